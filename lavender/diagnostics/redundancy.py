@@ -17,7 +17,8 @@ import numpy.typing as npt
 from lavender.base.arrays import FloatArray, check_float
 from lavender.base.errors import CapabilityError
 from lavender.problem import Problem, check_problem
-from lavender.problem.ordering import group_rows_by_island
+from lavender.problem.ordering import group_blocks_by_island
+from lavender.solvers.islands import find_islands, get_rows_of_blocks
 
 MIN_NEW_PART = 1e-6  # Smallest new part of a direction that differs from rounding of A, or of float32 data.
 MAX_ISLAND_ROWS = 3_000  # A dense QR factorisation of this many rows takes about 20 s.
@@ -99,7 +100,8 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
     tol = max(tol, MIN_NEW_PART) if jacobian is None or problem.precision == "float32" else tol
     m = problem.m
     unique, dependent = np.ones(m, bool), []
-    for island in group_rows_by_island(problem, np.arange(m + 1, dtype=np.int32)):
+    for blocks in group_blocks_by_island(*find_islands(problem)):
+        island = get_rows_of_blocks(problem, blocks)
         if len(island) > MAX_ISLAND_ROWS:
             raise CapabilityError(f"{len(island)} rows are coupled; at most {MAX_ISLAND_ROWS} are possible")
         part = (problem.csr[:, island] if jacobian is None else jacobian)[island]

@@ -224,28 +224,17 @@ class Operators(ProblemData):
         """Raise TooLarge if A in compressed rows may have more entries than 32-bit indices reach."""
         if self.matrix is not None or "_compressed" in self.__dict__:
             return
-        if self.generalized is not None:
-            self._check_bound_of_generalized()
-        else:
-            self._check_bound_of_rows(self._n_couplings)
+        self._check_entry_count(
+            self._n_couplings if self.generalized is None else self.metric.entries_of_matrix
+        )
 
-    def _check_bound_of_rows(self, bound: float) -> None:
-        """Raise TooLarge if this bound of the number of entries of A of bodies is too large."""
-        # Pairs of blocks that share both bodies were counted twice.
-        if min(bound, self.m**2) >= MAX_INDEXABLE_ENTRIES:
+    def _check_entry_count(self, bound: float) -> None:
+        """Raise TooLarge if this upper bound of the number of entries of A off the diagonal is too large."""
+        # Pairs of blocks that share both bodies were counted twice. Rows of J without entries have a diagonal entry.
+        if min(bound + self.m, self.m**2) >= MAX_INDEXABLE_ENTRIES:
             raise TooLarge(
-                f"A would have up to {bound:.0f} entries; at most 2^31 - 1 can be indexed: use a solver "
-                "that reads rows without forming A, for example a sweep solver"
-            )
-
-    def _check_bound_of_generalized(self) -> None:
-        """Raise TooLarge if the bound of the number of entries of A of J and M is too large."""
-        # Add m to the bound, because rows of J without entries have a diagonal entry, their compliance.
-        bound = min(self.metric.entries_of_matrix + self.m, self.m**2)
-        if bound >= MAX_INDEXABLE_ENTRIES:
-            raise TooLarge(
-                f"A would have up to {bound:.3g} entries, more than 32-bit indices reach: use a solver that takes "
-                "J and M as they are (operator 'generalized')"
+                f"A would have up to {bound:.3g} entries; at most 2^31 - 1 can be indexed: use a solver that does not "
+                "form A, for example a sweep solver that takes rows, or J and M (operator 'generalized')"
             )
 
     @computed_once
@@ -258,7 +247,7 @@ class Operators(ProblemData):
             return self._form_generalized()
         if self.rows is not None:
             bound, start, blocks = assemble.bound_delassus_entries(self.data)
-            self._check_bound_of_rows(bound)
+            self._check_entry_count(bound)
             bound = min(bound, self.m**2)
             indptr, indices, data = assemble.form_delassus_matrix(self.data, bound, start, blocks)
             return mark_read_only(indptr), mark_read_only(indices), mark_read_only(data)
@@ -266,8 +255,8 @@ class Operators(ProblemData):
 
     def _form_generalized(self) -> tuple[IntArray, IntArray, FloatArray]:
         """Form A = Y Y^T + diag(compliance), bitwise symmetric: both triangles are summed in the same order."""
-        self._check_bound_of_generalized()
         assert self.generalized is not None
+        self._check_entry_count(self.metric.entries_of_matrix)
         # A kernel is used instead of SciPy, which a first solve with a time limit would have to import.
         y = self.metric.whitened()
         indptr, indices, data = assemble.form_gram_matrix(*y, self.generalized.nv, self.compliance)

@@ -29,7 +29,6 @@ from lavender_ext.core.order import (
     compute_body_colors,
     compute_matrix_colors,
 )
-from lavender_ext.factor.graph import find_matrix_components
 
 # Orders of LavenderSim, which creates contacts in the order of its bodies and so does not need "local".
 ENGINE_ORDERS = ("given", "reverse", "symmetric", "random", "colored", "bottom_up", "top_down")
@@ -233,14 +232,6 @@ def compute_block_colors(problem: Problem) -> IntArray:
         graph.indptr.astype(np.int32),
         graph.indices.astype(np.int32),
     )
-
-
-def group_rows_by_island(problem: Problem, ptr: IntArray) -> list[IntArray]:
-    """Return the rows of each island of A, in order; rows ptr[i] to ptr[i + 1] - 1 are never separated."""
-    group = np.repeat(np.arange(len(ptr) - 1, dtype=np.int32), np.diff(ptr))
-    indptr, indices, _ = problem._compressed
-    count, label = find_matrix_components(ptr, group, indptr, indices)
-    return group_blocks_by_island(count, label[group])
 
 
 def group_blocks_by_island(count: int, label: IntArray) -> list[IntArray]:

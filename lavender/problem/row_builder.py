@@ -352,20 +352,8 @@ class RowBuilder(RowAssembly):
             Number of this point among the contacts of a and b, as from collision detection; part of its key. Default:
             the order of the calls.
         """
-        return self._add(
-            "contact",
-            a,
-            b,
-            feature,
-            name,
-            point,
-            normal,
-            tangent,
-            gap,
-            mu,
-            restitution,
-            restitution_threshold,
-        )
+        values = (point, normal, tangent, gap, mu, restitution, restitution_threshold)
+        return self._add("contact", a, b, feature, name, *values)
 
     # -- arrays of blocks ----------------------------------------------------------------------------------------
 

@@ -4,7 +4,6 @@ from libc.stdint cimport int32_t
 import numpy as np
 
 from lavender_ext.core.problem cimport Data
-from lavender_ext.core.islands cimport merge_components, number_components
 from lavender_ext.core.view cimport generalized_t
 from lavender_ext.factor.graph cimport order_graph, order_workspace_size
 
@@ -21,22 +20,6 @@ def order_for_elimination(const int32_t[::1] ptr, const int32_t[::1] near):
             order_graph(n, &ptr[0], entries, <int32_t*>&scratch[0], &order[0], &index[0], &index[n], &index[3 * n + 1],
                         &index[2 * n + 1])
     return order_array
-
-
-def find_matrix_components(const int32_t[::1] ptr, const int32_t[::1] block, const int32_t[::1] indptr,
-                      const int32_t[::1] indices):
-    """Return (number of components, label (k,)) of the blocks of a matrix in compressed rows; block (m,) has each row's block."""
-    cdef int32_t i, j, q, k = <int32_t>ptr.shape[0] - 1, count = 0
-    label_array = np.zeros(k, np.int32)
-    cdef int32_t[::1] label = label_array, parent = np.arange(k + 1, dtype=np.int32)
-    if k:
-        with nogil:
-            for i in range(k):
-                for j in range(ptr[i], ptr[i + 1]):
-                    for q in range(indptr[j], indptr[j + 1]):
-                        merge_components(&parent[0], i, block[indices[q]])
-            count = number_components(k, &parent[0], &label[0])
-    return count, label_array
 
 
 cdef enum:
