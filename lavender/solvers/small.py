@@ -110,7 +110,7 @@ def _make_call(problem: Problem) -> Small | None:
         return Small(data, problem.csr_data if bounded else data)
     # Newton's method factors over the bodies if these have fewer unknowns than there are rows, otherwise over A.
     bodies = problem.rows is not None and problem.m > 6 * problem.rows.n_bodies
-    return Islands(data, data if bodies else problem.csr_data, label, count)
+    return Islands(data, data if bodies else problem.csr_data)
 
 
 def call_uses_pivots(problem: Problem) -> bool:

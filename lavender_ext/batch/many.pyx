@@ -15,7 +15,7 @@ import numpy as np
 from lavender_ext.core.arrays cimport as_double_pointer, as_int_pointer, ndarray
 from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.method cimport workspace_t
-from lavender_ext.core.problem cimport Data, derived_t
+from lavender_ext.core.problem cimport Data, bind_body_arrays, derived_t
 from lavender_ext.core.problem import LAWS
 from lavender_ext.core.view cimport view_t
 from lavender_ext.small.call cimport N_COUNTS, Rules, small_rules_t, small_problem_t, judge_small_impulse
@@ -55,18 +55,15 @@ cdef enum:
 cdef int set_task_from_problem(task_t* j, problem) except -1:
     """Set up a task from a `Problem` that is given by A or by bodies and whose derived numbers are not computed."""
     cdef Blocks blocks = problem.cones._blocks
-    cdef Py_ssize_t m = blocks.at.n_rows, n, c, joints
+    cdef Py_ssize_t m = blocks.at.n_rows
     rows, matrix = problem.rows, problem.matrix
     j.p, j.has_derived, j.zero_residual[0], j.factored = blocks.at, False, -1.0, rows is not None
     j.p.law, j.p.b = LAWS[problem.friction], as_double_pointer(problem.b, m)
     if j.factored:
-        n, c, joints = len(rows.inv_mass), len(rows.normal), len(rows.joint_body)
-        j.r.n_bodies, j.r.n_joints, j.r.n_contacts = <int32_t>n, <int32_t>joints, <int32_t>c
-        j.r.jac, j.r.joint_body = as_double_pointer(rows.jac, 12 * j.p.ptr[joints]), as_int_pointer(rows.joint_body, 2 * joints)
-        j.r.normal, j.r.tangent = as_double_pointer(rows.normal, 3 * c), as_double_pointer(rows.tangent, 3 * c)
-        j.r.arm_a, j.r.arm_b = as_double_pointer(rows.arm_a, 3 * c), as_double_pointer(rows.arm_b, 3 * c)
-        j.r.contact_body, j.r.compliance = as_int_pointer(rows.contact_body, 2 * c), as_double_pointer(problem.compliance, m)
-        j.r.inv_mass, j.r.inv_inertia = as_double_pointer(rows.inv_mass, n), as_double_pointer(rows.inv_inertia, 9 * n)
+        bind_body_arrays(&j.r, &j.p, (
+            rows.jac, rows.joint_body, rows.normal, rows.tangent, rows.arm_a, rows.arm_b, rows.contact_body, rows.inv_mass,
+            rows.inv_inertia, problem.compliance,
+        ))
     elif isinstance(matrix, ndarray):
         j.dense, j.row = as_double_pointer(matrix, m * m), m
     else:

@@ -8,13 +8,14 @@ from libc.stdint cimport int32_t, int64_t
 from libc.math cimport INFINITY, NAN, fabs, sqrt
 from libc.string cimport memset
 
+from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles
 from lavender_ext.core.assemble cimport lav_form_delassus_matrix, lav_list_blocks_of_bodies, lav_expand_rows
 from lavender_ext.core.validate cimport find_invalid_number
 from lavender_ext.core.method cimport MORE, REACHED, NEEDS_WORKSPACE, options_t, workspace_t, info_t
 from lavender_ext.core.islands cimport island_workspace_integers
 from lavender_ext.core.block_types cimport CONE, blocks_t, has_independent_rows, islands_t
-from lavender_ext.core.problem cimport (DERIVED, lav_compute_body_diagonal, derived_t, compute_derived_numbers_of_jacobian,
-                                        compute_derived_numbers_of_csr)
+from lavender_ext.core.problem cimport (DERIVED, bind_derived_row_arrays, compute_derived_numbers_of_jacobian, derived_t,
+                                        lav_compute_body_diagonal, lav_compute_csr_diagonal)
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.driver.driver cimport NEWTON, lav_workspace_size, lav_start, lav_step
 from lavender_ext.factor.factors cimport has_wide
@@ -244,25 +245,22 @@ cdef inline bint derive_row_numbers_from_matrix(task_t* j, workspace_t* workspac
         j.a.indptr, j.a.indices, j.a.data = empty + m + 1, empty + 2 * (m + 1), x + 3 * (m + 1)
         compress_dense_rows(j.dense, j.row, j.p.n_rows, j.p.n_rows, <int32_t*>j.a.indptr, <int32_t*>j.a.indices, <double*>j.a.data)
     j.p.d, j.p.nu, j.p.step = x, x + m + 1, x + 2 * (m + 1)
-    j.made.n_empty = compute_derived_numbers_of_csr(&j.p, &j.a, x, x + m + 1, x + 2 * (m + 1), empty)
+    j.made.n_empty = lav_compute_csr_diagonal(&j.p, &j.a, empty)
     return True
 
 
 cdef inline bint derive_row_numbers_from_bodies(task_t* j, workspace_t* workspace) noexcept nogil:
     """Compute d, nu, step, joints' M^-1 J^T, coupling and inv_inertia_arm of contacts; return whether d is in the valid range."""
-    cdef int64_t m = j.p.n_rows, joints = j.p.ptr[j.r.n_joints], c = j.r.n_contacts
-    cdef int64_t n = 3 * (m + 1) + 12 * joints + 5 * c + 6 * (m - joints)
-    cdef double* x
-    cdef double* of_joints
-    if not grow_workspace_to(workspace, m + 1, n):
+    cdef int64_t m = j.p.n_rows
+    cdef arena_t arena = make_arena(NULL, NULL)
+    bind_derived_row_arrays(&j.r, &j.p, &arena)
+    if not grow_workspace_to(workspace, m + 1, arena.n_real + 3 * (m + 1)):
         return False
-    x, of_joints = workspace.real, workspace.real + 3 * (m + 1)
-    memset(x, 0, n * sizeof(double))
-    j.p.d, j.p.nu, j.p.step = x, x + m + 1, x + 2 * (m + 1)
-    j.r.minv_jac, j.r.coupling, j.r.inv_inertia_arm = of_joints, of_joints + 12 * joints, of_joints + 12 * joints + 5 * c
-    j.made.n_empty = lav_compute_body_diagonal(&j.p, &j.r, x, x + m + 1, x + 2 * (m + 1), workspace.index, of_joints,
-                                       of_joints + 12 * joints,
-                                       of_joints + 12 * joints + 5 * c)
+    memset(workspace.real, 0, (arena.n_real + 3 * (m + 1)) * sizeof(double))
+    arena = make_arena(workspace.real, NULL)
+    bind_derived_row_arrays(&j.r, &j.p, &arena)
+    j.p.d, j.p.nu, j.p.step = take_doubles(&arena, m + 1), take_doubles(&arena, m + 1), take_doubles(&arena, m + 1)
+    j.made.n_empty = lav_compute_body_diagonal(&j.p, &j.r, workspace.index)
     return find_invalid_number(j.p.d, m) < 0
 
 
@@ -287,8 +285,9 @@ cdef inline bint form_matrix_of_bodies(task_t* j, small_problem_t* s, workspace_
                              near + 4 * k + 2,
                  ptr, <int32_t*>j.a.indices, <double*>j.a.data)
     s.over = view_t(j.p, &j.a, NULL, NULL)
-    s.over.p.d, s.over.p.nu, s.over.p.step = x, j.p.nu, x + 2 * (m + 1)
-    compute_derived_numbers_of_csr(&s.over.p, &j.a, x, x + m + 1, x + 2 * (m + 1), ptr + m + 1)
+    s.over.p.d, s.over.p.nu, s.over.p.step = x, x + m + 1, x + 2 * (m + 1)
+    lav_compute_csr_diagonal(&s.over.p, &j.a, ptr + m + 1)
+    s.over.p.nu = j.p.nu
     return True
 
 

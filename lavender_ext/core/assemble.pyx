@@ -43,7 +43,7 @@ cdef public void lav_list_blocks_of_bodies(const blocks_t* p, const rows_t* r, i
 
     bound[0] receives an upper bound on the number of stored entries of A.
     """
-    cdef int32_t i, s, x, t, sum_ = 0
+    cdef int32_t i, s, x, t
     cdef int64_t n_rows
     for i in range(r.n_bodies + 1):
         start[i] = 0
@@ -52,21 +52,14 @@ cdef public void lav_list_blocks_of_bodies(const blocks_t* p, const rows_t* r, i
             x = get_moving_body(r, i, s)
             if x >= 0:
                 start[x] += 1
-    for i in range(r.n_bodies + 1):
-        t = start[i]
-        start[i] = sum_
-        sum_ += t
-    for i in range(p.n_blocks):
+    for i in range(r.n_bodies):                         # the end of each list, from which it is filled backwards
+        start[i + 1] += start[i]
+    for i in range(p.n_blocks - 1, -1, -1):
         for s in range(2):
             x = get_moving_body(r, i, s)
             if x >= 0:
+                start[x] -= 1
                 blocks[start[x]] = i
-                start[x] += 1
-    i = r.n_bodies
-    while i > 0:
-        start[i] = start[i - 1]
-        i -= 1
-    start[0] = 0
     bound[0] = 0
     for i in range(p.n_blocks):
         n_rows = p.ptr[i + 1] - p.ptr[i]

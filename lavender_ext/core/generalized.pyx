@@ -208,18 +208,6 @@ cdef class Operator:
             out[i] = multiply_jacobian_row(&self.g, i, x) if self.g.n else 0.0
         return result
 
-    def compute_rhs(self, velocity, target):
-        """Return b = target - J v (m,) [m/s], a new array; the caller checks its range."""
-        cdef const double* v = as_double_pointer(velocity, self.g.n)
-        cdef const double* t = as_double_pointer(target, self.g.m)
-        cdef int32_t i
-        cdef double* out
-        result = new(self.g.m)
-        out = as_double_pointer(result, self.g.m)
-        for i in range(self.g.m):
-            out[i] = t[i] - (multiply_jacobian_row(&self.g, i, v) if self.g.n else 0.0)
-        return result
-
 
 def lower_triangle_of_dense(const double[:, ::1] a):
     """Return (indptr, indices, data) of the lower triangle with diagonal, and the largest asymmetry.

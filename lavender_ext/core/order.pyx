@@ -85,26 +85,18 @@ cdef void sort_blocks_by_level(int32_t n_blocks, const int32_t* level, int32_t n
 
     start (n_levels + 1) receives the first index of each level in `order`.
     """
-    cdef int32_t i, s, t
+    cdef int32_t i
     for i in range(n_levels + 1):
         start[i] = 0
     for i in range(n_blocks):
         if level[i] >= 0:
             start[level[i]] += 1
-    s = 0
-    for i in range(n_levels + 1):
-        t = start[i]
-        start[i] = s
-        s += t
-    for i in range(n_blocks):
+    for i in range(n_levels):                           # the end of each level, from which it is filled backwards
+        start[i + 1] += start[i]
+    for i in range(n_blocks - 1, -1, -1):
         if level[i] >= 0:
+            start[level[i]] -= 1
             order[start[level[i]]] = i
-            start[level[i]] += 1
-    i = n_levels
-    while i > 0:
-        start[i] = start[i - 1]
-        i -= 1
-    start[0] = 0
 
 
 cdef int32_t color_blocks_by_bodies(int32_t n_blocks, const int32_t* body, int32_t n_bodies, uint64_t* used,

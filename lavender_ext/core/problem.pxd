@@ -1,6 +1,7 @@
 """A problem for kernels: pointers into arrays that a `Data` keeps alive, and derived numbers."""
 from libc.stdint cimport int32_t
 
+from lavender_ext.core.arena cimport arena_t
 from lavender_ext.core.block_types cimport blocks_t, islands_t
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 
@@ -33,11 +34,10 @@ cdef double count_gram_matrix_products(const generalized_t* g, double* on) noexc
 cdef int32_t compute_derived_numbers_of_jacobian(blocks_t* p, generalized_t* g, derived_t* out) noexcept nogil
 
 
-cdef public int32_t lav_compute_body_diagonal(const blocks_t* p, const rows_t* r, double* d, double* nu, double* step,
-                                              int32_t* empty,
-                                      double* minv_jac, double* coupling, double* inv_inertia_arm) noexcept nogil
-cdef int32_t compute_derived_numbers_of_csr(const blocks_t* p, const csr_t* a, double* d, double* nu, double* step,
-                                 int32_t* empty) noexcept nogil
+cdef public int32_t lav_compute_csr_diagonal(const blocks_t* p, const csr_t* a, int32_t* empty) noexcept nogil
+cdef public int32_t lav_compute_body_diagonal(const blocks_t* p, const rows_t* r, int32_t* empty) noexcept nogil
+cdef void bind_derived_row_arrays(rows_t* r, const blocks_t* p, arena_t* a) noexcept nogil
+cdef int bind_body_arrays(rows_t* r, const blocks_t* p, rows) except -1
 
 
 cdef class Data:
@@ -49,7 +49,8 @@ cdef class Data:
     cdef readonly bint ready            # d, nu, step and Y are known
     cdef readonly bint single_rows      # every block is one bounded row
     cdef readonly object empty
-    cdef object _numbers, _d, _nu, _step
+    cdef object _numbers
+    cdef list _arrays           # d, nu and step, created at first use
     cdef derived_t derived      # valid if is_general and ready
     cdef readonly double reference_energy, reference_velocity, relative_at_zero   # negative if unknown
     cdef islands_t islands_at           # target of blocks.islands, if that is not NULL

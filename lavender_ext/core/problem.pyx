@@ -7,7 +7,7 @@
     step_i    see core/steps.pxd                                                                                   (3)
 """
 from libc.math cimport fabs
-from libc.stdint cimport int32_t
+from libc.stdint cimport int32_t, int64_t
 from libc.stdlib cimport free, malloc
 from libc.string cimport memcpy
 
@@ -15,12 +15,12 @@ cimport cython
 
 import numpy as np
 
-from lavender_ext.core.arrays cimport as_double_pointer
+from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles
+from lavender_ext.core.arrays cimport as_double_pointer, as_int_pointer
 from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.validate cimport find_invalid_number, min_magnitude
 from lavender_ext.core.dot cimport dot
 from lavender_ext.core.generalized cimport Operator
-from lavender_ext.core.islands cimport find_islands, island_workspace_integers
 from lavender_ext.core.block_types cimport (CONE, COULOMB, MAX_FRICTION_COMPONENTS, blocks_t, is_box_friction_contact, islands_t,
                                             count_tangent_rows,
                                             count_angular_rows, get_friction_components, friction_components_t)
@@ -53,9 +53,10 @@ cdef inline void replace_empty_diagonal(int32_t m, double* d) noexcept nogil:
             d[i] = mean
 
 
-cdef public int32_t lav_compute_csr_diagonal(const blocks_t* p, const csr_t* a, double* d, double* step,
-                                     int32_t* empty) noexcept nogil:
-    """Compute d (1) and step (3) from the rows of A; mark empty rows and return their number."""
+cdef public int32_t lav_compute_csr_diagonal(const blocks_t* p, const csr_t* a, int32_t* empty) noexcept nogil:
+    """Compute p.d, p.nu and p.step from the rows of A; mark empty rows (m) and return their number."""
+    cdef double* d = <double*>p.d
+    cdef double* step = <double*>p.step
     cdef int32_t i, j, q, g, n_empty = 0
     cdef double diag, big, x
     cdef double eigenvalue[MAX_FRICTION_COMPONENTS]
@@ -84,29 +85,14 @@ cdef public int32_t lav_compute_csr_diagonal(const blocks_t* p, const csr_t* a, 
             if part.size[g] == 2:
                 eigenvalue[g] = largest_eigenvalue_of_csr_pair(a, j + part.first[g], d, step)
         compute_block_steps(p, i, &part, eigenvalue, d, step)
+    compute_velocity_weights(p, d, <double*>p.nu)
     return n_empty
 
 
-cdef public void lav_compute_csr_velocity_weights(const blocks_t* p, double* nu) noexcept nogil:
-    """Compute nu (2) of a problem that is given by a matrix A."""
-    compute_velocity_weights(p, p.d, nu)
-
-
-cdef int32_t compute_derived_numbers_of_csr(const blocks_t* p, const csr_t* a, double* d, double* nu, double* step,
-                            int32_t* empty) noexcept nogil:
-    """Compute d (= p.d), nu and step from a matrix; return the number of empty rows."""
-    cdef int32_t n_empty = lav_compute_csr_diagonal(p, a, d, step, empty)
-    lav_compute_csr_velocity_weights(p, nu)
-    return n_empty
-
-
-cdef public int32_t lav_compute_body_diagonal(const blocks_t* p, const rows_t* r, double* d, double* nu, double* step,
-                                      int32_t* empty, double* minv_jac, double* coupling,
-                                      double* inv_inertia_arm) noexcept nogil:
-    """Compute d, nu, step, M^-1 J^T of joints, coupling and inv_inertia_arm of contacts from the factored form.
-
-    Returns the number of empty rows.
-    """
+cdef public int32_t lav_compute_body_diagonal(const blocks_t* p, const rows_t* r, int32_t* empty) noexcept nogil:
+    """Compute p.d, p.nu, p.step, and the arrays of `bind_derived_row_arrays`; mark empty rows (m) and return their number."""
+    cdef double* d = <double*>p.d
+    cdef double* step = <double*>p.step
     cdef int32_t i, j, q, g, c, nt, n_empty = 0, a, b
     cdef double off[2]
     cdef double eigenvalue[MAX_FRICTION_COMPONENTS]
@@ -116,8 +102,8 @@ cdef public int32_t lav_compute_body_diagonal(const blocks_t* p, const rows_t* r
         a = r.joint_body[2 * i]
         b = r.joint_body[2 * i + 1]
         for j in range(p.ptr[i], p.ptr[i + 1]):
-            multiply_inverse_mass(r.jac + 12 * j, r.inv_mass, r.inv_inertia, a, b, minv_jac + 12 * j)
-            d[j] = dot12(r.jac + 12 * j, minv_jac + 12 * j) + r.compliance[j]
+            multiply_inverse_mass(r.jac + 12 * j, r.inv_mass, r.inv_inertia, a, b, <double*>r.minv_jac + 12 * j)
+            d[j] = dot12(r.jac + 12 * j, r.minv_jac + 12 * j) + r.compliance[j]
             step[j] = 0.0
     # contacts: block of A
     for c in range(r.n_contacts):
@@ -127,13 +113,13 @@ cdef public int32_t lav_compute_body_diagonal(const blocks_t* p, const rows_t* r
         compute_contact_delassus_block(r.normal + 3 * c, r.tangent + 3 * c, r.arm_a + 3 * c, r.arm_b + 3 * c, nt,
                          count_angular_rows(p, i), r.contact_body[2 * c], r.contact_body[2 * c + 1], r.inv_mass,
                          r.inv_inertia, d + j, off,
-                         coupling + 5 * c, inv_inertia_arm + 6 * (j - p.ptr[r.n_joints]))
+                         <double*>r.coupling + 5 * c, <double*>r.inv_inertia_arm + 6 * (j - p.ptr[r.n_joints]))
         for q in range(j, p.ptr[i + 1]):
             d[q] += r.compliance[q]
             step[q] = 0.0
         # The second tangent of a box uses the impulse change of the first.
         if is_box_friction_contact(p, i):
-            coupling[5 * c + 2] = off[0]
+            (<double*>r.coupling)[5 * c + 2] = off[0]
         get_friction_components(p, i, &part)
         for g in range(part.n):
             if part.size[g] == 2:
@@ -153,14 +139,36 @@ cdef public int32_t lav_compute_body_diagonal(const blocks_t* p, const rows_t* r
         for g in range(part.n):
             eigenvalue[g] = step[p.ptr[i] + part.first[g]]
         compute_block_steps(p, i, &part, eigenvalue, d, step)
-    compute_velocity_weights(p, d, nu)
-    set_angular_joint_weights(p, r, nu)
+    compute_velocity_weights(p, d, <double*>p.nu)
+    set_angular_joint_weights(p, r, <double*>p.nu)
     return n_empty
 
 
-cdef public int32_t lav_compute_generalized_diagonal(const blocks_t* p, const generalized_t* g, double* d, double* nu, double* step,
-                                         int32_t* empty, int32_t* place, double* y) noexcept nogil:
-    """Compute Y, d, nu and step in generalised coordinates; return the number of empty rows. place (n) is scratch."""
+cdef void bind_derived_row_arrays(rows_t* r, const blocks_t* p, arena_t* a) noexcept nogil:
+    """Take M^-1 J^T of joints, coupling and inv_inertia_arm of contacts from an arena; they must be 0 at first."""
+    cdef int64_t joint_rows = p.ptr[r.n_joints]
+    r.minv_jac, r.coupling = take_doubles(a, 12 * joint_rows), take_doubles(a, 5 * <int64_t>r.n_contacts)
+    r.inv_inertia_arm = take_doubles(a, 6 * (p.n_rows - joint_rows))
+
+
+cdef int bind_body_arrays(rows_t* r, const blocks_t* p, rows) except -1:
+    """Point r at the arrays of the factored form (argument `rows` of `Data`); the caller keeps them alive."""
+    jac, joint_body, normal, tangent, arm_a, arm_b, contact_body, inv_mass, inv_inertia, compliance = rows
+    cdef Py_ssize_t n = len(inv_mass), kj = len(joint_body), c = len(contact_body)
+    r.n_bodies, r.n_joints, r.n_contacts = <int32_t>n, <int32_t>kj, <int32_t>c
+    r.jac, r.joint_body = as_double_pointer(jac, 12 * <Py_ssize_t>p.ptr[kj]), as_int_pointer(joint_body, 2 * kj)
+    r.normal, r.tangent = as_double_pointer(normal, 3 * c), as_double_pointer(tangent, 3 * c)
+    r.arm_a, r.arm_b = as_double_pointer(arm_a, 3 * c), as_double_pointer(arm_b, 3 * c)
+    r.contact_body, r.compliance = as_int_pointer(contact_body, 2 * c), as_double_pointer(compliance, p.n_rows)
+    r.inv_mass, r.inv_inertia = as_double_pointer(inv_mass, n), as_double_pointer(inv_inertia, 9 * n)
+    return 0
+
+
+cdef public int32_t lav_compute_generalized_diagonal(const blocks_t* p, const generalized_t* g, int32_t* empty,
+                                                     int32_t* place) noexcept nogil:
+    """Compute g.y, p.d, p.nu and p.step in generalised coordinates; return the number of empty rows. place (n) is scratch."""
+    cdef double* d = <double*>p.d
+    cdef double* y = <double*>g.y
     cdef int32_t i, j, b, nc, part_, n_empty = 0
     cdef double eigenvalue[MAX_FRICTION_COMPONENTS]
     cdef friction_components_t part
@@ -191,8 +199,8 @@ cdef public int32_t lav_compute_generalized_diagonal(const blocks_t* p, const ge
                 row = y + g.pval[b] + (j - g.prow[b]) * nc
                 eigenvalue[part_] = largest_eigenvalue_2x2(d[j], dot(row, row + nc, nc), d[j + 1])
         average_diagonal_of_pairs(p, i, d)
-        compute_block_steps(p, i, &part, eigenvalue, d, step)
-    compute_velocity_weights(p, d, nu)
+        compute_block_steps(p, i, &part, eigenvalue, d, <double*>p.step)
+    compute_velocity_weights(p, d, <double*>p.nu)
     return n_empty
 
 
@@ -272,7 +280,7 @@ cdef int32_t compute_derived_numbers_of_jacobian(blocks_t* p, generalized_t* g, 
             b += 1
         home[i] = b
     bind_derived_numbers(p, g, out)
-    out.n_empty = lav_compute_generalized_diagonal(p, g, <double*>p.d, <double*>p.nu, <double*>p.step, out.empty, w, <double*>g.y)
+    out.n_empty = lav_compute_generalized_diagonal(p, g, out.empty, w)
     return DERIVED
 
 
@@ -305,10 +313,8 @@ cdef class Data:
         cdef const double[::1] b = b_
         cdef int32_t m = blocks.at.n_rows, n_empty, i
         numbers_ = new(3 * m + 3)
-        cdef double[::1] numbers = numbers_
-        cdef double* d = &numbers[0]
-        cdef double* nu = d + m + 1
-        cdef double* step = nu + m + 1
+        cdef double* numbers = as_double_pointer(numbers_, 3 * m + 3)
+        cdef arena_t arena = make_arena(NULL, NULL)
         cdef Workspace marks = allocate_bytes((<Py_ssize_t>m + 1) * sizeof(int32_t))
         cdef int32_t* empty = <int32_t*>marks.at
         cdef const int32_t[::1] indptr, indices
@@ -316,9 +322,7 @@ cdef class Data:
         self.keep = [blocks, b_, numbers_, csr, rows]
         self.blocks = blocks.at
         self.blocks.law = law
-        self.blocks.d = d
-        self.blocks.nu = nu
-        self.blocks.step = step
+        self.blocks.d, self.blocks.nu, self.blocks.step = numbers, numbers + m + 1, numbers + 2 * (m + 1)
         if m > 0:
             self.blocks.b = &b[0]
         self.reference_energy = self.reference_velocity = self.relative_at_zero = -1.0
@@ -326,18 +330,21 @@ cdef class Data:
         self.factored = rows is not None
         self.single_rows = blocks.single_rows
         if self.factored:
-            self._set_rows(rows)
-            n_empty = lav_compute_body_diagonal(&self.blocks, &self.rows, d, nu, step, empty,
-                                        <double*>self.rows.minv_jac, <double*>self.rows.coupling,
-                                        <double*>self.rows.inv_inertia_arm)
+            bind_body_arrays(&self.rows, &self.blocks, rows)
+            bind_derived_row_arrays(&self.rows, &self.blocks, &arena)
+            derived = np.zeros(arena.n_real + 1)
+            self.keep.append(derived)
+            arena = make_arena(as_double_pointer(derived, arena.n_real + 1), NULL)
+            bind_derived_row_arrays(&self.rows, &self.blocks, &arena)
+            n_empty = lav_compute_body_diagonal(&self.blocks, &self.rows, empty)
         else:
             indptr, indices, data = csr
             self.csr.indptr = &indptr[0]
             if data.shape[0] > 0:
                 self.csr.indices = &indices[0]
                 self.csr.data = &data[0]
-            n_empty = compute_derived_numbers_of_csr(&self.blocks, &self.csr, d, nu, step, empty)
-        self._numbers = numbers_
+            n_empty = lav_compute_csr_diagonal(&self.blocks, &self.csr, empty)
+        self._numbers, self._arrays = numbers_, [None, None, None]
         self.empty = _NONE
         if n_empty:
             self.empty = _read_only(np.array([i for i in range(m) if empty[i]], np.intp))
@@ -354,7 +361,7 @@ cdef class Data:
         other.blocks.law, other.blocks.islands = law, NULL
         other.factored, other.is_general = self.factored, self.is_general
         other.ready, other.single_rows, other.empty = self.ready, self.single_rows, self.empty
-        other._numbers, other._d, other._nu, other._step = self._numbers, self.d, self._nu, self._step
+        other._numbers, other._arrays = self._numbers, self._arrays.copy()
         other.reference_energy = other.reference_velocity = other.relative_at_zero = -1.0
         return other
 
@@ -403,58 +410,20 @@ cdef class Data:
             bind_derived_numbers(&self.blocks, &self.general, derived)
             self.ready = True
 
-    def _set_rows(self, rows):
-        """Point self.rows at the arrays of the factored form and allocate its derived arrays."""
-        cdef const double[:, ::1] jac, normal, tangent, arm_a, arm_b
-        cdef const int32_t[:, ::1] joint_body, contact_body
-        cdef const double[::1] inv_mass, compliance
-        cdef const double[:, :, ::1] inv_inertia
-        cdef double[:, ::1] minv_jac, coupling, inv_inertia_arm
-        jac, joint_body, normal, tangent, arm_a, arm_b, contact_body, inv_mass, inv_inertia, compliance = rows
-        minv_jac = np.zeros((jac.shape[0] + 1, 12))
-        coupling = np.zeros((normal.shape[0] + 1, 5))
-        inv_inertia_arm = np.zeros((self.blocks.n_rows - jac.shape[0] + 1, 6))
-        self.keep += [minv_jac, coupling, inv_inertia_arm]
-        self.rows.n_bodies = <int32_t>inv_mass.shape[0]
-        self.rows.n_joints = <int32_t>joint_body.shape[0]
-        self.rows.n_contacts = <int32_t>contact_body.shape[0]
-        self.rows.minv_jac = &minv_jac[0, 0]
-        self.rows.coupling = &coupling[0, 0]
-        self.rows.inv_inertia_arm = &inv_inertia_arm[0, 0]
-        if jac.shape[0]:
-            self.rows.jac = &jac[0, 0]
-        if self.rows.n_joints:
-            self.rows.joint_body = &joint_body[0, 0]
-        if self.rows.n_contacts:
-            self.rows.normal = &normal[0, 0]
-            self.rows.tangent = &tangent[0, 0]
-            self.rows.arm_a = &arm_a[0, 0]
-            self.rows.arm_b = &arm_b[0, 0]
-            self.rows.contact_body = &contact_body[0, 0]
-        if self.rows.n_bodies:
-            self.rows.inv_mass = &inv_mass[0]
-            self.rows.inv_inertia = &inv_inertia[0, 0, 0]
-        if compliance.shape[0]:
-            self.rows.compliance = &compliance[0]
-
     cdef object get_derived_array(self, int which):
-        """Return d (0), nu (1) or step (2) as an array (m,)."""
+        """Return d (0), nu (1) or step (2) as a read-only array (m,), which is created at first use."""
         cdef Py_ssize_t m = self.blocks.n_rows, at = which * (m + 1)
-        cdef double[::1] x
-        if not self.is_general:
-            return self._numbers[at:at + m]
-        out = np.empty(m)
-        if m:
-            x = out
-            memcpy(&x[0], self.blocks.d + at, m * sizeof(double))
-        return out
+        if self._arrays[which] is None:
+            out = new(m) if self.is_general else self._numbers[at:at + m]
+            if self.is_general:
+                memcpy(as_double_pointer(out, m), self.blocks.d + at, m * sizeof(double))
+            self._arrays[which] = _read_only(out)
+        return self._arrays[which]
 
     @property
     def d(self):
         """Diagonal of A with fallbacks (m,) [1/kg]."""
-        if self._d is None:
-            self._d = _read_only(self.get_derived_array(0))
-        return self._d
+        return self.get_derived_array(0)
 
     def copy_velocity_weight(self, Data other, bint joints=False):
         """Copy nu from the same problem given by bodies, because A does not distinguish angular from linear rows.
@@ -463,21 +432,17 @@ cdef class Data:
         """
         cdef int32_t rows = self.blocks.ptr[other.rows.n_joints] if joints else self.blocks.n_rows
         memcpy(<double*>self.blocks.nu, other.blocks.nu, rows * sizeof(double))
-        self._nu = self._weight = None
+        self._arrays[1] = self._weight = None
 
     @property
     def nu(self):
         """Velocity weight nu (m,) [1/kg]: velocity error = sqrt(nu d) |e|."""
-        if self._nu is None:
-            self._nu = _read_only(self.get_derived_array(1))
-        return self._nu
+        return self.get_derived_array(1)
 
     @property
     def step(self):
         """Steps of a sweep (m,) [kg]."""
-        if self._step is None:
-            self._step = _read_only(self.get_derived_array(2))
-        return self._step
+        return self.get_derived_array(2)
 
     @property
     def outside(self):
@@ -587,15 +552,9 @@ cdef class Data:
             self.store_reference(other.blocks.islands, start)
 
     def islands(self):
-        """Return (number of islands, island of each block (k,)): the labels of the judge, if it has judged the zero impulse."""
-        cdef view_t v = self.get_pointers()
-        cdef islands_t found
+        """Return (number of islands, island of each block (k,)), as labelled with the references of the zero impulse."""
         cdef const islands_t* islands = self.blocks.islands
         cdef Py_ssize_t k = self.blocks.n_blocks
-        cdef Workspace marks
-        if self.reference_energy < 0.0:
-            marks = allocate_bytes(island_workspace_integers(&v) * sizeof(int32_t))
-            islands = &found if find_islands(&v, <int32_t*>marks.at, &found) > 1 else NULL
         label_ = np.zeros(k, np.int32)
         cdef int32_t[::1] label = label_
         if islands == NULL:
@@ -617,7 +576,7 @@ def make_generalized_data(Blocks blocks, b, Operator operator, compliance, int l
     data.is_general = True
     data.single_rows = blocks.single_rows
     data.reference_energy = data.reference_velocity = data.relative_at_zero = -1.0
-    data.empty = _NONE
+    data.empty, data._arrays = _NONE, [None, None, None]
     if blocks.at.n_rows:
         data.blocks.b = as_double_pointer(b, blocks.at.n_rows)
         data.general.compliance = as_double_pointer(compliance, blocks.at.n_rows)

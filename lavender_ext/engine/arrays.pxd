@@ -10,6 +10,8 @@ only, by their index `dyn` (-1 = static), as core/rows.pxd requires.
 """
 from libc.stdint cimport int32_t, int64_t, uint64_t
 
+from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles, take_integers
+
 
 # size[]: the array sizes that `bind_engine_arrays` needs
 cpdef enum:
@@ -204,20 +206,6 @@ cdef struct engine_t:
     uint64_t* color_scratch  # (nd)
 
 
-cdef inline double* take_next_doubles(double* base, int64_t* at, int64_t count) noexcept nogil:
-    """Return the next `count` doubles of the buffer and advance the offset `at`."""
-    cdef double* p = base + at[0]
-    at[0] += count
-    return p
-
-
-cdef inline int32_t* take_next_integers(int32_t* base, int64_t* at, int64_t count) noexcept nogil:
-    """Return the next `count` int32 of the buffer and advance the offset `at`."""
-    cdef int32_t* p = base + at[0]
-    at[0] += count
-    return p
-
-
 cdef inline void bind_engine_arrays(const int32_t* size, double* real, int32_t* index, uint64_t* keys, engine_t* e,
                       int64_t* used) noexcept nogil:
     """Point every array of `e` into the three buffers; `used` (3) receives the number of entries of each buffer."""
@@ -226,80 +214,78 @@ cdef inline void bind_engine_arrays(const int32_t* size, double* real, int32_t* 
     cdef int64_t frames = size[N_FRAME], nt = c if size[ROWS_PER_CONTACT] > 1 else 0
     cdef int64_t rolls = 1 if size[ROWS_PER_CONTACT] > 4 else 0
     cdef int64_t grid = n if size[N_BUCKET] > 0 else 0, n_excluded = size[N_EXCLUDED]
-    cdef int64_t i = 0, j = 0
+    cdef arena_t a = make_arena(real, index)
     e.size = size
-    e.setting = take_next_doubles(real, &i, N_SETTINGS)
-    e.x = take_next_doubles(real, &i, 3 * n)
-    e.q = take_next_doubles(real, &i, 4 * n)
-    e.v = take_next_doubles(real, &i, 6 * n)
-    e.inv_mass_body = take_next_doubles(real, &i, n)
-    e.inertia = take_next_doubles(real, &i, 9 * n)
-    e.inv_inertia_body = take_next_doubles(real, &i, 9 * n)
-    e.shape = take_next_doubles(real, &i, 4 * n)
-    e.friction = take_next_doubles(real, &i, n)
-    e.restitution = take_next_doubles(real, &i, n)
-    e.patch = take_next_doubles(real, &i, n)
-    e.rot = take_next_doubles(real, &i, 9 * frames)
-    e.fat = take_next_doubles(real, &i, 6 * n)
-    e.joint = take_next_doubles(real, &i, N_JOINT_REAL * kj)
-    e.joint_error = take_next_doubles(real, &i, mj)
-    e.jac = take_next_doubles(real, &i, 12 * mj)
-    e.minv_jac = take_next_doubles(real, &i, 12 * mj)
-    e.joint_impulse = take_next_doubles(real, &i, mj)
-    e.inv_mass = take_next_doubles(real, &i, nd)
-    e.inv_inertia = take_next_doubles(real, &i, 9 * nd)
-    e.v_free = take_next_doubles(real, &i, 6 * nd)
-    e.dv = take_next_doubles(real, &i, 6 * nd)
-    e.shift = take_next_doubles(real, &i, 6 * nd)
-    e.point = take_next_doubles(real, &i, 3 * c)
-    e.gap = take_next_doubles(real, &i, c)
-    e.normal = take_next_doubles(real, &i, 3 * c)
-    e.tangent = take_next_doubles(real, &i, 3 * nt)
-    e.arm_a = take_next_doubles(real, &i, 3 * c)
-    e.arm_b = take_next_doubles(real, &i, 3 * c)
-    e.coupling = take_next_doubles(real, &i, 5 * nt)
-    e.inv_inertia_arm = take_next_doubles(real, &i, 6 * (m - mj))
-    e.local = take_next_doubles(real, &i, 6 * c)
-    e.cache_impulse = take_next_doubles(real, &i, N_CACHE_IMPULSE * c)
-    e.cache_local = take_next_doubles(real, &i, 6 * c)
-    e.push = take_next_doubles(real, &i, mj + c)
-    e.target = take_next_doubles(real, &i, m)
-    e.lower = take_next_doubles(real, &i, mj)
-    e.upper = take_next_doubles(real, &i, mj)
-    e.b = take_next_doubles(real, &i, m)
-    e.d = take_next_doubles(real, &i, m)
-    e.step = take_next_doubles(real, &i, m)
-    e.compliance = take_next_doubles(real, &i, m)
-    e.impulse = take_next_doubles(real, &i, m)
-    e.mu = take_next_doubles(real, &i, k)
-    e.patch_radius = take_next_doubles(real, &i, k)
-    e.rolling = take_next_doubles(real, &i, k * rolls)
-    e.cache_roll = take_next_doubles(real, &i, 3 * c * rolls)
-    e.head = take_next_integers(index, &j, N_HEAD)
-    e.kind_of_shape = take_next_integers(index, &j, n)
-    e.dyn = take_next_integers(index, &j, n)
-    e.uneven = take_next_integers(index, &j, n)
-    e.body_of = take_next_integers(index, &j, nd)
-    e.joint_kind = take_next_integers(index, &j, kj)
-    e.joint_motor = take_next_integers(index, &j, kj)
-    e.joint_bodies = take_next_integers(index, &j, 2 * kj)
-    e.excluded = take_next_integers(index, &j, 2 * n_excluded)
-    e.pair = take_next_integers(index, &j, 2 * p)
-    e.pair_scratch = take_next_integers(index, &j, 2 * p)
-    e.count = take_next_integers(index, &j, n + 1)
-    e.bucket = take_next_integers(index, &j, size[N_BUCKET])
-    e.chain = take_next_integers(index, &j, grid)
-    e.cell = take_next_integers(index, &j, 4 * grid)
-    e.contact_pair = take_next_integers(index, &j, 2 * c)
-    e.joint_body = take_next_integers(index, &j, 2 * k)
+    e.setting = take_doubles(&a, N_SETTINGS)
+    e.x = take_doubles(&a, 3 * n)
+    e.q = take_doubles(&a, 4 * n)
+    e.v = take_doubles(&a, 6 * n)
+    e.inv_mass_body = take_doubles(&a, n)
+    e.inertia = take_doubles(&a, 9 * n)
+    e.inv_inertia_body = take_doubles(&a, 9 * n)
+    e.shape = take_doubles(&a, 4 * n)
+    e.friction = take_doubles(&a, n)
+    e.restitution = take_doubles(&a, n)
+    e.patch = take_doubles(&a, n)
+    e.rot = take_doubles(&a, 9 * frames)
+    e.fat = take_doubles(&a, 6 * n)
+    e.joint = take_doubles(&a, N_JOINT_REAL * kj)
+    e.joint_error = take_doubles(&a, mj)
+    e.jac = take_doubles(&a, 12 * mj)
+    e.minv_jac = take_doubles(&a, 12 * mj)
+    e.joint_impulse = take_doubles(&a, mj)
+    e.inv_mass = take_doubles(&a, nd)
+    e.inv_inertia = take_doubles(&a, 9 * nd)
+    e.v_free = take_doubles(&a, 6 * nd)
+    e.dv = take_doubles(&a, 6 * nd)
+    e.shift = take_doubles(&a, 6 * nd)
+    e.point = take_doubles(&a, 3 * c)
+    e.gap = take_doubles(&a, c)
+    e.normal = take_doubles(&a, 3 * c)
+    e.tangent = take_doubles(&a, 3 * nt)
+    e.arm_a = take_doubles(&a, 3 * c)
+    e.arm_b = take_doubles(&a, 3 * c)
+    e.coupling = take_doubles(&a, 5 * nt)
+    e.inv_inertia_arm = take_doubles(&a, 6 * (m - mj))
+    e.local = take_doubles(&a, 6 * c)
+    e.cache_impulse = take_doubles(&a, N_CACHE_IMPULSE * c)
+    e.cache_local = take_doubles(&a, 6 * c)
+    e.push = take_doubles(&a, mj + c)
+    e.target = take_doubles(&a, m)
+    e.lower = take_doubles(&a, mj)
+    e.upper = take_doubles(&a, mj)
+    e.b = take_doubles(&a, m)
+    e.d = take_doubles(&a, m)
+    e.step = take_doubles(&a, m)
+    e.compliance = take_doubles(&a, m)
+    e.impulse = take_doubles(&a, m)
+    e.mu = take_doubles(&a, k)
+    e.patch_radius = take_doubles(&a, k)
+    e.rolling = take_doubles(&a, k * rolls)
+    e.cache_roll = take_doubles(&a, 3 * c * rolls)
+    e.head = take_integers(&a, N_HEAD)
+    e.kind_of_shape = take_integers(&a, n)
+    e.dyn = take_integers(&a, n)
+    e.uneven = take_integers(&a, n)
+    e.body_of = take_integers(&a, nd)
+    e.joint_kind = take_integers(&a, kj)
+    e.joint_motor = take_integers(&a, kj)
+    e.joint_bodies = take_integers(&a, 2 * kj)
+    e.excluded = take_integers(&a, 2 * n_excluded)
+    e.pair = take_integers(&a, 2 * p)
+    e.pair_scratch = take_integers(&a, 2 * p)
+    e.count = take_integers(&a, n + 1)
+    e.bucket = take_integers(&a, size[N_BUCKET])
+    e.chain = take_integers(&a, grid)
+    e.cell = take_integers(&a, 4 * grid)
+    e.contact_pair = take_integers(&a, 2 * c)
+    e.joint_body = take_integers(&a, 2 * k)
     e.contact_body = e.joint_body + 2 * kj
-    e.ptr = take_next_integers(index, &j, k + 1)
-    e.kind = take_next_integers(index, &j, k)
-    e.order = take_next_integers(index, &j, k)
-    e.order_scratch = take_next_integers(index, &j, 2 * (n + k) + 8)
+    e.ptr = take_integers(&a, k + 1)
+    e.kind = take_integers(&a, k)
+    e.order = take_integers(&a, k)
+    e.order_scratch = take_integers(&a, 2 * (n + k) + 8)
     e.key = keys
     e.cache_key = keys + c
-    used[0] = i
-    used[1] = j
     e.color_scratch = keys + 2 * c
-    used[2] = 2 * c + nd
+    used[0], used[1], used[2] = a.n_real, a.n_index, 2 * c + nd

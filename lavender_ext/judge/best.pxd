@@ -29,6 +29,7 @@ from lavender_ext.core.block cimport euclidean_norm
 from lavender_ext.core.block_types cimport (CONE, ROUND, blocks_t, friction_components_t, get_friction_components,
                                             has_independent_rows)
 from lavender_ext.core.csr cimport measure_asymmetry_and_bandwidth
+from lavender_ext.core.start cimport clip_zero_to_row_bounds
 from lavender_ext.core.view cimport view_t
 from lavender_ext.judge.score cimport score_t, unit_roundoff
 from lavender_ext.judge.tally cimport get_block_in_order, index_of_island_begin, index_of_island_end
@@ -346,11 +347,6 @@ cdef inline double relative_residual_at_zero(const blocks_t* p, int32_t island, 
     return p.islands.reference[2 * p.islands.n + island] if p.islands != NULL else of_all
 
 
-cdef inline double clip_zero_to_row(const blocks_t* p, int32_t k) noexcept nogil:
-    """Return 0 clipped to the bounds of row k [N s]."""
-    return p.lower[k] if p.lower[k] > 0.0 else p.upper[k] if p.upper[k] < 0.0 else 0.0
-
-
 cdef inline bint replace_stale_islands(const blocks_t* p, const double* now, double at_zero, double* lam) noexcept nogil:
     """Set lam (m) to zero, clipped to its bounds, in the islands in which that has a lower relative residual.
 
@@ -366,7 +362,7 @@ cdef inline bint replace_stale_islands(const blocks_t* p, const double* now, dou
         for a in range(index_of_island_begin(p, island), index_of_island_end(p, island)):
             i = get_block_in_order(order, a)
             for k in range(p.ptr[i], p.ptr[i + 1]):
-                x = clip_zero_to_row(p, k) if has_independent_rows(p, i) else 0.0
+                x = clip_zero_to_row_bounds(p, k) if has_independent_rows(p, i) else 0.0
                 changed |= lam[k] != x
                 lam[k] = x
     return changed
@@ -389,7 +385,7 @@ cdef inline void store_zero_if_better(best_t* s, const view_t* v, double energy_
         for a in range(index_of_island_begin(p, i), index_of_island_end(p, i)):
             block = get_block_in_order(order, a)
             for k in range(p.ptr[block], p.ptr[block + 1]):
-                at_bound = at_bound or clip_zero_to_row(p, k) != 0.0
+                at_bound = at_bound or clip_zero_to_row_bounds(p, k) != 0.0
         if at_bound:                                    # f of the clipped zero impulse is not known without a pass.
             continue
         relative = relative_residual_at_zero(p, i, at_zero)

@@ -11,58 +11,15 @@ v = M^-1 J^T lam, and a second loop computes J v.
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport compute_block_error
 from lavender_ext.core.csr cimport csr_row_dot, csr_row_dot_with_abs_sum
 from lavender_ext.core.generalized cimport add_abs_panel_transpose_product, multiply_abs_whitened_panel
-from lavender_ext.core.block_types cimport blocks_t, has_independent_rows
+from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.rows cimport get_block_jacobian
 from lavender_ext.core.velocity cimport add_vector_6, compute_velocity_change
 from lavender_ext.core.view cimport csr_t, generalized_t, get_block_bodies, rows_t
 from lavender_ext.judge.score cimport score_t
 from lavender_ext.judge.slack cimport compute_generalized_slack, compute_body_slack
-from lavender_ext.judge.tally cimport (
-    add_block_floor, add_row_floor, begin_island_scores, get_block_in_order, add_island_to_score, write_score_floor,
-    floor_t, index_of_island_begin, index_of_island_end, make_empty_floor, make_empty_tally, write_score_norms,
-    score_all_blocks, add_block_error, tally_t,
-)
-
-
-# -- islands --------------------------------------------------------------------------------------------
-
-
-cdef inline void add_island_floor_to_total(const floor_t* island, floor_t* total) noexcept nogil:
-    """Add the floor of an island to the floor of all rows."""
-    total.energy += island.energy
-    if island.fast > total.fast:
-        total.fast = island.fast
-
-
-cdef inline void score_with_floor(const blocks_t* p, const rows_t* r, const double* lam, const double* w, double* e,
-                                  const double* sizes, score_t* out) noexcept nogil:
-    """Compute errors e, norms and floors from the slack w, island by island.
-
-    With bodies r, sizes is the result of `compute_abs_velocity`. If r is NULL, sizes (m) is an upper bound of |A| |lam|.
-    """
-    cdef int32_t island, a, i, end, n = begin_island_scores(p, out)
-    cdef const int32_t* order = p.islands.order if p.islands != NULL else NULL
-    cdef tally_t own, s = make_empty_tally()
-    cdef floor_t floor, f = make_empty_floor()
-    for island in range(n):
-        own = make_empty_tally()
-        floor = make_empty_floor()
-        end = index_of_island_end(p, island)
-        for a in range(index_of_island_begin(p, island), end):
-            i = get_block_in_order(order, a)
-            compute_block_error(p, i, lam, w, e)
-            add_block_error(p, i, e, &own)
-            if r == NULL:
-                add_block_floor(p, i, lam, w, e, sizes + p.ptr[i], &floor)
-            else:
-                add_body_block_floor(p, r, i, lam, w, e, sizes, &floor)
-        add_island_to_score(p, island, w, e, &own, &floor, &s, out)
-        add_island_floor_to_total(&floor, &f)
-    write_score_norms(p, e, &s, out)
-    write_score_floor(&f, out)
+from lavender_ext.judge.tally cimport score_all_blocks
 
 
 # -- A in compressed rows ----------------------------------------------------------------------------
@@ -75,43 +32,17 @@ cdef inline void compute_csr_slack(const blocks_t* p, const csr_t* a, const doub
         w[i] = csr_row_dot(a, i, lam) - p.b[i]
 
 
-cdef inline void judge_csr_block(const blocks_t* p, const csr_t* a, int32_t i, const double* lam, double* w, double* e, tally_t* s,
-                           floor_t* f) noexcept nogil:
-    """Compute slack and error of block i; add the error to s and its rounding to f."""
-    cdef int32_t j = p.ptr[i], k
-    cdef double size[6]
-    for k in range(j, p.ptr[i + 1]):
-        w[k] = csr_row_dot_with_abs_sum(a, k, lam, size + (0 if has_independent_rows(p, i) else k - j)) - p.b[k]
-        if has_independent_rows(p, i):                               # Such a block may have any number of rows.
-            add_row_floor(p, k, lam[k], w[k], size[0], f)
-    compute_block_error(p, i, lam, w, e)
-    add_block_error(p, i, e, s)
-    if not has_independent_rows(p, i):
-        add_block_floor(p, i, lam, w, e, size, f)
-
-
-cdef inline void judge_impulse_over_csr(const blocks_t* p, const csr_t* a, const double* lam, double* w, double* e, bint floor,
-                           score_t* out) noexcept nogil:
-    """Judge lam over A in compressed rows."""
-    cdef int32_t island, k, end, n
-    cdef const int32_t* order = p.islands.order if p.islands != NULL else NULL
-    cdef tally_t own, s = make_empty_tally()
-    cdef floor_t island_floor_, f = make_empty_floor()
+cdef inline void judge_impulse_over_csr(const blocks_t* p, const csr_t* a, const double* lam, double* w, double* e, double* sizes,
+                                        bint floor, score_t* out) noexcept nogil:
+    """Judge lam over A in compressed rows; sizes (m) is scratch, not used without a floor."""
+    cdef int32_t i
     if not floor:
         compute_csr_slack(p, a, lam, w)
-        score_all_blocks(p, lam, w, e, out)
+        score_all_blocks(p, lam, w, e, NULL, out)
         return
-    n = begin_island_scores(p, out)
-    for island in range(n):
-        own = make_empty_tally()
-        island_floor_ = make_empty_floor()
-        end = index_of_island_end(p, island)
-        for k in range(index_of_island_begin(p, island), end):
-            judge_csr_block(p, a, get_block_in_order(order, k), lam, w, e, &own, &island_floor_)
-        add_island_to_score(p, island, w, e, &own, &island_floor_, &s, out)
-        add_island_floor_to_total(&island_floor_, &f)
-    write_score_norms(p, e, &s, out)
-    write_score_floor(&f, out)
+    for i in range(p.n_rows):
+        w[i] = csr_row_dot_with_abs_sum(a, i, lam, sizes + i) - p.b[i]
+    score_all_blocks(p, lam, w, e, sizes, out)
 
 
 # -- the factored form -------------------------------------------------------------------------------
@@ -163,35 +94,26 @@ cdef inline double compute_row_abs_velocity(const double* jac, const int32_t* bo
     return s + t
 
 
-cdef inline void add_body_block_floor(const blocks_t* p, const rows_t* r, int32_t i, const double* lam, const double* w,
-                                      const double* e, const double* sizes, floor_t* f) noexcept nogil:
-    """Add the rounding of the rows of block i to f; sizes is the result of `compute_abs_velocity`."""
-    cdef int32_t k, j = p.ptr[i]
-    cdef double size[6]
-    cdef double scratch[72]
-    cdef double one
-    cdef const double* jac = get_block_jacobian(p, r, i, scratch)
-    for k in range(p.ptr[i + 1] - j):
-        one = r.compliance[j + k] * fabs(lam[j + k]) + compute_row_abs_velocity(jac + 12 * k, get_block_bodies(r, i), sizes)
-        if i < r.n_joints:                                  # A joint may have any number of rows.
-            add_row_floor(p, j + k, lam[j + k], w[j + k], one, f)
-        else:
-            size[k] = one
-    if i >= r.n_joints:
-        add_block_floor(p, i, lam, w, e, size, f)
-
-
 cdef inline void judge_impulse_over_bodies(const blocks_t* p, const rows_t* r, const double* lam, double* w, double* e, double* v,
                             bint floor, score_t* out) noexcept nogil:
-    """Judge lam over bodies; v (12 n) is scratch, (6 n) without a floor."""
-    cdef double* sizes = v + 6 * <ssize_t>r.n_bodies
+    """Judge lam over bodies; v (12 n + m) is scratch, (6 n) without a floor."""
+    cdef double* abs_velocity = v + 6 * <ssize_t>r.n_bodies
+    cdef double* sizes = abs_velocity + 6 * <ssize_t>r.n_bodies
+    cdef double scratch[72]
+    cdef const double* jac
+    cdef int32_t i, j
     compute_velocity_change(p, r, lam, v)
     compute_body_slack(p, r, lam, v, w)
     if not floor:
-        score_all_blocks(p, lam, w, e, out)
+        score_all_blocks(p, lam, w, e, NULL, out)
         return
-    compute_abs_velocity(p, r, lam, sizes)
-    score_with_floor(p, r, lam, w, e, sizes, out)
+    compute_abs_velocity(p, r, lam, abs_velocity)
+    for i in range(p.n_blocks):
+        jac = get_block_jacobian(p, r, i, scratch)
+        for j in range(p.ptr[i], p.ptr[i + 1]):
+            sizes[j] = r.compliance[j] * fabs(lam[j]) + compute_row_abs_velocity(jac, get_block_bodies(r, i), abs_velocity)
+            jac += 12
+    score_all_blocks(p, lam, w, e, sizes, out)
 
 
 # -- generalised coordinates ---------------------------------------------------------------------------
@@ -219,7 +141,7 @@ cdef inline const double* bound_generalized_terms(const blocks_t* p, const gener
 cdef inline void score_generalized_slack(const blocks_t* p, const generalized_t* g, const double* lam, const double* w, double* e,
                                double* x, const double* extra, score_t* out) noexcept nogil:
     """Compute errors e from the slack w, their norms and floors; extra as in `bound_generalized_terms`, x (n + m) is scratch."""
-    score_with_floor(p, NULL, lam, w, e, bound_generalized_terms(p, g, lam, extra, x), out)
+    score_all_blocks(p, lam, w, e, bound_generalized_terms(p, g, lam, extra, x), out)
 
 
 cdef inline void judge_impulse_over_generalized(const blocks_t* p, const generalized_t* g, const double* lam, double* w, double* e,
@@ -229,4 +151,4 @@ cdef inline void judge_impulse_over_generalized(const blocks_t* p, const general
     if floor:
         score_generalized_slack(p, g, lam, w, e, x, NULL, out)
     else:
-        score_all_blocks(p, lam, w, e, out)
+        score_all_blocks(p, lam, w, e, NULL, out)

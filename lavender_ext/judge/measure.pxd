@@ -3,13 +3,16 @@ from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.block_types cimport blocks_t, islands_t
 from lavender_ext.core.problem cimport Data
+from lavender_ext.core.start cimport clip_zero_to_row_bounds
 from lavender_ext.core.view cimport generalized_t, view_t
 from lavender_ext.judge.score cimport zero_if_at_floor, all_finite_numbers, floor_hides_residual, relative_residual, score_t
 
 
 cdef inline int64_t count_judge_scratch(const view_t* v) noexcept nogil:
     """Return the number of scratch doubles of `judge_view`, and over J and M of its refinement (judge/refine.pxd)."""
-    return 6 * <int64_t>v.g.n + 2 * <int64_t>v.p.n_rows if v.g != NULL else 12 * <int64_t>v.r.n_bodies if v.r != NULL else 0
+    if v.g != NULL:
+        return 6 * <int64_t>v.g.n + 2 * <int64_t>v.p.n_rows
+    return (12 * <int64_t>v.r.n_bodies if v.r != NULL else 0) + v.p.n_rows
 
 
 cdef void judge_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, bint floor,
@@ -35,11 +38,7 @@ cdef inline bint set_zero_impulse(const blocks_t* p, double* x, double* w) noexc
     cdef int32_t i
     cdef bint moves = False
     for i in range(p.n_rows):
-        x[i] = 0.0
-        if p.lower[i] > 0.0:
-            x[i] = p.lower[i]
-        elif p.upper[i] < 0.0:
-            x[i] = p.upper[i]
+        x[i] = clip_zero_to_row_bounds(p, i)
         moves |= x[i] != 0.0
         w[i] = -p.b[i]
     return moves
@@ -90,6 +89,9 @@ cdef class Judged:
     cdef double known_loss                              # `loss`, negative before it is computed
     cdef readonly int worst                             # row of the largest velocity error, or -1
     cdef readonly int island                            # island with the largest relative residual, or -1
+
+    cdef void set_score(self, Data p, object impulse, object both, const score_t* s, double relative_, double floor,
+                        double float64_relative)
 
 
 cdef Judged make_judged(Data p, object impulse, object both, const score_t* s, double relative_, double floor,

@@ -11,9 +11,10 @@ from lavender_ext.core.generalized cimport multiply_whitened_transpose
 from lavender_ext.core.islands cimport find_islands, has_no_moving_body, island_workspace_integers, list_one_island
 from lavender_ext.core.block_types cimport blocks_t, islands_t
 from lavender_ext.core.problem cimport Data, Workspace, allocate_bytes
+from lavender_ext.core.start cimport clip_zero_to_row_bounds
 from lavender_ext.core.velocity cimport compute_velocity_change
 from lavender_ext.core.view cimport generalized_t, view_t
-from lavender_ext.judge.best cimport (best_workspace_size, best_t, bind_best, clip_zero_to_row,
+from lavender_ext.judge.best cimport (best_workspace_size, best_t, bind_best,
                                       count_islands, copy_score_without_islands, replace_stale_islands, store_better_islands,
                                       store_better_start)
 from lavender_ext.judge.forms cimport (compute_csr_slack, judge_impulse_over_bodies, judge_impulse_over_csr,
@@ -33,14 +34,14 @@ cdef void judge_view(const view_t* v, const double* lam, double* w, double* e, d
                      score_t* out) noexcept nogil:
     """Judge lam (m) [N s]: compute its slack w (m) [m/s], its error e (m) [N s] and the norms in `out`, with `floor` the floors.
 
-    scratch has `count_judge_scratch` doubles; half of these suffice over bodies without a floor.
+    scratch has `count_judge_scratch` doubles; without a floor 6 n suffice over n bodies, and none over A.
     """
     if v.g != NULL:
         judge_impulse_over_generalized(&v.p, v.g, lam, w, e, scratch, floor, out)
     elif v.r != NULL:
         judge_impulse_over_bodies(&v.p, v.r, lam, w, e, scratch, floor, out)
     else:
-        judge_impulse_over_csr(&v.p, v.a, lam, w, e, floor, out)
+        judge_impulse_over_csr(&v.p, v.a, lam, w, e, scratch, floor, out)
 
 
 cdef bint refine_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, double reference_energy,
@@ -81,7 +82,7 @@ cdef void score_given_generalized_slack(const blocks_t* p, const generalized_t* 
 
 cdef void score_given_slack(const blocks_t* p, const double* lam, const double* w, double* e, score_t* out) noexcept nogil:
     """Compute errors e (m) from the slack w and their norms, without floors."""
-    score_all_blocks(p, lam, w, e, out)
+    score_all_blocks(p, lam, w, e, NULL, out)
 
 
 cdef void find_reference(blocks_t* p, const double* x, const double* w, const double* e, double* out) noexcept nogil:
@@ -102,7 +103,7 @@ cdef void judge_zero_impulse(view_t* v, int32_t* index, islands_t* islands, doub
     if set_zero_impulse(&v.p, x, w):
         judge_view(v, x, w, e, scratch, False, &s)
     else:
-        score_all_blocks(&v.p, x, w, e, &s)
+        score_all_blocks(&v.p, x, w, e, NULL, &s)
     islands.reference = reference
     if find_islands(v, index, islands) > 1:
         v.p.islands = islands
@@ -179,14 +180,7 @@ cdef double estimate_factor_loss_of_pass(Data p, impulse, both) except -1.0:
 cdef Judged make_judged(Data p, impulse, both, const score_t* s, double relative_, double floor, double float64_relative=NAN):
     """Create the result of a pass over `impulse`, with w and e in `both` (2 m + 1)."""
     cdef Judged judged = Judged.__new__(Judged)
-    judged.data, judged.impulse, judged.both = p, impulse, both
-    judged.energy = s.energy if s.finite else 1.0 / 0.0
-    judged.velocity = s.velocity if s.finite else 1.0 / 0.0
-    judged.floor_energy = s.floor_energy
-    judged.worst, judged.island = s.worst, s.island
-    judged.relative, judged.roundoff_floor, judged.above_floor = relative_, floor, residual_above_floor(s, relative_, floor)
-    judged.float64_relative = float64_relative
-    judged.known_loss = -1.0 if p.is_general and float64_relative != float64_relative else 0.0
+    judged.set_score(p, impulse, both, s, relative_, floor, float64_relative)
     return judged
 
 
@@ -206,26 +200,26 @@ cdef class Judged:
         cdef Workspace workspace
         cdef view_t v = p.get_pointers()
         cdef score_t s = make_empty_score()
-        self.data = p
-        self.impulse = impulse
-        self.both = both = np.empty(2 * m + 1)
+        numbers = both = np.empty(2 * m + 1)
         w = &both[0]
         e = w + m
         if m > 0:
             workspace = allocate_bytes(count_judge_scratch(&v) * sizeof(double))
             with nogil:
                 judge_view(&v, &lam[0], w, e, <double*>workspace.at, True, &s)
+        self.set_score(p, impulse, numbers, &s,
+                       relative_residual_of_score(&s, w, p.blocks.n_rows, p.reference_energy, p.reference_velocity),
+                       relative_floor_of_score(&s, p.reference_energy, p.reference_velocity), NAN)
+
+    cdef void set_score(self, Data p, impulse, both, const score_t* s, double relative_, double floor, double float64_relative):
+        """Set the fields from the score of a pass over `impulse`, with w and e in `both` (2 m + 1)."""
+        self.data, self.impulse, self.both = p, impulse, both
         self.energy = s.energy if s.finite else 1.0 / 0.0
         self.velocity = s.velocity if s.finite else 1.0 / 0.0
-        self.floor_energy = s.floor_energy
-        self.worst, self.island = s.worst, s.island
-        self.roundoff_floor = relative_floor_of_score(&s, p.reference_energy, p.reference_velocity)
-        self.relative = relative_residual_of_score(&s, w, p.blocks.n_rows, p.reference_energy, p.reference_velocity)
-        self.above_floor = residual_above_floor(&s, self.relative, self.roundoff_floor)
-        self.float64_relative, self.known_loss = NAN, 0.0
-        if p.is_general and m > 0:
-            self.known_loss = estimate_factor_loss(&p.blocks, &p.general, &lam[0], w, <double*>workspace.at, p.reference_energy,
-                                             p.reference_velocity, 0.0)
+        self.floor_energy, self.worst, self.island = s.floor_energy, s.worst, s.island
+        self.relative, self.roundoff_floor, self.above_floor = relative_, floor, residual_above_floor(s, relative_, floor)
+        self.float64_relative = float64_relative
+        self.known_loss = -1.0 if p.is_general and float64_relative != float64_relative else 0.0
 
     @property
     def loss(self):
@@ -357,7 +351,7 @@ def replace_stale_start(Data p, double[::1] lam):
     cdef score_t s = make_empty_score()
     cdef Workspace workspace
     cdef double* w
-    while k < m and lam[k] == clip_zero_to_row(&p.blocks, k):
+    while k < m and lam[k] == clip_zero_to_row_bounds(&p.blocks, k):
         k += 1
     if k == m:
         return

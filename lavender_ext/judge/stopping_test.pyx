@@ -247,7 +247,7 @@ cdef class StoppingTest:
             self.other = confirm.get_pointers()
             self.confirm = &self.other
         workspace = stopping_test_workspace_size(m, count_islands(&self.view.p))
-        scratch = np.empty(workspace + 2 * m + count_judge_scratch(&self.other) + 4)
+        scratch = np.empty(workspace + 2 * m + max(count_judge_scratch(&self.view), count_judge_scratch(&self.other)) + 4)
         self.keep = data, confirm, scratch
         begin_stopping_test(&self.state, &self.view.p, data.reference_energy, data.reference_velocity, data.relative_at_zero,
                             patience, &scratch[0])

@@ -242,12 +242,6 @@ cdef inline void add_block_floor(const blocks_t* p, int32_t i, const double* lam
             add_slack_rounding(p, j + k, j, slack_rounding_of_row(p, j + k, x), s)
 
 
-cdef inline void write_score_floor(const floor_t* s, score_t* out) noexcept nogil:
-    """Write the floor entries of the score."""
-    out.floor_energy = sqrt(s.energy)
-    out.floor_velocity = sqrt(s.fast)
-
-
 cdef inline int32_t begin_island_scores(const blocks_t* p, score_t* out) noexcept nogil:
     """Initialise the score before the first `add_island_to_score`; return the number of islands."""
     if p.islands == NULL:
@@ -322,17 +316,28 @@ cdef inline void add_island_to_score(const blocks_t* p, int32_t island, const do
         total.fast, total.worst = s.fast, s.worst
 
 
-cdef inline void score_all_blocks(const blocks_t* p, const double* lam, const double* w, double* e, score_t* out) noexcept nogil:
-    """Compute the errors e (m) of all blocks and their norms; the floor entries are not changed."""
+cdef inline void score_all_blocks(const blocks_t* p, const double* lam, const double* w, double* e, const double* sizes,
+                                  score_t* out) noexcept nogil:
+    """Compute the errors e (m) of all blocks and their norms, island by island.
+
+    sizes (m) is an upper bound of |A| |lam|, from which the floors are computed. If it is NULL, the floor entries are not changed.
+    """
     cdef int32_t island, a, i, end, n = begin_island_scores(p, out)
     cdef const int32_t* order = p.islands.order if p.islands != NULL else NULL
     cdef tally_t own, s = make_empty_tally()
+    cdef floor_t floor, f = make_empty_floor()
     for island in range(n):
-        own = make_empty_tally()
+        own, floor = make_empty_tally(), make_empty_floor()
         end = index_of_island_end(p, island)
         for a in range(index_of_island_begin(p, island), end):
             i = get_block_in_order(order, a)
             compute_block_error(p, i, lam, w, e)
             add_block_error(p, i, e, &own)
-        add_island_to_score(p, island, w, e, &own, NULL, &s, out)
+            if sizes != NULL:
+                add_block_floor(p, i, lam, w, e, sizes + p.ptr[i], &floor)
+        add_island_to_score(p, island, w, e, &own, &floor if sizes != NULL else NULL, &s, out)
+        f.energy += floor.energy
+        f.fast = floor.fast if floor.fast > f.fast else f.fast
     write_score_norms(p, e, &s, out)
+    if sizes != NULL:
+        out.floor_energy, out.floor_velocity = sqrt(f.energy), sqrt(f.fast)

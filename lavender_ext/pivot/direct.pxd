@@ -1,15 +1,15 @@
 """The method of the solver `direct`, step by step, without Python (states in direct.pyx).
 
     t.v, t.e0, t.v0, t.least, t.sweeps, t.linear, t.symmetric, and a, p, band, order, linear.tiny of t.s are set
-    bind_direct_workspace(&t, real, integers)       arrays of as many numbers as the two counts below
+    bind_direct_arrays(&t, &arena)                  twice: to count, and with memory (core/arena.pxd)
     begin_direct_solve(&t, start), or begin_bound_exchanges(&t) from the bounds in t.s.at
     step_direct_solve(&t, max_rounds)               until t.is_over
 
-The counts are `count_direct_workspace_doubles` and `count_direct_workspace_integers`. After each step `best` is the best judged
-impulse.
+After each step `best` is the best judged impulse.
 """
-from libc.stdint cimport int32_t, int64_t
+from libc.stdint cimport int32_t
 
+from lavender_ext.core.arena cimport arena_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport view_t
 from lavender_ext.judge.score cimport score_t
@@ -67,9 +67,7 @@ cdef struct direct_t:
     double halved_from          # residual that the next pass has to halve
 
 
-cdef int64_t count_direct_workspace_doubles(const view_t* v, int64_t band) noexcept nogil
-cdef int64_t count_direct_workspace_integers(const view_t* v) noexcept nogil
-cdef void bind_direct_workspace(direct_t* t, double* real, int32_t* index) noexcept nogil
+cdef void bind_direct_arrays(direct_t* t, arena_t* a) noexcept nogil
 cdef void begin_direct_solve(direct_t* t, const double* start) noexcept nogil
 cdef void begin_bound_exchanges(direct_t* t) noexcept nogil
 cdef int32_t step_direct_solve(direct_t* t, int32_t max_rounds) noexcept nogil

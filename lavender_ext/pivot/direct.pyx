@@ -28,9 +28,9 @@ from libc.string cimport memcpy
 
 import numpy as np
 
+from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles, take_integers
 from lavender_ext.core.block cimport clip
 from lavender_ext.core.problem cimport Data
-from lavender_ext.core.view cimport view_t
 from lavender_ext.factor.linear cimport CHOLESKY, LU
 from lavender_ext.judge.measure cimport (
     residual_above_floor, relative_floor_of_score, judge_view, make_judged, relative_residual_of_score,
@@ -40,7 +40,7 @@ from lavender_ext.judge.score cimport is_at_floor, make_empty_score, score_t
 from lavender_ext.pivot.direct cimport (CYCLING, DESCENT, EXCHANGE, GUESS, PASS, PASS_ENDED, PASS_HALVED, PASSES_USED,
                                         direct_t)
 from lavender_ext.pivot.principal cimport (
-    INDEFINITE, ROUNDS_USED, SMALL_PIVOT, SOLVED, STUCK, bind_pivoting_workspace, compute_slack_and_rounding,
+    INDEFINITE, ROUNDS_USED, SMALL_PIVOT, SOLVED, STUCK, bind_pivoting_arrays, compute_slack_and_rounding,
     correct_free_row_solution, exchange_infeasible_rows, factor_all_rows, factor_free_rows, guess_free_rows_by_sweeps,
     pivoting_t, reset_exchange_patience, reset_pivoting, run_exchange_rounds, set_diagonal_shift,
     solve_with_all_rows_free,
@@ -55,33 +55,23 @@ cdef enum:
     MAX_STEP_LENGTHS = 41       # Largest number of step lengths in a line search: 1, 1/2, ... 2^-40.
 
 
-# -- workspace and begin -----------------------------------------------------------------------------------------
+# -- arrays and begin --------------------------------------------------------------------------------------------
 
-cdef int64_t count_direct_workspace_doubles(const view_t* v, int64_t band) noexcept nogil:
-    """Return the number of doubles that `bind_direct_workspace` needs; half bandwidth -1: without a compiled factor."""
-    cdef int64_t m = v.p.n_rows
-    return 16 * m + m * (band + 1) + 1 + count_judge_scratch(v)
-
-
-cdef int64_t count_direct_workspace_integers(const view_t* v) noexcept nogil:
-    """Return the number of integers that `bind_direct_workspace` needs."""
-    return 4 * <int64_t>v.p.n_rows + 1
-
-
-cdef void bind_direct_workspace(direct_t* t, double* real, int32_t* index) noexcept nogil:
-    """Bind the arrays of t. The fields listed in direct.pxd must be set before."""
+cdef void bind_direct_arrays(direct_t* t, arena_t* a) noexcept nogil:
+    """Take the arrays of t from an arena; the fields listed in direct.pxd must be set before."""
     cdef int64_t m = t.v.p.n_rows
-    t.x, t.best = real, real + 3 * m
-    t.start, t.origin, t.slope, t.step = real + 6 * m, real + 7 * m, real + 8 * m, real + 9 * m
-    t.scratch = real + 10 * m
-    t.side = index + 3 * m
-    bind_pivoting_workspace(&t.s, t.scratch + count_judge_scratch(&t.v), index)
+    t.x, t.best = take_doubles(a, 3 * m), take_doubles(a, 3 * m)
+    t.start, t.origin = take_doubles(a, m), take_doubles(a, m)
+    t.slope, t.step = take_doubles(a, m), take_doubles(a, m)
+    t.scratch = take_doubles(a, count_judge_scratch(&t.v))
+    bind_pivoting_arrays(&t.s, a)
+    t.s.linear.swap, t.side = take_integers(a, m), take_integers(a, m)
     if not t.symmetric:
-        t.s.linear.swap, t.s.linear.by = index + 2 * m, LU
-    reset_direct_solve(t)
+        t.s.linear.by = LU
 
 
-cdef inline void reset_direct_solve(direct_t* t) noexcept nogil:
+cdef void reset_direct_solve(direct_t* t) noexcept nogil:
+    """Begin without an impulse."""
     reset_pivoting(&t.s)
     t.relative = INFINITY
     t.floor = 0.0
@@ -479,6 +469,7 @@ cdef class Pivoting:
                  bint symmetric=True):
         cdef int32_t m = p.blocks.n_rows
         cdef const int32_t[::1] row_order
+        cdef arena_t arena = make_arena(NULL, NULL)
         cdef double[::1] reals
         cdef int32_t[::1] ints
         if p.factored or p.is_general:
@@ -498,10 +489,12 @@ cdef class Pivoting:
             if m:
                 self.t.s.order = &row_order[0]
         # One array for the vectors and the factor: two allocations in all.
-        self.reals = np.zeros(count_direct_workspace_doubles(&self.t.v, band))
-        self.ints = np.zeros(count_direct_workspace_integers(&self.t.v), np.int32)
+        bind_direct_arrays(&self.t, &arena)
+        self.reals, self.ints = np.zeros(arena.n_real + 1), np.zeros(arena.n_index + 1, np.int32)
         reals, ints = self.reals, self.ints
-        bind_direct_workspace(&self.t, &reals[0], &ints[0])
+        arena = make_arena(&reals[0], &ints[0])
+        bind_direct_arrays(&self.t, &arena)
+        reset_direct_solve(&self.t)
         if outside is not None:
             self.t.s.linear.by = CHOLESKY
             self.t.s.outside = <void*>self

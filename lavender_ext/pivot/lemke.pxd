@@ -1,10 +1,10 @@
-"""Declarations of Lemke's method: bind a workspace, then call `follow_lemke_paths` until it returns DONE.
+"""Declarations of Lemke's method: bind the arrays, then call `follow_lemke_paths` until it returns DONE.
 
 The states are in lemke.pyx.
 """
 from libc.stdint cimport int32_t, int64_t, uint64_t
 
-from lavender_ext.core.block_types cimport blocks_t
+from lavender_ext.core.arena cimport arena_t
 from lavender_ext.pivot.direct cimport direct_t
 
 
@@ -40,9 +40,7 @@ cdef struct lemke_t:
     int32_t max_pivots          # A path ends without a result after this many pivots.
 
 
-cdef int64_t lemke_workspace_doubles(const blocks_t* p) noexcept nogil
-cdef int64_t lemke_workspace_integers(const blocks_t* p) noexcept nogil
-cdef void bind_lemke_workspace(lemke_t* l, direct_t* t, double* real, int32_t* index) noexcept nogil
+cdef void bind_lemke_arrays(lemke_t* l, direct_t* t, arena_t* a) noexcept nogil
 cdef void begin_lemke_solve(lemke_t* l) noexcept nogil
 cdef int32_t follow_lemke_paths(lemke_t* l, int32_t pivots) noexcept nogil
 cdef void judge_unfinished_path(lemke_t* l) noexcept nogil

@@ -40,6 +40,7 @@ from libc.string cimport memcpy
 
 import numpy as np
 
+from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles, take_integers
 from lavender_ext.core.validate cimport norm_inf
 from lavender_ext.core.order cimport next_random
 from lavender_ext.core.block_types cimport blocks_t
@@ -455,24 +456,13 @@ cdef void get_ray_direction(const lemke_t* l, double* y) noexcept nogil:
 
 # -- calls -------------------------------------------------------------------------------------------------------
 
-cdef int64_t lemke_workspace_doubles(const blocks_t* p) noexcept nogil:
-    """Return the number of doubles that `bind_lemke_workspace` needs."""
-    cdef int64_t n = count_complementary_pairs(p)
-    return n * (n + FIRST) + 1
-
-
-cdef int64_t lemke_workspace_integers(const blocks_t* p) noexcept nogil:
-    """Return the number of integers that `bind_lemke_workspace` needs."""
-    return 6 * <int64_t>count_complementary_pairs(p) + FIRST + 1
-
-
-cdef void bind_lemke_workspace(lemke_t* l, direct_t* t, double* real, int32_t* index) noexcept nogil:
-    """Bind the arrays of l for the rows of t. The arrays of t must be bound before."""
-    cdef int32_t n = count_complementary_pairs(t.s.p)
-    l.t = t
-    l.d.t, l.d.width = real, n + FIRST
-    l.row, l.d.initial, l.d.basic = index, index + n, index + 2 * n
-    l.d.nonbasic, l.d.position = index + 3 * n, index + 4 * n + FIRST
+cdef void bind_lemke_arrays(lemke_t* l, direct_t* t, arena_t* a) noexcept nogil:
+    """Take the arrays of l for the rows of t from an arena; t has its arrays, or both are only counted."""
+    cdef int64_t n = count_complementary_pairs(t.s.p)
+    l.t, l.d.width = t, n + FIRST
+    l.d.t = take_doubles(a, n * l.d.width)
+    l.row, l.d.initial, l.d.basic = take_integers(a, n), take_integers(a, n), take_integers(a, n)
+    l.d.nonbasic, l.d.position = take_integers(a, n + FIRST), take_integers(a, 2 * n + 1)
 
 
 cdef void begin_lemke_solve(lemke_t* l) noexcept nogil:
@@ -533,11 +523,14 @@ cdef class Lemke:
     cdef object keep
 
     def __init__(self, Pivoting rows):
-        cdef const blocks_t* p = rows.t.s.p
-        cdef double[::1] real = np.empty(lemke_workspace_doubles(p))
-        cdef int32_t[::1] index = np.empty(lemke_workspace_integers(p), np.int32)
+        cdef arena_t arena = make_arena(NULL, NULL)
+        cdef double[::1] real
+        cdef int32_t[::1] index
+        bind_lemke_arrays(&self.l, &rows.t, &arena)
+        real, index = np.empty(arena.n_real + 1), np.empty(arena.n_index, np.int32)
         self.rows, self.keep = rows, (real, index)
-        bind_lemke_workspace(&self.l, &rows.t, &real[0], &index[0])
+        arena = make_arena(&real[0], &index[0])
+        bind_lemke_arrays(&self.l, &rows.t, &arena)
 
     def set_start(self, const double[::1] start):
         """Begin a solve at start (m,) [N s]."""

@@ -1,6 +1,7 @@
 """Declarations of principal pivoting (`principal.pyx`): its state, results and operations."""
 from libc.stdint cimport int32_t
 
+from lavender_ext.core.arena cimport arena_t
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport csr_t
 from lavender_ext.factor.linear cimport linear_t
@@ -25,7 +26,7 @@ ctypedef void (*outside_solve_t)(void* outside, int32_t n_free, double* y) noexc
 
 
 cdef struct pivoting_t:
-    const csr_t* a              # The caller sets the first five fields before `bind_pivoting_workspace`.
+    const csr_t* a              # The caller sets the first five fields before `bind_pivoting_arrays`.
     const blocks_t* p           # b, d, lower, upper
     int32_t band                # half bandwidth in the order of elimination; -1: no compiled factor
     const int32_t* order        # (n) row that is eliminated first, second, ...; NULL: 0, 1, ...
@@ -53,7 +54,7 @@ cdef struct pivoting_t:
     outside_solve_t solve_outside       # y (n_free) <- solution
 
 
-cdef void bind_pivoting_workspace(pivoting_t* s, double* real, int32_t* index) noexcept nogil
+cdef void bind_pivoting_arrays(pivoting_t* s, arena_t* a) noexcept nogil
 cdef void reset_pivoting(pivoting_t* s) noexcept nogil
 cdef void set_diagonal_shift(pivoting_t* s, double shift) noexcept nogil
 cdef void reset_exchange_patience(pivoting_t* s) noexcept nogil

@@ -3,7 +3,7 @@
     free rows F: (A_FF + s D_FF) x_F = b_F - A_FB x_B + s D_FF center_F,  bound rows B: x = its bound    (1)
     w = A x - b + s D (x - center),   D = diag(d)                                                       (2)
     infeasible: x_i outside its bounds on F, w_i < 0 at a lower, w_i > 0 at an upper bound              (3)
-    exchange all infeasible rows, unless their number has not fallen for MAX_MAX_PATIENCE exchanges         (4)
+    exchange all infeasible rows, unless their number has not fallen for MAX_PATIENCE exchanges         (4)
 
 Judice, Pires 1994 (block principal pivoting; if (4) is stuck, the caller descends on the energy instead).
 s > 0 is the proximal shift of a singular matrix. Free rows are numbered compactly in a fixed order of elimination, so the
@@ -13,6 +13,7 @@ factors D^-1/2 (A_FF + s D_FF) D^-1/2, dense, with row exchanges for the largest
 from libc.math cimport fabs
 from libc.stdint cimport int32_t, int64_t
 
+from lavender_ext.core.arena cimport arena_t, take_doubles, take_integers
 from lavender_ext.core.block cimport project_row_update
 from lavender_ext.core.csr cimport csr_row_dot
 from lavender_ext.core.view cimport csr_t
@@ -356,19 +357,19 @@ cdef void reset_pivoting(pivoting_t* s) noexcept nogil:
     set_diagonal_shift(s, 0.0)
 
 
-cdef void bind_pivoting_workspace(pivoting_t* s, double* real, int32_t* index) noexcept nogil:
-    """Bind 6 n doubles and those of the factor, and 2 n integers, for the matrix that s contains; the factor is LDL^T."""
-    cdef int32_t i, n = s.p.n_rows
-    s.n, s.natural = n, 1
+cdef void bind_pivoting_arrays(pivoting_t* s, arena_t* a) noexcept nogil:
+    """Take the arrays of s and of its factor, LDL^T, from an arena; the first five fields must be set before."""
+    cdef int64_t n = s.p.n_rows
+    cdef int32_t i
+    s.n, s.natural = s.p.n_rows, 1
     if s.order != NULL:
-        for i in range(n):
+        for i in range(s.n):
             s.natural &= s.order[i] == i
-    s.x, s.w, s.f, s.center = real, real + n, real + 2 * n, real + 3 * n
-    s.y, s.size, s.linear.matrix = real + 4 * n, real + 5 * n, real + 6 * n
-    s.at, s.place = index, index + n
+    s.x, s.w, s.f, s.center = take_doubles(a, n), take_doubles(a, n), take_doubles(a, n), take_doubles(a, n)
+    s.y, s.size, s.linear.matrix = take_doubles(a, n), take_doubles(a, n), take_doubles(a, n * (s.band + 1))
+    s.at, s.place = take_integers(a, n), take_integers(a, n)
     s.linear.by, s.linear.wide = CHOLESKY, has_wide()
     s.linear.d = s.linear.scale = s.size
     s.outside = NULL
     s.factor_outside = NULL
     s.solve_outside = NULL
-    reset_pivoting(s)

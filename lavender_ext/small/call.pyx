@@ -13,11 +13,13 @@ from libc.math cimport INFINITY
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcmp, memcpy, memset
 
+cimport cython
+
 import numpy as np
 
+from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles, take_integers
 from lavender_ext.core.arrays cimport as_double_pointer
 from lavender_ext.core.csr cimport measure_asymmetry_and_bandwidth
-from lavender_ext.core.order cimport sort_blocks_by_level
 from lavender_ext.core.block_types cimport (CONE, CONTACT_ROLLING, N_FRICTION_ARRAYS, ROUND, blocks_t, get_friction_arrays,
                                             has_independent_rows, bind_friction_arrays)
 from lavender_ext.core.problem cimport Data
@@ -28,7 +30,7 @@ from lavender_ext.small.call cimport (N_COUNTS, RESULT_FAILED, RESULT_IS_START, 
                                       small_rules_t, solve_workspaces_t)
 from lavender_ext.small.friction cimport friction_run_t, subproblem_t, solve_subproblem, subproblem_work_size
 from lavender_ext.small.limits cimport has_only_free_rows
-from lavender_ext.small.workspace cimport grow_workspace_to, free_workspace
+from lavender_ext.small.workspace cimport fits_workspace, free_workspace, grow_workspace_to, grow_workspace_to_arena
 from lavender_ext.judge.measure cimport (
     set_zero_impulse, relative_floor_of_score, judge_view, make_judged, relative_residual_of_score,
     count_judge_scratch,
@@ -36,12 +38,9 @@ from lavender_ext.judge.measure cimport (
 from lavender_ext.judge.score cimport make_empty_score
 from lavender_ext.local.gauss_seidel cimport prepare_exact_blocks, index_prepared_numbers
 from lavender_ext.pivot.direct cimport (
-    PASS, PASS_HALVED, begin_direct_solve, bind_direct_workspace, direct_t, count_direct_workspace_doubles,
-    count_direct_workspace_integers, is_solved_to_rounding, step_direct_solve,
+    PASS, PASS_HALVED, begin_direct_solve, bind_direct_arrays, direct_t, is_solved_to_rounding, step_direct_solve,
 )
-from lavender_ext.pivot.lemke cimport (RAY, begin_lemke_solve, bind_lemke_workspace, follow_lemke_paths, lemke_t,
-                                       lemke_workspace_doubles,
-                                       lemke_workspace_integers)
+from lavender_ext.pivot.lemke cimport RAY, begin_lemke_solve, bind_lemke_arrays, follow_lemke_paths, lemke_t
 from lavender_ext.pivot.principal cimport SMALL_PIVOT
 
 cdef object new = np.empty
@@ -53,6 +52,7 @@ cdef enum:
     LEMKE_PIVOTS_PER_ROW = 8    # largest number of pivots of Lemke's paths, per row
     EXCHANGE_NS_PER_ROW = 50    # estimated cost [ns] of a round of exchanges per row, in addition to its factorisation
     FULL_SWEEP_ROWS = 12        # Islands with at most this many rows get all sweeps before their factorisations.
+    MAX_KEPT_DOUBLES = 4096     # A larger workspace is freed after a run, since many problems may be kept for long.
     INTERRUPT_CHECK_WORK = 5000000      # multiply-adds between two checks for Ctrl-C, a few milliseconds
 
 
@@ -172,12 +172,15 @@ cdef inline int32_t run_lemke_paths(direct_t* t, double tol, double* remaining_c
     Returns the number of pivots, -1 if the residual is above tol. remaining_cost [ns] is reduced by their cost.
     """
     cdef lemke_t l
+    cdef arena_t arena = make_arena(workspace.real, workspace.index)
     cdef double each = 2.0 * <double>t.s.n ** 2
     cdef int32_t limit = LEMKE_PIVOTS_PER_ROW * t.s.n
     cdef int32_t last = limit if remaining_cost[0] > limit * each else <int32_t>(remaining_cost[0] / each)
-    if not grow_workspace_to(workspace, lemke_workspace_integers(t.s.p), lemke_workspace_doubles(t.s.p)):
-        return -1
-    bind_lemke_workspace(&l, t, workspace.real, workspace.index)
+    bind_lemke_arrays(&l, t, &arena)
+    if not fits_workspace(workspace, &arena):
+        if not grow_workspace_to_arena(workspace, &arena):
+            return -1
+        bind_lemke_arrays(&l, t, &arena)
     begin_lemke_solve(&l)
     while follow_lemke_paths(&l, last - l.n_pivots) == RAY:
         pass
@@ -195,15 +198,18 @@ cdef bint solve_by_pivoting(const small_problem_t* s, double* own, double tol, b
     is not exact to rounding, and Lemke's paths are followed if exchanges are stuck.
     """
     cdef direct_t t
+    cdef arena_t arena = make_arena(workspaces.work.real, workspaces.work.index)
     cdef int32_t path = 0, m = s.v.p.n_rows
     cdef double each = EXCHANGE_NS_PER_ROW * m + 0.1 * m * (s.band + 1.0) ** 2
     cdef bint ended
-    if not grow_workspace_to(&workspaces.work, count_direct_workspace_integers(&s.v), count_direct_workspace_doubles(&s.v, s.band)):
-        return False
     t.v, t.e0, t.v0, t.least = s.v, s.zero_residual[0], s.zero_residual[1], 1e-13
     t.linear, t.symmetric, t.sweeps = s.linear, s.symmetric, ACTIVE_SET_SWEEPS
     t.s.a, t.s.p, t.s.band, t.s.order, t.s.linear.tiny = s.over.a, &s.over.p, s.band, NULL, 1e-13
-    bind_direct_workspace(&t, workspaces.work.real, workspaces.work.index)
+    bind_direct_arrays(&t, &arena)
+    if not fits_workspace(&workspaces.work, &arena):
+        if not grow_workspace_to_arena(&workspaces.work, &arena):
+            return False
+        bind_direct_arrays(&t, &arena)
     # exchanges, then Lemke's paths
     ended = run_exchanges(&t, own, tol, follows, remaining_cost[0] / each)
     remaining_cost[0] -= t.s.n_rounds * each
@@ -276,8 +282,6 @@ cdef enum:                      # doubles of an island's data
     ROW_DOUBLES = 7             # per row: lower, upper, b, d, nu, step, start
     JOINT_ROW_DOUBLES = 24      # per joint row: J, M^-1 J^T
     CONTACT_ROW_DOUBLES = 6     # per contact row: inv_inertia_arm
-    CONTACT_DOUBLES = 17        # per contact: normal, tangent, arm_a, arm_b, coupling
-    BODY_DOUBLES = 10           # per body: 1/m, I^-1
     N_SIZES = 5                 # rows, blocks, entries of A, joint rows, joints
 
 
@@ -291,48 +295,37 @@ cdef struct island_t:           # copied from A or the bodies; its doubles and i
     int64_t n_integers
 
 
-cdef inline double* take_next_numbers(double** at, int64_t n) noexcept nogil:
-    """Return the next n numbers and advance `at`."""
-    cdef double* x = at[0]
-    at[0] = x + n
-    return x
-
-
-cdef inline void bind_island_arrays(island_t* x, double* numbers, int32_t* integers, const int32_t* size, int32_t n) noexcept nogil:
-    """Bind the arrays of an island with the given sizes (N_SIZES) and n bodies, and of its result.
+cdef inline void bind_island_arrays(island_t* x, arena_t* arena, const int32_t* size, int32_t n) noexcept nogil:
+    """Take the arrays of an island with the given sizes (N_SIZES) and n bodies, and of its result, from an arena.
 
     n < 0: over A, without joints.
     """
     cdef blocks_t* p = &x.s.v.p
     cdef rows_t* r = &x.r
-    cdef int32_t m = size[0], k = size[1], nnz = size[2], mj = size[3], c = k - size[4]
-    x.numbers, x.integers = numbers, integers
+    cdef int32_t m = size[0], k = size[1], nnz = size[2], mj = size[3], kj = size[4], c = k - kj
+    x.numbers, x.integers = take_doubles(arena, 0), take_integers(arena, 0)
+    x.n_numbers, x.n_integers = arena.n_real, arena.n_index
     p.n_blocks, p.n_rows, p.islands = k, m, NULL
-    p.lower, p.upper, p.b = take_next_numbers(&numbers, m), take_next_numbers(&numbers, m), take_next_numbers(&numbers, m)
-    p.d, p.nu = take_next_numbers(&numbers, m), take_next_numbers(&numbers, m)
-    p.step, x.s.lam = take_next_numbers(&numbers, m), take_next_numbers(&numbers, m)
-    bind_friction_arrays(p, take_next_numbers(&numbers, N_FRICTION_ARRAYS * k), k)
-    p.ptr, p.kind = integers, integers + k + 1
-    integers += 2 * k + 1
+    p.lower, p.upper, p.b = take_doubles(arena, m), take_doubles(arena, m), take_doubles(arena, m)
+    p.d, p.nu = take_doubles(arena, m), take_doubles(arena, m)
+    p.step, x.s.lam = take_doubles(arena, m), take_doubles(arena, m)
+    bind_friction_arrays(p, take_doubles(arena, N_FRICTION_ARRAYS * k), k)
+    p.ptr, p.kind = take_integers(arena, k + 1), take_integers(arena, k)
     x.s.v.a = x.s.v.r = x.s.v.g = NULL
     if n < 0:
-        x.a.data, x.a.indptr, x.a.indices = take_next_numbers(&numbers, nnz), integers, integers + m + 1
-        integers += m + 1 + nnz
+        x.a.data, x.a.indptr, x.a.indices = take_doubles(arena, nnz), take_integers(arena, m + 1), take_integers(arena, nnz)
         x.s.v.a = &x.a
     else:
-        r.n_bodies, r.n_joints, r.n_contacts = n, size[4], c
-        r.jac, r.minv_jac = take_next_numbers(&numbers, 12 * mj), take_next_numbers(&numbers, 12 * mj)
-        r.normal, r.tangent = take_next_numbers(&numbers, 3 * c), take_next_numbers(&numbers, 3 * c)
-        r.arm_a, r.arm_b = take_next_numbers(&numbers, 3 * c), take_next_numbers(&numbers, 3 * c)
-        r.coupling = take_next_numbers(&numbers, 5 * c)
-        r.inv_inertia_arm = take_next_numbers(&numbers, CONTACT_ROW_DOUBLES * (m - mj))
-        r.compliance = take_next_numbers(&numbers, m)
-        r.inv_mass, r.inv_inertia = take_next_numbers(&numbers, n), take_next_numbers(&numbers, 9 * n)
-        r.joint_body, r.contact_body = integers, integers + 2 * size[4]
-        integers += 2 * k
+        r.n_bodies, r.n_joints, r.n_contacts = n, kj, c
+        r.jac, r.minv_jac = take_doubles(arena, 12 * mj), take_doubles(arena, 12 * mj)
+        r.normal, r.tangent = take_doubles(arena, 3 * c), take_doubles(arena, 3 * c)
+        r.arm_a, r.arm_b = take_doubles(arena, 3 * c), take_doubles(arena, 3 * c)
+        r.coupling, r.inv_inertia_arm = take_doubles(arena, 5 * c), take_doubles(arena, CONTACT_ROW_DOUBLES * (m - mj))
+        r.compliance, r.inv_mass, r.inv_inertia = take_doubles(arena, m), take_doubles(arena, n), take_doubles(arena, 9 * n)
+        r.joint_body, r.contact_body = take_integers(arena, 2 * kj), take_integers(arena, 2 * c)
         x.s.v.r = r
-    x.n_numbers, x.n_integers = numbers - x.numbers, integers - x.integers
-    x.s.answer = numbers
+    x.n_numbers, x.n_integers = arena.n_real - x.n_numbers, arena.n_index - x.n_integers
+    x.s.answer = take_doubles(arena, m)
 
 
 cdef inline void copy_island_blocks(island_t* x, const blocks_t* p, const int32_t* block, const double* lam,
@@ -462,6 +455,7 @@ cdef class Small:
     cdef Data over
     cdef small_problem_t at
     cdef workspace_t workspace
+    cdef workspace_t kept                               # workspace of the last run, which the next run takes
 
     def __init__(self, Data data, Data over):
         self.data, self.over, self.count = data, over, 1
@@ -473,6 +467,12 @@ cdef class Small:
 
     def __dealloc__(self):
         free_workspace(&self.workspace)
+        free_workspace(&self.kept)
+
+    cdef void exchange_kept_workspace(self, workspace_t* r) noexcept:
+        """Exchange a workspace with the kept one, so that no two runs of different threads use the same."""
+        with cython.critical_section(self):
+            self.kept, r[0] = r[0], self.kept
 
     def run(self, impulse, double tol, Rules rules, double max_cost=INFINITY):
         """Solve from `impulse` (m,) [N s], or from the zero impulse if it is None.
@@ -487,11 +487,14 @@ cdef class Small:
         cdef double[::1] own = new(m), both = new(2 * m + 1)
         cdef int32_t code
         memset(&workspaces, 0, sizeof(workspaces))
+        self.exchange_kept_workspace(&workspaces.work)
         if impulse is not None:
             memcpy(&own[0], as_double_pointer(impulse, m), m * sizeof(double))
         try:
             code = self.run_kernel(&s, &rules.at, &own[0], impulse is None, tol, max_cost, &both[0], &workspaces, counts)
         finally:
+            if workspaces.work.n_real <= MAX_KEPT_DOUBLES:
+                self.exchange_kept_workspace(&workspaces.work)
             free_workspace(&workspaces.work)
             free_workspace(&workspaces.more)
         judged = make_judged(self.data, own.base, both.base, &s.score, s.relative, s.floor) if code != RESULT_FAILED else None
@@ -509,22 +512,22 @@ cdef class Islands(Small):
 
     Parameters
     ----------
-    label : (k,) int32
-        Island of each block, from 0 to count - 1.
-    count : int
-        Number of islands, more than one.
+    data : Data
+        Problem for the judge, which has labelled its islands; there are several.
+    over : Data
+        The same problem, or A of it.
     """
 
-    cdef object block, size
+    cdef object size
 
-    def __init__(self, Data data, Data over, const int32_t[::1] label, int count):
+    def __init__(self, Data data, Data over):
         Small.__init__(self, data, over)
-        self.count = count
         cdef const int32_t* ptr = over.blocks.ptr
+        cdef const int32_t* label = data.islands_at.label
         cdef int32_t i, q, k = over.blocks.n_blocks, rows, joints = over.rows.n_joints if over.factored else 0
-        self.size, self.block = np.zeros((self.count, N_SIZES), np.int32), np.empty(k, np.int32)
+        self.count = data.islands_at.n
+        self.size = np.zeros((self.count, N_SIZES), np.int32)
         cdef int32_t[:, ::1] size = self.size
-        cdef int32_t[::1] block = self.block, first = np.empty(self.count + 1, np.int32)
         cdef int32_t[::1] island = np.empty(ptr[k], np.int32)       # of each row
         for i in range(k):
             for q in range(ptr[i], ptr[i + 1]):
@@ -539,7 +542,6 @@ cdef class Islands(Small):
             if i < joints:
                 size[label[i], 3] += rows
                 size[label[i], 4] += 1
-        sort_blocks_by_level(k, &label[0], count, &first[0], &block[0])
 
     cdef int32_t run_kernel(self, small_problem_t* s, const small_rules_t* rules, double* own, bint cold, double tol,
                             double max_cost, double* both, solve_workspaces_t* workspaces, int32_t* counts) except -1:
@@ -563,12 +565,14 @@ cdef class Islands(Small):
         cdef const blocks_t* p = &self.over.blocks
         cdef const rows_t* rows = &self.over.rows
         cdef bint over_bodies = self.over.factored
-        cdef const int32_t[::1] block = self.block
+        cdef const int32_t* block = self.data.islands_at.order
         cdef const int32_t[:, ::1] size = self.size     # N_SIZES of each island
         cdef int32_t n_bodies = rows.n_bodies if over_bodies else 0
         cdef int32_t[::1] place = np.full(p.n_rows, -1, np.int32), at, order, integers, number, body
         cdef double[::1] numbers, work
-        cdef int32_t i, j, q, m, k, n = -1, first = 0
+        cdef int32_t i, j, q, m, k, n = -1
+        cdef int32_t largest[N_SIZES]
+        cdef arena_t counted = make_arena(NULL, NULL), arena
         cdef int64_t swept, read, unchecked = 0
         cdef double factored
         cdef island_t two[2]
@@ -576,11 +580,13 @@ cdef class Islands(Small):
         cdef island_t* last
         cdef bint good = True
         m, k, q, _, _ = self.size.max(axis=0)
-        cdef int64_t each = (ROW_DOUBLES + 1) * <int64_t>m + N_FRICTION_ARRAYS * k + q, whole = 4 * k + m + 2 + q
         if over_bodies:
             n = min(2 * k, n_bodies)
-            each += (JOINT_ROW_DOUBLES + CONTACT_ROW_DOUBLES + 1) * <int64_t>m + CONTACT_DOUBLES * k + BODY_DOUBLES * n
-        numbers, integers, work = np.empty(2 * each), np.empty(2 * whole, np.int32), np.empty(subproblem_work_size(m, max(n, 0)))
+        # The rows of joints take the most doubles of a row, contacts the most of a block.
+        largest[0], largest[1], largest[2], largest[3], largest[4] = m, k, q, m, 0
+        bind_island_arrays(&two[0], &counted, largest, n)
+        numbers, integers = np.empty(2 * counted.n_real), np.empty(2 * counted.n_index, np.int32)
+        work = np.empty(subproblem_work_size(m, max(n, 0)))
         at, order = np.empty(k + 1, np.int32), np.empty(k, np.int32)
         number, body = np.full(n_bodies + 1, -1, np.int32), np.empty(n + 2, np.int32)
         two[1].n_numbers = -1
@@ -590,20 +596,21 @@ cdef class Islands(Small):
                 x, last = &two[i % 2], &two[1 - i % 2]
                 m, k = size[i, 0], size[i, 1]
                 if over_bodies:
-                    n = number_island_bodies(rows, &block[first], k, &number[0], &body[0])
-                bind_island_arrays(x, &numbers[(i % 2) * each], &integers[(i % 2) * whole], &size[i, 0], n)
-                copy_island_blocks(x, p, &block[first], own, &place[0])
+                    n = number_island_bodies(rows, block, k, &number[0], &body[0])
+                arena = make_arena(&numbers[(i % 2) * counted.n_real], &integers[(i % 2) * counted.n_index])
+                bind_island_arrays(x, &arena, &size[i, 0], n)
+                copy_island_blocks(x, p, block, own, &place[0])
                 if over_bodies:
-                    copy_island_bodies(x, p, rows, &block[first], &number[0], &body[0])
+                    copy_island_bodies(x, p, rows, block, &number[0], &body[0])
                 else:
-                    copy_island_matrix(x, p, &self.over.csr, &block[first], &place[0])
+                    copy_island_matrix(x, p, &self.over.csr, block, &place[0])
                 if are_islands_identical(x, last):
                     memcpy(x.s.answer, last.s.answer, m * sizeof(double))
                 else:
                     x.s.split, x.s.at, x.s.prepared, x.s.relative_at_zero = size[i, 4], NULL, NULL, -1.0
                     if p.law == CONE:
                         for j in range(k):
-                            at[j] = self.at.at[block[first + j]]
+                            at[j] = self.at.at[block[j]]
                         x.s.at, x.s.prepared = &at[0], self.at.prepared
                     o.first = count_first_sweeps(&x.s.v.p, o.max_sweeps)
                     swept, factored = o.swept, o.factored
@@ -619,8 +626,8 @@ cdef class Islands(Small):
                             PyErr_CheckSignals()
                 # Write the result back.
                 for j in range(k):
-                    q = block[first + j]
+                    q = block[j]
                     memcpy(&own[p.ptr[q]], x.s.answer + x.s.v.p.ptr[j], (p.ptr[q + 1] - p.ptr[q]) * sizeof(double))
                     memset(&place[p.ptr[q]], 255, (p.ptr[q + 1] - p.ptr[q]) * sizeof(int32_t))     # -1: in no island
-                first += k
+                block += k
         return good

@@ -142,8 +142,7 @@ static int32_t form_matrix(lav_solver *s) {
   s->a.indptr = indptr;
   s->a.indices = index;
   s->a.data = data;
-  k_compute_csr_diagonal(&s->q, &s->a, (double *)(uintptr_t)s->q.d, (double *)(uintptr_t)s->q.step, near);
-  k_compute_csr_velocity_weights(&s->q, (double *)(uintptr_t)s->q.nu);
+  k_compute_csr_diagonal(&s->q, &s->a, near);
   return LAV_OK;
 }
 

@@ -5,11 +5,17 @@
 enum { GUESS_SWEEPS = 2, BATCH = 32 }; /* BATCH: exchanges or pivots between two checks of the clock. */
 static const double TINY_PIVOT = 1e-13;
 
+static void bind_pivots(lav_solver *s, struct core_arena_arena_t *arena) {
+  pivot_direct_bind_direct_arrays(&s->direct, arena);
+  if (s->options.method == LAV_LEMKE) pivot_lemke_bind_lemke_arrays(&s->lemke, &s->direct, arena);
+}
+
 static int32_t start_pivots(lav_solver *s) {
   struct pivot_direct_direct_t *t = &s->direct;
   const int64_t m = s->p.n_rows;
-  int32_t bands[2] = {0, 0}, band, i, *index, *whole = NULL;
-  double asymmetry = 0.0, *real;
+  struct core_arena_arena_t counted = {NULL, NULL, 0, 0}, arena = {NULL, NULL, 0, 0};
+  int32_t bands[2] = {0, 0}, band, i;
+  double asymmetry = 0.0;
   GIVE_BACK(form_matrix(s));
   if (m > 0 && s->a.indptr[m] > 0) asymmetry = core_csr_measure_asymmetry_and_bandwidth(&s->a, s->p.d, (int32_t)m, s->marks, bands);
   t->symmetric = asymmetry <= 1e-14;
@@ -19,13 +25,6 @@ static int32_t start_pivots(lav_solver *s) {
     if (s->p.lower[i] != -INFINITY || s->p.upper[i] != INFINITY) t->linear = 0;
   for (i = 0; i < s->p.n_blocks; i++)
     if (s->p.kind[i] != LAV_ROW) t->linear = 0;
-  real = TAKE(s, double, pivot_direct_count_direct_workspace_doubles(&s->read, band));
-  index = TAKE(s, int32_t, pivot_direct_count_direct_workspace_integers(&s->read));
-  if (s->options.method == LAV_LEMKE) {
-    s->table = TAKE(s, double, pivot_lemke_lemke_workspace_doubles(&s->p));
-    whole = TAKE(s, int32_t, pivot_lemke_lemke_workspace_integers(&s->p));
-  }
-  if (s->is_short) return LAV_ERROR_WORKSPACE;
   t->e0 = s->start[0];
   t->v0 = s->start[1];
   t->least = 1e-13;
@@ -36,8 +35,11 @@ static int32_t start_pivots(lav_solver *s) {
   t->s.band = band;
   t->s.order = NULL;
   t->s.linear.tiny = TINY_PIVOT;
-  pivot_direct_bind_direct_workspace(t, real, index);
-  if (whole) pivot_lemke_bind_lemke_workspace(&s->lemke, t, s->table, whole);
+  bind_pivots(s, &counted);
+  arena.real = TAKE(s, double, counted.n_real);
+  arena.index = TAKE(s, int32_t, counted.n_index);
+  if (s->is_short) return LAV_ERROR_WORKSPACE;
+  bind_pivots(s, &arena);
   return LAV_OK;
 }
 

@@ -52,7 +52,7 @@ static void take_blocks(lav_solver *s, const lav_problem *q) {
   s->n_v = q->form == LAV_BODIES ? 6 * q->n_bodies : q->form == LAV_VELOCITIES ? q->n_velocities : 0;
   s->v_free = TAKE(s, double, s->n_v);
   s->compare = TAKE(s, double, 2 * m + s->n_v);
-  s->stopping_test.v = TAKE(s, double, q->form == LAV_BODIES ? 12 * n : q->form == LAV_VELOCITIES ? 6 * nv + 2 * m : 0);
+  s->stopping_test.v = TAKE(s, double, q->form == LAV_BODIES ? 12 * n + m : q->form == LAV_VELOCITIES ? 6 * nv + 2 * m : m);
 }
 
 /* Numbers of rows of joints and of contacts of bodies, from block_ptr, or else the largest possible numbers. */
@@ -214,9 +214,7 @@ static void fill_bodies(lav_solver *s, const lav_problem *q) {
     core_rows_multiply_jacobian(&s->p, &s->r, s->v_free, s->stopping_test.w);
     for (i = 0; i < q->n_rows; i++) b[i] = (q->target ? q->target[i] : 0.0) - s->stopping_test.w[i];
   }
-  k_compute_body_diagonal(&s->p, &s->r, (double *)(uintptr_t)s->p.d, (double *)(uintptr_t)s->p.nu, (double *)(uintptr_t)s->p.step,
-                  s->empty, (double *)(uintptr_t)s->r.minv_jac, (double *)(uintptr_t)s->r.coupling,
-                  (double *)(uintptr_t)s->r.inv_inertia_arm);
+  k_compute_body_diagonal(&s->p, &s->r, s->empty);
 }
 
 #ifndef LAV_SWEEPS_ONLY

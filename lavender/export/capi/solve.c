@@ -247,8 +247,7 @@ static int32_t set_problem(lav_solver *s, const lav_problem *q) {
   if (q->form == LAV_MATRIX) {
     copy_or(s->p.b, q->b, q->n_rows, 0.0);
     fill_matrix(s->a.indptr, s->a.indices, s->a.data, q->index_ptr, q->index, q->value, q->n_rows, q->n_rows, 0);
-    if (q->n_rows > 0) k_compute_csr_diagonal(&s->p, &s->a, (double *)(uintptr_t)s->p.d, (double *)(uintptr_t)s->p.step, s->empty);
-    k_compute_csr_velocity_weights(&s->p, (double *)(uintptr_t)s->p.nu);
+    if (q->n_rows > 0) k_compute_csr_diagonal(&s->p, &s->a, s->empty);
   } else if (q->form == LAV_BODIES) fill_bodies(s, q);
 #ifndef LAV_SWEEPS_ONLY
   else code = fill_velocities(s, q);
