@@ -316,8 +316,8 @@ class Generalized:
     def bias(self, target: FloatArray) -> FloatArray:
         """Compute b = target - J v* (m,) [m/s, rad/s] for targets (m,)."""
         v = self.v_free if self.order is None else self.v_free[self.order]
-        b: FloatArray = as_array("target", target, (self.m,), finite=False) - self.operator.multiply_jacobian(v)
-        return b
+        values: FloatArray = as_array("target", target, (self.m,), finite=False)
+        return values - self.operator.multiply_jacobian(v)
 
     def momentum_of(self, v: FloatArray) -> FloatArray:
         """Compute M v (nv,) [kg m/s] for velocities v (nv,)."""

@@ -51,7 +51,7 @@ static void replace_stale_start(lav_solver *s) {
   score_t t = judge_score_make_empty_score();
   double *now = s->stopping_test.best.now;
   int32_t i = 0;
-  while (i < s->p.n_rows && s->impulse[i] == judge_best_clip_zero_to_row(&s->p, i)) i++;
+  while (i < s->p.n_rows && s->impulse[i] == core_start_clip_zero_to_row_bounds(&s->p, i)) i++;
   if (i == s->p.n_rows) return;
   t.by_island = now;
   judge_measure_judge_view(&s->read, s->impulse, s->stopping_test.w, s->stopping_test.e, s->stopping_test.v, 0, &t);

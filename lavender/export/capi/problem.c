@@ -287,8 +287,7 @@ static int32_t fill_velocities(lav_solver *s, const lav_problem *q) {
     while (s->g.prow[j + 1] <= s->p.ptr[i]) j++;
     home[i] = j;
   }
-  k_compute_generalized_diagonal(&s->p, &s->g, (double *)(uintptr_t)s->p.d, (double *)(uintptr_t)s->p.nu,
-                     (double *)(uintptr_t)s->p.step, s->empty, s->marks, (double *)(uintptr_t)s->g.y);
+  k_compute_generalized_diagonal(&s->p, &s->g, s->empty, s->marks);
   return LAV_OK;
 }
 #endif
