@@ -78,6 +78,10 @@ DIVERGED_TEXT = (
     "earlier step"
 )
 FLOAT32_GAP = 1e-5  # [-] Largest relative difference of M qacc_smooth and qfrc_smooth of data in float32.
+FLOAT32_ADVICE = (
+    "as in float32: mjx.get_data and mujoco_warp.get_data_into copy results of an engine in float32. Pass the arrays "
+    "of that engine (efc_J, efc_D, efc_aref, ...) to lavender.io.from_efc"
+)
 LAYOUT_NOTE = "(also if opt.jacobian, which determines the layout of efc_J, was changed)"
 NO_TRIANGLE = (np.zeros(1, np.int32), np.zeros(0, np.int32))
 _CODES = (
@@ -244,10 +248,7 @@ def _read_mass(step: Step, data: Any, like: Any) -> tuple[Any, Any]:
     if not gap <= MASS_TOLERANCE:
         difference = f"M qacc_smooth differs from qfrc_smooth by {gap:.1e} of their size"
         if gap <= FLOAT32_GAP:
-            raise CapabilityError(
-                f"{difference}, as in float32: mjx.get_data copies results of MJX in float32. Pass the arrays of the "
-                "mjx.Data (efc_J, efc_D, efc_aref, ...) to lavender.io.from_efc"
-            )
+            raise CapabilityError(f"{difference}, {FLOAT32_ADVICE}")
         raise CapabilityError(
             f"{difference}: the problem was built with another matrix than M. {CHANGED_ADVICE}"
         )
@@ -351,9 +352,11 @@ def _check_jacobian(velocity: float, row: float, push: float, finite: float) -> 
         (push, "J^T efc_force and qfrc_constraint"),
     ):
         if not difference <= SUM_TOLERANCE:
+            is_small = difference <= FLOAT32_GAP
+            cause = f". The difference is {FLOAT32_ADVICE}" if is_small else f" {LAYOUT_NOTE}"
             raise CapabilityError(
                 f"{names} differ by {difference:.1e} of their size: efc_J is not the Jacobian of this forward pass. "
-                f"{CHANGED_ADVICE} {LAYOUT_NOTE}"
+                f"{CHANGED_ADVICE}{cause}"
             )
 
 

@@ -505,9 +505,10 @@ def test_data_of_a_second_model_are_refused():
         lv.io.from_mujoco(other, data)
 
 
-def test_data_in_float32_as_of_mjx_are_rejected_and_from_efc_is_named():
+@pytest.mark.parametrize("fields", [("M", "qacc_smooth", "qfrc_smooth"), ("efc_aref",), ("efc_force",)])
+def test_data_in_float32_as_of_mjx_are_rejected_and_from_efc_is_named(fields):
     model, data = state()
-    for field in ("M", "qacc_smooth", "qfrc_smooth"):
+    for field in fields:
         getattr(data, field)[:] = getattr(data, field).astype(np.float32)
     data.efc_R[:] = 0.0  # mjx.get_data does not write it.
     with pytest.raises(lv.CapabilityError, match=r"as in float32: mjx.get_data .* lavender.io.from_efc"):
