@@ -48,8 +48,9 @@ from lavender.base.errors import InputError, check_name
 from lavender.batch.data import Batch
 from lavender.batch.residuals import residual_many
 from lavender.io.efc import from_mujoco_many
-from lavender.io.recorder import VECTOR, Control
-from lavender.io.stored import lock_step_folder, write_arrays, write_npz
+from lavender.io.npz import write_npz
+from lavender.io.start_states import VECTOR, Control
+from lavender.io.stored import lock_step_folder, write_arrays
 from lavender.judge.residuals import AT_FLOOR, CLOSE, DEFAULT_THRESHOLD, UNCONVERGED, VERDICTS, WRONG
 from lavender.problem import PRECISIONS, Problem
 from lavender.report import machine
@@ -627,7 +628,7 @@ def audit(
         See `Runs`. Default spread: the largest of 0.1, 0.01, 0.001 and 0 m/s with which trial worlds do not diverge.
     engine : {"mujoco", "mjx", "mujoco_warp"}
     states : path of an .npz, "keyframes", or arrays, optional
-        States in which the worlds start: see `lavender.io.recorder`. Default: the model's own.
+        States in which the worlds start: see `lavender.io.start_states`. Default: the model's own.
     keep : int, optional
         Number of worst steps that are kept as problems and states. Default: the worst step of each of three worlds.
     keep_contact_states : bool

@@ -32,7 +32,7 @@ from lavender.io.engine_step import EngineStep
 from lavender.io.genesis import from_genesis
 from lavender.io.kamino import from_kamino
 from lavender.io.newton_mujoco import NEWTON_ADVICE, from_newton_mujoco
-from lavender.io.recorder import check_array_names
+from lavender.io.start_states import check_array_names
 from lavender.io.stored import Archive, read_first_bytes
 
 CLAIM_ENGINES = ("kamino", "newton-mujoco", "genesis")

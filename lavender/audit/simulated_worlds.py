@@ -28,7 +28,7 @@ from lavender.base.arrays import FloatArray, IntArray, check_float, check_int
 from lavender.base.errors import CapabilityError, InputError
 from lavender.batch.data import Batch
 from lavender.io.efc import from_efc
-from lavender.io.recorder import (
+from lavender.io.start_states import (
     Control,
     StartStates,
     can_sleep,

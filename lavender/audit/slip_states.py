@@ -24,7 +24,7 @@ from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.io import mujoco as adapter
 from lavender.io.mujoco_memory import import_mujoco
-from lavender.io.recorder import read_states, without_sleep
+from lavender.io.start_states import read_states, without_sleep
 from lavender.problem import Problem
 
 MAX_REMEDY_STATES = 8  # Settings are simulated from up to this many states, those with the largest slip.

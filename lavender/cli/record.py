@@ -38,7 +38,7 @@ def record(
 
     Exit code 1: a step could not be recorded.
     """
-    from lavender.io.recorder import record_file
+    from lavender.io.recording import record_file
 
     reject_unused_recording_options(context, True)
     recorded = record_file(model, out, steps, precision=precision or "float64", **options)

@@ -210,7 +210,7 @@ def _record_model(
     path = Path(word)
     if path.suffix.lower() != ".xml":
         return word
-    from lavender.io.recorder import record_file
+    from lavender.io.recording import record_file
     from lavender.report.records import make_file_name
 
     model, n = str(path.resolve()), 1

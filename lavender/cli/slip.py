@@ -40,7 +40,7 @@ def slip(model: Path, states: str | None, steps: int, contacts: tuple[str, ...],
     from lavender.audit.slip_figure import draw_slip
     from lavender.audit.slip_states import explain_slip_of_states
     from lavender.base.arrays import check_int
-    from lavender.io.recorder import can_sleep, load_model
+    from lavender.io.start_states import can_sleep, load_model
     from lavender.report.terminal import print_table
     from lavender.report.text import format_count
 

@@ -28,9 +28,11 @@ from lavender.io.genesis import from_genesis
 from lavender.io.kamino import from_kamino
 from lavender.io.mujoco import from_mujoco
 from lavender.io.newton_mujoco import from_newton_mujoco
+from lavender.io.npz import Stored, read_npz, write_npz
 from lavender.io.pinocchio import from_pinocchio
-from lavender.io.recorder import Recorder, Recording, StepVerdict, read_recorded_state, record
-from lavender.io.stored import HDF5, MAX_BYTES, Stored, as_path, read_first_bytes, read_npz, write_npz
+from lavender.io.recorder import Recorder, StepVerdict, read_recorded_state
+from lavender.io.recording import Recording, record
+from lavender.io.stored import HDF5, MAX_BYTES, as_path, read_first_bytes
 from lavender.problem import Problem
 
 __all__ = [

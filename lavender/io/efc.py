@@ -35,7 +35,7 @@ from lavender.batch.data import ERRORS, Batch, check_row_counts, check_shared_lo
 from lavender.io import mujoco as single
 from lavender.io.mujoco_discrete import MASS_TOLERANCE, compute_discrete_matrix, is_active
 from lavender.io.mujoco_memory import CHANGED_ADVICE
-from lavender.io.recorder import can_sleep
+from lavender.io.start_states import can_sleep
 from lavender.problem import FRICTION_LAWS
 from lavender.problem.cones import Cones, get_block_kinds
 from lavender.problem.generalized import Compressed

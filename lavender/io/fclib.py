@@ -24,7 +24,8 @@ from lavender.base.arrays import FloatArray, as_array, check_choice
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.lazy_import import sparse as sp
 from lavender.io.condensed import SPARSE_ENTRY_BYTES, form_dense_a
-from lavender.io.stored import MAX_BYTES, NUMBER_BYTES, Budget, Stored, build_checked_csr, write_bytes
+from lavender.io.npz import Stored, build_checked_csr
+from lavender.io.stored import MAX_BYTES, NUMBER_BYTES, Budget, write_bytes
 from lavender.problem import Problem
 from lavender.problem.cones import Cones
 from lavender.problem.generalized import Generalized

@@ -1,9 +1,7 @@
-"""Problem files: their contents, NumPy archives (.npz), and functions that write files and lock outputs.
+"""Files: paths, locks of outputs, atomic writing, and reading of NumPy archives (.npz).
 
-Three formats of archives are read: our own, the plain box format, and the format of a benchmark generator. Nothing
-in an archive is executed or unpickled. The memory for all entries is computed from their headers before the first
-entry is read, and the arrays are checked against each other before a kernel uses them. `docs/formats.md` describes
-each entry.
+Nothing in an archive is executed or unpickled. The memory for all entries is computed from their headers before the
+first entry is read.
 """
 
 from __future__ import annotations
@@ -19,27 +17,19 @@ import struct
 import time
 import zipfile
 import zlib
-from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass, field, fields, replace
-from functools import lru_cache, partial
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from threading import get_native_id
 from tokenize import TokenError
-from types import MappingProxyType
 from typing import IO, Any
 
 import numpy as np
 from numpy.lib import format as npy
 
-from lavender.base.arrays import FloatArray, as_array, check_bool, check_int
+from lavender.base.arrays import check_bool, check_int
 from lavender.base.errors import InputError, require_packages
-from lavender.base.lazy_import import issparse
-from lavender.base.lazy_import import sparse as sp
-from lavender.problem import PRECISIONS, Problem, check_problem
-from lavender.problem.cones import Cones, get_block_kinds
-from lavender.problem.generalized import Generalized
-from lavender.problem.program import recover_program
-from lavender.problem.rows import Rows
 
 HDF5 = (".hdf5", ".h5", ".hdf")
 SUFFIXES = (".npz", *HDF5)  # Suffixes of problem files.
@@ -63,21 +53,12 @@ TEMPORARY_NAME = re.compile(r"\..*\.(\d+)\.\d+\.part(\.\w+)?")  # Names of files
 # [s] Older temporary files are removed: no write takes this long, so their writer was killed.
 MAX_TEMPORARY_AGE = 86400.0
 
-FORMAT_VERSION = 1
 MAX_NPY_HEADER_BYTES = 10_000  # [bytes] A longer .npy header is rejected; 100 bytes are usual.
 MAX_ARCHIVE_ENTRIES = 1000  # Largest accepted number of entries in an archive; a problem has up to 30.
 # Memory that Python objects need per byte of JSON text, at most; nested empty lists need 24.
 JSON_BYTES_PER_BYTE = 40
 # Compression methods that NumPy writes. Others are rejected: their memory use depends on parameters in the archive.
 ACCEPTED_COMPRESSION = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-CONES = tuple(f"cones_{f.name}" for f in fields(Cones) if f.name != "rolling")
-ROWS = tuple(f"rows_{f.name}" for f in fields(Rows) if f.name != "copy")
-GENERALIZED = (
-    *(f"general_{name}_{part}" for name in ("jac", "mass") for part in ("data", "indices", "indptr")),
-    "general_v_free",
-)
-CSR = ("A_data", "A_indices", "A_indptr", "A_shape")
-OPTIONAL = ("cones_rolling", "guess", "key", "impulse")
 #: Exceptions that zipfile and NumPy raise for damaged archives.
 READ_ERRORS = (
     zipfile.BadZipFile,
@@ -95,41 +76,6 @@ READ_ERRORS = (
     MemoryError,
     RecursionError,
 )
-
-
-@dataclass(frozen=True, eq=False)
-class Stored:
-    """A problem from a file, with the stored solution and guesses.
-
-    Parameters
-    ----------
-    problem : Problem
-    format : str
-        "lavender", "box", "generated", "fclib_local" or "fclib_global", the last two also with the suffix "_rolling".
-    impulse : (m,) N s, optional
-        Stored solution.
-    slack : (m,) m/s, optional
-        Stored slack of that solution.
-    compare : str
-        Unique quantities of the solution, if the file names them: "l,w", "r,u", "w", "u", "error", "no solution".
-    guesses : tuple of (m,) N s
-    info : mapping of str to str
-        Texts of the file: title, description, ...
-    """
-
-    problem: Problem
-    format: str
-    impulse: FloatArray | None = None
-    slack: FloatArray | None = None
-    compare: str = ""
-    guesses: tuple[FloatArray, ...] = ()
-    info: Mapping[str, str] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "info", MappingProxyType(dict(self.info)))
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return partial(Stored, **vars(self) | {"info": dict(self.info)}), ()
 
 
 @contextlib.contextmanager
@@ -636,335 +582,3 @@ def _read_npy_header(stream: IO[bytes], size: int) -> _Header:
             "the file is damaged, save it again"
         )
     return _Header(stream, dtype, shape, fortran)
-
-
-def read_npz(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
-    """Read a problem from an .npz archive of any layout that `docs/formats.md` lists.
-
-    Raises
-    ------
-    InputError
-        The archive is damaged, of another layout, or larger than `max_bytes` in memory.
-    """
-    archive = Archive(path, max_bytes)
-    try:
-        if "lavender_format" in archive:
-            return _read_own_format(archive)
-        if {"kind", "J_data", "minv"} <= set(archive):
-            return _read_generated_format(archive)
-        if {"b", "lo", "hi"} <= set(archive):
-            return _read_box_format(archive)
-    except InputError as error:
-        text = str(error)
-        raise InputError(text if text.startswith(str(path)) else f"{path}: {text}") from None
-    finally:
-        archive.close()
-    has = ", ".join(archive) or "nothing"
-    raise InputError(
-        f"{path} holds the entries {has}; a problem has lavender_format (written by lavender.io.save), or "
-        "b, lo, hi and A"
-    )
-
-
-# -- our own format -------------------------------------------------------------------------------
-
-
-def write_npz(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = None) -> None:
-    """Write a problem in our own format, optionally with an impulse (m,) [N s], for example its solution.
-
-    `read_npz(path).problem == problem`, bit for bit.
-    """
-    check_problem(problem)
-    arrays: dict[str, Any] = {"lavender_format": np.int64(FORMAT_VERSION), "b": problem.b}
-    for name in CONES:
-        arrays[name] = getattr(problem.cones, name.removeprefix("cones_"))
-    if problem.cones.has_rolling:
-        arrays["cones_rolling"] = problem.cones.rolling
-    if problem.rows is not None:
-        for name in ROWS:
-            arrays[name] = getattr(problem.rows, name.removeprefix("rows_"))
-        arrays["compliance"] = problem.compliance
-        operator = "rows"
-    elif problem.generalized is not None:
-        general = problem.generalized
-        for name, x in (("jac", general.jac), ("mass", general.mass)):
-            for part in ("data", "indices", "indptr"):
-                arrays[f"general_{name}_{part}"] = getattr(x, part)
-        arrays["general_v_free"] = general.v_free
-        arrays["compliance"] = problem.compliance
-        operator = "generalized"
-    elif issparse(problem.matrix):
-        a = problem.matrix
-        arrays |= dict(zip(CSR, (a.data, a.indices, a.indptr, np.array(a.shape, np.int64)), strict=True))
-        operator = "csr"
-    else:
-        arrays["A"] = problem.matrix
-        operator = "dense"
-    if problem.guess is not None:
-        arrays["guess"] = problem.guess
-    if problem.key is not None:
-        arrays["key"] = problem.key
-    if impulse is not None:
-        arrays["impulse"] = problem.impulse_array(impulse)
-    names = None if problem.names is None else list(problem.names)
-    meta: dict[str, Any] = {
-        "operator": operator,
-        "friction": problem.friction,
-        "name": problem.name,
-        "names": names,
-    }
-    if problem.precision != "float64":
-        meta["precision"] = problem.precision
-    if problem.generalized is not None:
-        meta["dof_names"] = problem.generalized.names
-    if problem.has_singular_program:
-        meta["program"] = len(problem.qp.q)
-    arrays["meta"] = np.frombuffer(json.dumps(meta).encode("ascii"), np.uint8)
-    write_arrays(path, arrays)
-
-
-def _read_own_format(archive: Archive) -> Stored:
-    """Read a problem in our own format."""
-    version = archive.read_scalar("lavender_format")
-    if version != FORMAT_VERSION or isinstance(version, bool):
-        raise InputError(
-            f"lavender_format is {version!r}; this lavender reads {FORMAT_VERSION}: update it, or save again"
-        )
-    meta = _read_meta(archive)
-    operator = {
-        "dense": ("A",),
-        "csr": CSR,
-        "rows": (*ROWS, "compliance"),
-        "generalized": (*GENERALIZED, "compliance"),
-    }[meta["operator"]]
-    needed = ("lavender_format", "meta", "b", *CONES, *operator)
-    _check_entries(archive, needed, OPTIONAL)
-    for name in archive:
-        if archive[name].dtype.kind not in "iuf":
-            raise InputError(f"entry {name!r} has dtype {archive[name].dtype}; numbers are needed")
-    b, ptr = archive["b"], archive["cones_ptr"]
-    if b.ndim != 1:
-        raise InputError(f"b has shape {b.shape}; one dimension is needed")
-    # Check the number of rows before bounds of that length are allocated.
-    if ptr.ndim != 1 or len(ptr) == 0 or ptr[-1] != len(b):
-        raise InputError(f"b has shape {b.shape}; cones.ptr must end with the number of its rows")
-    optional_parts: dict[str, Any] = {name: archive[name] for name in ("guess", "key") if name in archive}
-    optional_parts["precision"] = meta.get("precision", "float64")
-    if meta["operator"] == "rows":
-        parts: dict[str, Any] = {name.removeprefix("rows_"): archive[name] for name in ROWS}
-        optional_parts["rows"] = Rows(**parts)
-        optional_parts["compliance"] = archive["compliance"]
-    elif meta["operator"] == "generalized":
-        optional_parts["generalized"] = _build_generalized(archive, meta["dof_names"])
-        optional_parts["compliance"] = archive["compliance"]
-    else:
-        optional_parts["matrix"] = _read_matrix(archive)
-    entries = [*CONES, *(["cones_rolling"] if "cones_rolling" in archive else [])]
-    cones = Cones(**{name.removeprefix("cones_"): archive[name] for name in entries})
-    problem = Problem(
-        b, cones, friction=meta["friction"], names=meta["names"], name=meta["name"], **optional_parts
-    )
-    if "program" in meta:
-        n = check_int("program", meta["program"], high=problem.m)
-        problem = replace(problem, qp=recover_program(problem.csr, problem.b, problem.cones, n), copy=False)
-    return Stored(problem, "lavender", impulse=_read_vector(archive, "impulse", problem))
-
-
-def _read_meta(archive: Archive) -> dict[str, Any]:
-    """Read and check the entry 'meta', a JSON object."""
-    try:
-        meta = json.loads(archive["meta"].astype(np.uint8, casting="safe").tobytes())
-    except (ValueError, TypeError, RecursionError) as error:
-        raise InputError(
-            f"entry 'meta' cannot be read as JSON ({error}); JSON text in bytes is needed, as "
-            "lavender.io.save writes it: save the problem again"
-        ) from None
-    if not isinstance(meta, dict):
-        raise InputError(f"entry 'meta' holds a {type(meta).__name__}; a JSON object is needed")
-    needed = ("operator", "friction", "name", "names")
-    for name in needed:
-        if name not in meta:
-            raise InputError(f"entry 'meta' has no {name!r}; {', '.join(needed)} are needed")
-    unknown = sorted(set(meta) - {*needed, "dof_names", "precision", "program"})
-    if unknown:
-        raise InputError(f"entry 'meta' has the unknown names {', '.join(unknown)}: remove them")
-    operators = ("dense", "csr", "rows", "generalized")
-    for name, is_valid, requirement in (
-        ("operator", meta["operator"] in operators, " or ".join(operators)),
-        ("dof_names", ("dof_names" in meta) == (meta["operator"] == "generalized"),
-         "a list of names or null with the operator generalized, and nothing with other operators,"),
-        ("dof_names", _is_name_list(meta.get("dof_names")), "a list of names, or null,"),
-        ("name", isinstance(meta["name"], str), "a text"),
-        ("friction", isinstance(meta["friction"], str), "a text"),
-        ("names", _is_name_list(meta["names"]), "a list of names, or null,"),
-        ("precision", meta.get("precision", "float64") in PRECISIONS, " or ".join(PRECISIONS)),
-        ("program", type(meta.get("program", 0)) is int and ("program" not in meta or meta["operator"] == "csr"),
-         "a number of variables, with the operator csr,"),
-    ):  # fmt: skip
-        if not is_valid:
-            raise InputError(f"entry 'meta': {name} is {meta.get(name)!r:.60}; {requirement} is needed")
-    return meta
-
-
-def _build_generalized(archive: Archive, names: list[str] | None) -> Generalized:
-    """Build the generalised form from its entries."""
-    v_free = archive["general_v_free"]
-    n, m = v_free.size, archive["b"].size
-    jac, mass = (
-        build_checked_csr(
-            archive[f"general_{name}_indptr"],
-            archive[f"general_{name}_indices"],
-            archive[f"general_{name}_data"],
-            rows,
-            n,
-        )
-        for name, rows in (("jac", m), ("mass", n))
-    )
-    return Generalized(jac, mass, v_free, names)
-
-
-def _is_name_list(value: Any) -> bool:
-    return value is None or (isinstance(value, list) and all(isinstance(name, str) for name in value))
-
-
-def _check_entries(archive: Archive, needed: Collection[str], optional: Collection[str]) -> None:
-    """Raise InputError if entries are missing or unknown."""
-    missing = [name for name in needed if name not in archive]
-    if missing:
-        raise InputError(
-            f"the entries {', '.join(missing)} are missing; all entries of the format are needed: save the "
-            "problem again with lavender.io.save"
-        )
-    unknown = [name for name in archive if name not in needed and name not in optional]
-    if unknown:
-        raise InputError(
-            f"the entries {', '.join(unknown)} do not belong to format {FORMAT_VERSION} of this lavender: "
-            "remove them, or install the version that wrote the file"
-        )
-
-
-# -- plain box format and format of a benchmark generator ------------------------------------------
-
-
-def _read_box_format(archive: Archive) -> Stored:
-    """Read the box format: w = A l - b, lo <= l <= hi complementary to w; friction cones become contacts."""
-    b = archive["b"]
-    if b.ndim != 1:
-        raise InputError(f"b has shape {b.shape}; one dimension is needed")
-    cones = _build_box_cones(archive, len(b))
-    problem = Problem(b, cones, _read_matrix(archive), name=Path(archive.path).stem)
-    compare = archive.read_scalar("compare") if "compare" in archive else ""
-    return Stored(
-        problem,
-        "box",
-        impulse=_read_vector(archive, "l_ref", problem),
-        slack=_read_vector(archive, "w_ref", problem),
-        compare=str(compare),
-    )
-
-
-def _build_box_cones(archive: Archive, m: int) -> Cones:
-    """Build the cones of the box format from bounds and, if given, contacts of 1 to 3 rows."""
-    lower, upper = (as_array(f"entry {name!r}", archive[name], (m,), finite=False) for name in ("lo", "hi"))
-    if "cone_start" not in archive or archive["cone_start"].size == 0:
-        return Cones.bounded(lower, upper)
-    integers = {name: archive[name] for name in ("cone_start", "cone_dim")}
-    count = integers["cone_start"].size
-    start, size = (
-        as_array(f"entry {name!r}", x, (count,), dtype=np.int32).astype(np.int64)
-        for name, x in integers.items()
-    )
-    mu = as_array("entry 'cone_mu'", archive["cone_mu"], (count,))
-    order = np.argsort(start)
-    start, size, mu = start[order], size[order], mu[order]
-    end = start + size
-    if size.min() < 1 or size.max() > 3 or start.min() < 0 or end.max() > m or np.any(end[:-1] > start[1:]):
-        raise InputError(
-            "cone_start and cone_dim must describe cones of 1 to 3 rows that do not overlap, within rows 0 "
-            f"to {m - 1}; they have sizes {size.min()} to {size.max()}, from row {start.min()} to "
-            f"{end.max() - 1}"
-        )
-    inside = np.zeros(m, bool)  # Whether a row belongs to the block of the row before it.
-    for s, e in zip(start, end, strict=True):
-        inside[s + 1 : e] = True
-    first = np.flatnonzero(~inside)
-    contact, friction = np.zeros(len(first), bool), np.zeros(len(first))
-    at = np.searchsorted(first, start)
-    contact[at], friction[at] = True, mu
-    return Cones(
-        ptr=np.append(first, m),
-        kind=get_block_kinds(contact),
-        lower=lower,
-        upper=upper,
-        mu=friction,
-        patch_radius=np.zeros(len(first)),
-    )
-
-
-def _read_generated_format(archive: Archive) -> Stored:
-    """Read the layout of a benchmark generator: A, b, and `kind` lcp (l >= 0), free, or cone (3 rows per contact)."""
-    kind = archive.read_scalar("kind")
-    b = archive["b"]
-    name = Path(archive.path).stem
-    if b.ndim != 1:
-        raise InputError(f"b has shape {b.shape}; one dimension is needed")
-    if kind == "lcp":
-        problem = Problem.lcp(_read_matrix(archive), b, name=name)
-    elif kind == "free":
-        problem = Problem.linear(_read_matrix(archive), b, name=name)
-    elif kind == "cone":
-        problem = Problem.contact(_read_matrix(archive), b, archive["mu"], friction="cone", name=name)
-    else:
-        raise InputError(f"entry 'kind' is {kind!r}; 'lcp', 'free' or 'cone' is needed")
-    return Stored(problem, "generated")
-
-
-def _read_vector(archive: Archive, name: str, problem: Problem) -> FloatArray | None:
-    return problem.impulse_array(archive[name], f"entry {name!r}") if name in archive else None
-
-
-def _read_matrix(archive: Archive) -> Any:
-    """Return the matrix A of an archive: the dense entry `A`, or a CSR matrix from entries with checked indices."""
-    if "A" in archive:
-        return archive["A"]
-    m = archive["b"].size
-    shape = tuple(archive["A_shape"].ravel().tolist())
-    if shape != (m, m):
-        raise InputError(f"A_shape is {shape}; ({m}, {m}) is needed, as b has {m} rows")
-    return build_checked_csr(archive["A_indptr"], archive["A_indices"], archive["A_data"], m, m)
-
-
-def build_checked_csr(
-    indptr: np.ndarray, indices: np.ndarray, data: np.ndarray, m: int, n: int
-) -> sp.csr_array:
-    """Build a CSR matrix (m, n) from arrays of a file, with checked indices; `data` may be longer than needed.
-
-    Raises
-    ------
-    InputError
-        An array has the wrong type or length, or an index is out of range.
-    """
-    for name, x, kinds in (("pointers", indptr, "iu"), ("indices", indices, "iu"), ("values", data, "buif")):
-        if x.ndim != 1 or x.dtype.kind not in kinds:
-            raise InputError(
-                f"the {name} of a compressed matrix have dtype {x.dtype} and shape {x.shape}; "
-                f"one dimension of {'whole ' if kinds == 'iu' else ''}numbers is needed"
-            )
-    if len(indptr) != m + 1 or indptr[0] != 0 or np.any(indptr[1:] < indptr[:-1]):
-        raise InputError(
-            f"the pointers of a compressed matrix are {indptr.tolist()!s:.60}; {m + 1} numbers that start with 0 and "
-            f"do not decrease are needed: the first entry of each of its {m} rows, and the number of entries"
-        )
-    used = int(indptr[-1])
-    if used > len(indices) or used > len(data):
-        raise InputError(
-            f"the pointers of a compressed matrix announce {used} entries, but there are {len(indices)} "
-            f"indices and {len(data)} values; equal numbers are needed"
-        )
-    if used and (indices[:used].min() < 0 or indices[:used].max() >= n):
-        raise InputError(
-            f"a compressed matrix has column indices from {indices[:used].min()} to {indices[:used].max()}; "
-            f"0 to {n - 1} is needed, because it has {n} columns"
-        )
-    parts = (data[:used].astype(np.float64), indices[:used].astype(np.int64), indptr.astype(np.int64))
-    return sp.csr_array(parts, shape=(m, n))

@@ -13,7 +13,7 @@ from lavender.audit import audit as module
 from lavender.audit.audit import AUDIT_VERDICTS, audit
 from lavender.audit.simulated_worlds import Frame, Runs
 from lavender.io.efc import from_efc
-from lavender.io.recorder import read_states
+from lavender.io.start_states import read_states
 
 
 def own_errors(path, world, steps, seed=0, spread=0.1):

@@ -7,7 +7,7 @@ import pytest
 from mujoco_scene import mj, scene, state
 
 import lavender as lv
-from lavender.io import recorder
+from lavender.io import recording
 
 PGS = 1e-6  # as in test_io_mujoco.py
 
@@ -56,14 +56,14 @@ def test_record_ctrl_c_keeps_the_steps_until_then(tmp_path):
 
 
 def test_record_ctrl_c_while_a_file_is_written_leaves_no_file_without_a_line(tmp_path, monkeypatch):
-    write = recorder.write_npz
+    write = recording.write_npz
 
     def interrupt(problem, path, impulse):
         write(problem, path, impulse=impulse)
         if path.name == "step_03.npz":
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(recorder, "write_npz", interrupt)
+    monkeypatch.setattr(recording, "write_npz", interrupt)
     assert lv.io.record(*state(steps=1), tmp_path, 20).files == ("step_01.npz", "step_02.npz")
     assert len(list(tmp_path.glob("*.npz"))) == 2
 
@@ -87,7 +87,7 @@ def test_record_of_steps_that_cannot_be_exported_counts_them(tmp_path, monkeypat
     def refuse(model, data, name):
         raise lv.CapabilityError(f"{name} has a constraint of an unknown type")
 
-    monkeypatch.setattr(recorder.adapter, "from_mujoco", refuse)
+    monkeypatch.setattr(recording.adapter, "from_mujoco", refuse)
     found = lv.io.record(*state(steps=1), tmp_path, 20, every=10)
     assert (len(found.files), len(found.left_out)) == (0, 2)
     assert "unknown type" in str(found)
@@ -190,4 +190,4 @@ def test_controls_of_another_thing_are_refused_by_name(tmp_path, make):
     make(path)
     path = next(tmp_path.glob("controls*"), path)  # NumPy gives an archive a suffix of its own
     with pytest.raises(lv.InputError, match="control"):
-        recorder.record_file(tmp_path / "model.xml", tmp_path / "out", 3, control=str(path))
+        recording.record_file(tmp_path / "model.xml", tmp_path / "out", 3, control=str(path))

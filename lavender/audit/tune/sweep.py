@@ -32,7 +32,7 @@ from lavender.audit.tune.world_settings import make_kamino_stages, make_warp_sta
 from lavender.base.arrays import check_float, check_int
 from lavender.base.errors import InputError, check_name
 from lavender.io.efc import from_mujoco_many
-from lavender.io.recorder import Control
+from lavender.io.start_states import Control
 from lavender.judge.residuals import DEFAULT_THRESHOLD
 from lavender.report import machine
 from lavender.report.runner import Event

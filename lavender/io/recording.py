@@ -1,0 +1,283 @@
+"""Step a MuJoCo simulation and record the problem of every n-th step in a folder."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from lavender.base.arrays import FloatArray, check_choice, check_float, check_int
+from lavender.base.errors import InputError, LavenderError
+from lavender.io import mujoco as adapter
+from lavender.io.mujoco_memory import read_step
+from lavender.io.npz import write_npz
+from lavender.io.recorder import describe_answer, write_lines
+from lavender.io.start_states import Control, load_controls, load_model, make_controller, read_states
+from lavender.io.stored import lock_step_folder
+from lavender.judge.residuals import AT_FLOOR, DEFAULT_THRESHOLD, UNCONVERGED, WRONG
+from lavender.problem import PRECISIONS, Problem
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Summary of the files that `record` wrote; `str()` formats it.
+
+    Parameters
+    ----------
+    folder : path
+    files : tuple of str
+        Names of the problem files.
+    without : int
+        Number of selected steps that had no constraints and therefore have no file.
+    left_out : tuple of str
+        Reasons why steps could not be exported, one line each.
+    above_floor : int
+        Number of MuJoCo's answers with an error above the round-off floor.
+    stopped : int
+        Number of MuJoCo's answers with an error above the round-off floor and a velocity error above `threshold`.
+    threshold : float, m/s
+    worst : str
+        Velocity error, row, step and verdict of the worst answer.
+    n_starts : int
+        Number of start states of the recorded steps; 0 if the recording is one simulation.
+    is_interrupted : bool
+        Whether Ctrl-C ended the recording early.
+    """
+
+    folder: Path
+    files: tuple[str, ...]
+    without: int
+    left_out: tuple[str, ...] = field(default=())
+    above_floor: int = 0
+    stopped: int = 0
+    threshold: float = DEFAULT_THRESHOLD
+    worst: str = ""
+    n_starts: int = 0
+    is_interrupted: bool = False
+
+    def __str__(self) -> str:
+        lines = [f"{len(self.files)} problems in {self.folder}"]
+        if self.n_starts:
+            lines.append(
+                f"from {self.n_starts} start states; steps from different states are independent problems"
+            )
+        if self.without:
+            lines.append(f"{self.without} steps without constraints")
+        if self.left_out:
+            lines.append(f"{len(self.left_out)} left out: {self.left_out[0]}")
+        if self.above_floor:
+            threshold = f"{self.threshold:g}".replace("e-0", "e-")
+            counts = f"{self.above_floor} above their floor, {self.stopped} more than {threshold} m/s off"
+            lines.append(f"MuJoCo's own answers: {counts}")
+        return "\n".join(lines + ([f"worst: {self.worst}"] if self.stopped else []))
+
+
+def record(
+    model: Any,
+    data: Any,
+    folder: str | os.PathLike[str],
+    steps: int,
+    *,
+    every: int = 1,
+    control: Control = "random",
+    seed: int = 0,
+    states: Any = None,
+    replace: bool = False,
+    precision: str = "float64",
+    threshold: float = DEFAULT_THRESHOLD,
+) -> Recording:
+    """Step a MuJoCo simulation and write the problem of every `every`-th step to a file.
+
+    Each file holds the problem with keys of its blocks and MuJoCo's own impulse. `engine.jsonl` has a line for each
+    file: file, step, rows, the iterations of the engine's solver and of noslip (in all islands; null if MuJoCo has more
+    islands than it counts, 20), the time of both [s], the number of the start state (if `states` are given), and the
+    judge's result: residual, velocity error [m/s], worst row, round-off floor of the precision, and verdict. After
+    Ctrl-C, the lines and the result describe the steps until then. A step in which MuJoCo's solver stopped before
+    convergence is written with that verdict. A step that cannot be exported has no file; its line holds the reason as
+    `left_out`, which is reported with every measurement of the other steps.
+
+    Parameters
+    ----------
+    model : mujoco.MjModel
+    data : mujoco.MjData
+        Initial state; it is advanced by the steps.
+    folder : path
+        Created if it does not exist.
+    steps : int
+        Steps of the simulation.
+    every : int
+    control : {"random", "zero"}, array (any, nu), or callable (model, data, step)
+        "random" draws uniformly within the ranges of the actuators. An array has the controls of consecutive steps and
+        is repeated from its start when it ends. The result of a callable is written to `data.ctrl`, unless it is None.
+    seed : int
+        Seed of "random".
+    states : path of an .npz, "keyframes", or arrays, optional
+        Start states (`read_states`): the steps are divided evenly among them. The first step from a state uses
+        its controls, if it has any. Steps from different states are independent problems. Default: `data` as it is.
+    replace : bool
+        Whether to remove the problem files of another recording from the folder; if false, such files raise an error.
+    precision : {"float64", "float32"}
+        Precision in which this MuJoCo computes (`mjtNum`); written with each problem.
+    threshold : float, m/s
+        Velocity error up to which MuJoCo's answer is close enough.
+
+    Returns
+    -------
+    Recording
+
+    Raises
+    ------
+    InputError
+        The arguments are not a model and its data; `steps` or `every` is below 1; the control, precision or threshold
+        is invalid; the folder holds a recording; MuJoCo raises an error (out of memory, an unsupported feature).
+    """
+    mj = read_step(model, data).cache.mj
+    steps, every = check_int("steps", steps, 1), check_int("every", every, 1)
+    precision = check_choice("precision", precision, PRECISIONS)
+    threshold = check_float("threshold", threshold, low=0.0)
+    control_at = make_controller(model, control, seed)
+    starts = None if states is None else read_states(mj, model, states).select_evenly(steps)
+    records: list[dict[str, Any]] = []
+    left_out: list[dict[str, Any]] = []
+    without, is_interrupted = 0, False
+    width, file = len(str(steps)), Path()
+    with lock_step_folder(folder, replace) as folder:
+        try:
+            for step, start in iterate_steps(mj, model, data, steps, every, control_at, starts):
+                file = folder / f"step_{step:0{width}d}.npz"
+                line = {"file": file.name, "step": step} | ({} if starts is None else {"start": start})
+                try:
+                    result = _solve_step(mj, model, data, f"step {step}", precision, threshold)
+                except LavenderError as error:
+                    left_out.append({**line, "left_out": str(error)})
+                    continue
+                if result is None:
+                    without += 1
+                    continue
+                problem, impulse, facts = result
+                write_npz(problem, file, impulse=impulse)
+                records.append({**line, **facts})
+        except KeyboardInterrupt:
+            if not records:
+                raise
+            is_interrupted = True
+            if records[-1]["file"] != file.name:
+                file.unlink(missing_ok=True)  # A file without a line would belong to another recording.
+        write_lines(folder, (*records, *left_out))
+    above_threshold = [line for line in records if line["verdict"] in (UNCONVERGED, WRONG)]
+    worst = max(above_threshold, key=lambda line: float(line["velocity"]), default=None)
+    short = ""
+    if worst is not None:
+        verdict = "it " + (UNCONVERGED if worst["verdict"] == UNCONVERGED else f"is {WRONG}")
+        short = f"{worst['velocity']:.2g} m/s off at {worst['worst']}, step {worst['step']}: {verdict}"
+    return Recording(
+        folder=folder,
+        files=tuple(line["file"] for line in records),
+        without=without,
+        left_out=tuple(f"step {line['step']}: {line['left_out']}" for line in left_out),
+        above_floor=sum(line["verdict"] != AT_FLOOR for line in records),
+        stopped=len(above_threshold),
+        threshold=threshold,
+        worst=short,
+        n_starts=len({line["start"] for line in records if "start" in line}),
+        is_interrupted=is_interrupted,
+    )
+
+
+def iterate_steps(
+    mj: Any, model: Any, data: Any, steps: int, every: int, control_at: Callable[..., Any], starts: Any
+) -> Iterator[tuple[int, int]]:
+    """Step a simulation; yield the numbers of every `every`-th step and of its start state.
+
+    `data` then has the constraints of the state after the step. The steps are divided evenly among the start states.
+    The first step from a state uses its controls, if it has any.
+    """
+    firsts = {} if starts is None else {steps * i // len(starts): i for i in range(len(starts))}
+    i = 0
+    for step in range(steps):
+        ctrl = control_at(data, step)
+        if starts is not None and step in firsts:
+            i = firsts[step]
+            mj.mj_setState(model, data, starts.vectors[i], mj.mjtState.mjSTATE_INTEGRATION)
+            ctrl = ctrl if starts.controls is None else starts.controls[i]
+        if ctrl is not None:
+            data.ctrl[:] = ctrl
+        try:
+            mj.mj_step(model, data)
+            if (step + 1) % every:
+                continue
+            mj.mj_forward(model, data)
+        except mj.FatalError as error:
+            raise InputError(f"step {step + 1}: MuJoCo raised an error, {error}") from None
+        yield step + 1, i
+
+
+def _solve_step(
+    mj: Any, model: Any, data: Any, name: str, precision: str, threshold: float
+) -> tuple[Problem, FloatArray, dict[str, Any]] | None:
+    """Solve the constraints of the present state with MuJoCo without advancing time; return None without constraints.
+
+    Returns
+    -------
+    (Problem, (m,) N s, dict) or None
+        The problem, MuJoCo's impulse, and the record of both.
+    """
+    # The same solve from the same warm start, without noslip, has the iterations of the solver alone.
+    noslip, iterations = int(model.opt.noslip_iterations), None
+    if noslip > 0:
+        model.opt.noslip_iterations = 0
+        try:
+            mj.mj_fwdConstraint(model, data)
+        finally:
+            model.opt.noslip_iterations = noslip
+        iterations = count_iterations(data)
+    start = perf_counter()
+    mj.mj_fwdConstraint(model, data)
+    seconds = perf_counter() - start
+    total = count_iterations(data)
+    iterations = iterations if noslip > 0 else total
+    if int(data.nefc) == 0:
+        return None
+    problem = adapter.from_mujoco(model, data, name=name)
+    problem = dataclasses.replace(problem, precision=precision, copy=False)
+    impulse = adapter.impulse(model, data)
+    facts = describe_answer(problem, impulse, threshold) | {
+        "iterations": iterations, "seconds": seconds,
+        "noslip_iterations": None if iterations is None or total is None else total - iterations,
+        "solver": mj.mjtSolver(int(model.opt.solver)).name.removeprefix("mjSOL_"),
+    }  # fmt: skip
+    return problem, impulse, facts
+
+
+def count_iterations(data: Any) -> int | None:
+    """Return MuJoCo's iterations in all islands, with those of noslip; None if it has not counted all islands."""
+    return int(np.sum(data.solver_niter)) if data.nisland <= len(data.solver_niter) else None
+
+
+def record_file(
+    path: str | os.PathLike[str],
+    folder: str | os.PathLike[str],
+    steps: int,
+    *,
+    control: Control = "random",
+    **options: Any,
+) -> Recording:
+    """Call `record` for a model file (MJCF); an array of controls may also be given as a file (.npy).
+
+    Raises
+    ------
+    InputError
+        `record` raises it, or no step had a constraint that could be exported.
+    """
+    mj, model = load_model(path)
+    result = record(model, mj.MjData(model), folder, steps, control=load_controls(control), **options)
+    if not result.files:
+        why = f" ({result.left_out[0]})" if result.left_out else ": more steps, or other controls"
+        raise InputError(f"{path}: no step had a constraint that could be recorded{why}")
+    return result

@@ -1,0 +1,285 @@
+"""Read models, start states and controls of MuJoCo simulations.
+
+`read_states` reads a file with `state`, which has a vector of mjSTATE_INTEGRATION in each row, or arrays with the names
+of MjData, of which qpos and qvel are required. Only the vector contains all that a step depends on (warm start,
+controls, mocap bodies, applied forces, the state of plug-ins), except which trees sleep: MuJoCo wakes all trees when a
+state is set. Quantities without an array have the values of a new MjData.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import dataclasses
+import os
+import zipfile
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lavender.base.arrays import FloatArray, as_array, check_int
+from lavender.base.errors import InputError
+from lavender.io.mujoco_memory import import_mujoco
+from lavender.io.stored import SUFFIXES, Archive, as_path, read_first_bytes
+
+CONTROLS = ("zero", "random")
+Control = str | Callable[[Any, Any, int], Any] | Any
+KEYFRAMES = "keyframes"
+VECTOR = "state"
+NEEDED = ("qpos", "qvel")
+OPTIONAL = (
+    "act", "ctrl", "qacc_warmstart", "time", "mocap_pos", "mocap_quat", "userdata", "eq_active", "qfrc_applied",
+    "xfrc_applied",
+)  # fmt: skip
+LABELS = ("world", "step")  # Additional arrays in the files of `lavender audit`: the origin of each state.
+
+
+def load_model(path: str | os.PathLike[str]) -> tuple[Any, Any]:
+    """Return the module mujoco and the model of a file (MJCF).
+
+    Raises
+    ------
+    InputError
+        MuJoCo is not installed, or cannot read the file, or the file is a problem.
+    """
+    mj, path = import_mujoco(), str(as_path(path))
+    if Path(path).suffix.lower() in SUFFIXES:
+        raise InputError(
+            f"{path} has the suffix of a problem file; a model of MuJoCo (MJCF) is needed: `lavender check` and "
+            "`lavender report` read problems"
+        )
+    try:
+        return mj, mj.MjModel.from_xml_path(path)
+    except ValueError as error:  # MuJoCo raises it for a file that it cannot read.
+        raise InputError(f"{path}: {error}") from None
+
+
+def load_controls(control: Control) -> Control:
+    """Return controls for `record`: the array of a file (.npy), or `control` unchanged."""
+    return _load_controls_npy(control) if isinstance(control, str) and control not in CONTROLS else control
+
+
+def _load_controls_npy(path: str) -> Any:
+    """Return the array of a .npy file; raise InputError if it cannot be read or holds several arrays."""
+    try:
+        read_first_bytes(path)  # Raises an error if `path` is not a regular file.
+        # A memory map cannot be longer than the file, whatever size the header declares.
+        result = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(
+            f"controls {path} cannot be read ({error}); one of {', '.join(CONTROLS)}, or a .npy file of one "
+            "array, is needed"
+        ) from None
+    if not isinstance(result, np.ndarray):
+        result.close()
+        raise InputError(
+            f"controls {path}: it is an archive of several arrays; a .npy file of one array is needed"
+        )
+    return result
+
+
+def make_controller(model: Any, control: Control, seed: int) -> Callable[[Any, int], FloatArray | None]:
+    """Return a function (data, step) -> controls (nu,) or None; see `record`."""
+    n = int(model.nu)
+    if callable(control):
+        call: Callable[[Any, Any, int], Any] = control
+
+        def called(data: Any, step: int) -> FloatArray | None:
+            values = call(model, data, step)
+            return None if values is None else as_array(f"control of step {step}", values, (n,))
+
+        return called
+    if isinstance(control, str):
+        if control not in CONTROLS:
+            raise InputError(
+                f"control is {control!r}; one of {', '.join(CONTROLS)}, an array or a function is needed"
+            )
+        if control == "zero":
+            return lambda data, step: np.zeros(n)
+        rng = np.random.default_rng(check_int("seed", seed, high=None))
+        limited = np.array(model.actuator_ctrllimited, bool)[:, None]
+        low, high = np.where(limited, np.array(model.actuator_ctrlrange), [-1.0, 1.0]).T
+        return lambda data, step: rng.uniform(low, high)
+    rows = as_array("control", control, (None, n))
+    if len(rows) == 0:
+        raise InputError(f"control has shape {rows.shape}; (any, {n}) with at least one row is needed")
+    return lambda data, step: rows[step % len(rows)]
+
+
+@dataclass(frozen=True, eq=False)
+class StartStates:
+    """States in which simulations start.
+
+    Parameters
+    ----------
+    vectors : (n, size)
+        State vectors of mjSTATE_INTEGRATION, as `mj_getState` returns them.
+    controls : (n, nu), optional
+        Controls of the first step; None if the source has none.
+    missing : tuple of str
+        Quantities on which a step depends and that arrays of states lack: "warm start", "controls".
+    """
+
+    vectors: FloatArray
+    controls: FloatArray | None = None
+    missing: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.vectors)
+
+    def select_evenly(self, count: int) -> StartStates:
+        """Return at most `count` of the states, evenly spaced."""
+        if len(self) <= count:
+            return self
+        chosen = np.arange(count) * len(self) // count
+        controls = None if self.controls is None else self.controls[chosen]
+        return dataclasses.replace(self, vectors=self.vectors[chosen], controls=controls)
+
+
+def can_sleep(mj: Any, model: Any) -> bool:
+    """Return whether the model has <flag sleep="enable"/>."""
+    flag = getattr(mj.mjtEnableBit, "mjENBL_SLEEP", 0)
+    return bool(model.opt.enableflags & int(flag))
+
+
+def without_sleep(mj: Any, model: Any) -> Any:
+    """Return a copy of the model with <flag sleep="disable"/>, or the model itself if it has this flag.
+
+    A state does not contain which trees sleep. A simulation whose steps are repeated from states must not use sleep.
+    """
+    if not can_sleep(mj, model):
+        return model
+    awake = copy.copy(model)
+    awake.opt.enableflags &= ~int(mj.mjtEnableBit.mjENBL_SLEEP)
+    return awake
+
+
+def read_states(mj: Any, model: Any, source: Any) -> StartStates:
+    """Read start states.
+
+    Parameters
+    ----------
+    mj : module
+        MuJoCo.
+    model : mujoco.MjModel
+    source : path of an .npz, "keyframes", mapping of arrays, array (n, size), or StartStates
+
+    Returns
+    -------
+    StartStates
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or its arrays do not fit the model; a number is not finite; the model has no
+        keyframes.
+    """
+    if isinstance(source, StartStates):
+        return source
+    if isinstance(source, str) and source == KEYFRAMES:
+        return _read_keyframes(mj, model)
+    if isinstance(source, (str, os.PathLike)):
+        read_first_bytes(source)  # Raises an error if `source` is not a regular file.
+        with contextlib.closing(Archive(source)) as archive:
+            return _read_arrays(mj, model, dict(archive), f"states {os.fspath(source)}")
+    arrays = source if isinstance(source, Mapping) else {VECTOR: source}
+    return _read_arrays(mj, model, arrays, "states")
+
+
+def check_array_names(source: str, names: Iterable[str], valid: Iterable[str]) -> None:
+    """Raise InputError at the first name that is neither valid nor one of `LABELS`; `source` begins the message."""
+    valid = tuple(valid)
+    for name in names:
+        if name not in (*valid, *LABELS):
+            raise InputError(
+                f"{source} has an array {name!r}, which is not part of a state; the arrays of a state are "
+                f"{', '.join(valid)}: remove or rename it"
+            )
+
+
+def _read_keyframes(mj: Any, model: Any) -> StartStates:
+    """Return the model's keyframes; raise InputError if it has none."""
+    if not model.nkey:
+        raise InputError(
+            "states are 'keyframes', but the model has no keyframes; give an .npz file of states, or add "
+            "keyframes to the model"
+        )
+    data, vectors = mj.MjData(model), []
+    for key in range(model.nkey):
+        mj.mj_resetDataKeyframe(model, data, key)
+        vectors.append(_read_state_vector(mj, model, data))
+    return StartStates(np.array(vectors), np.array(model.key_ctrl, float).reshape(model.nkey, model.nu))
+
+
+def _read_arrays(mj: Any, model: Any, arrays: Mapping[str, Any], source: str) -> StartStates:
+    """Build states from arrays by name; `source` begins the error messages."""
+    check_array_names(source, arrays, (VECTOR, *NEEDED, *OPTIONAL))
+    if VECTOR in arrays:
+        return _read_vectors(mj, model, arrays[VECTOR], source)
+    missing = [name for name in NEEDED if name not in arrays]
+    if missing:
+        raise InputError(
+            f"{source} has no {' and no '.join(missing)}; {VECTOR!r}, or qpos and qvel, are needed"
+        )
+    data = mj.MjData(model)
+    parts: dict[str, FloatArray] = {}
+    for name in (*NEEDED, *OPTIONAL):
+        if name in arrays:
+            shape = np.shape(getattr(data, name))
+            values = np.asarray(arrays[name])
+            values = values[None] if values.ndim == len(shape) else values
+            parts[name] = as_array(f"{source}: {name}", values, (None, *shape))
+    counts = {name: len(x) for name, x in parts.items()}
+    n = counts["qpos"]
+    if n == 0 or set(counts.values()) != {n}:
+        sizes = ", ".join(f"{count} of {name}" for name, count in counts.items())
+        raise InputError(
+            f"{source} holds states of different numbers: {sizes}; all arrays must have the same number of "
+            "entries, at least one"
+        )
+    vectors = []
+    for i in range(n):
+        data = mj.MjData(model)
+        for name, x in parts.items():
+            if name == "time":
+                data.time = float(x[i])
+            else:
+                getattr(data, name)[:] = x[i]
+        vectors.append(_read_state_vector(mj, model, data))
+    has = {"warm start": "qacc_warmstart" in parts, "controls": "ctrl" in parts or not model.nu}
+    absent = tuple(name for name, is_present in has.items() if not is_present)
+    return StartStates(np.array(vectors), parts.get("ctrl"), absent)
+
+
+def _read_vectors(mj: Any, model: Any, states: Any, source: str) -> StartStates:
+    """Build states from vectors (n, size) of mjSTATE_PHYSICS, mjSTATE_FULLPHYSICS or mjSTATE_INTEGRATION."""
+    integration = mj.mjtState.mjSTATE_INTEGRATION
+    kinds = {mj.mj_stateSize(model, kind): kind for kind in
+             (mj.mjtState.mjSTATE_PHYSICS, mj.mjtState.mjSTATE_FULLPHYSICS, integration)}  # fmt: skip
+    states = np.asarray(states)
+    states = as_array(f"{source}: {VECTOR}", states[None] if states.ndim == 1 else states, (None, None))
+    n, size = states.shape
+    if size not in kinds or n == 0:
+        raise InputError(
+            f"{source}: {VECTOR} has shape {states.shape}; (n, {mj.mj_stateSize(model, integration)}) of "
+            "mjSTATE_INTEGRATION, n at least 1, is needed for this model"
+        )
+    vectors, controls = [], []
+    for state in states:
+        data = mj.MjData(model)
+        mj.mj_setState(model, data, state, kinds[size])
+        vectors.append(_read_state_vector(mj, model, data))
+        controls.append(np.array(data.ctrl))
+    if kinds[size] == integration:
+        return StartStates(np.array(vectors), np.array(controls))
+    return StartStates(np.array(vectors), missing=("warm start", *(("controls",) if model.nu else ())))
+
+
+def _read_state_vector(mj: Any, model: Any, data: Any) -> FloatArray:
+    kind = mj.mjtState.mjSTATE_INTEGRATION
+    vector = np.empty(mj.mj_stateSize(model, kind))
+    mj.mj_getState(model, data, vector, kind)
+    return vector
