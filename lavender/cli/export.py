@@ -15,12 +15,7 @@ from lavender.io.stored import lock_output
 @click.argument("folder", type=FOLDER)
 @click.option("--replace", is_flag=True, help="Overwrite files of an earlier export that differ.")
 @click.pass_context
-def export(
-    context: click.Context,
-    kind: str,
-    folder: Path,
-    replace: bool,
-) -> None:
+def export(context: click.Context, kind: str, folder: Path, replace: bool) -> None:
     """Write the kernels as a C library with one header.
 
     The library does not need Python.

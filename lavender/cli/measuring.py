@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -28,8 +29,8 @@ if TYPE_CHECKING:
 
     P = TypeVar("P", bound=Plan)
 
-BAR_WIDTH = 40  # Largest width of a progress bar in characters; a narrow terminal has a shorter one.
 PROGRESS_INTERVAL = 10.0  # [s] Time between two lines of progress if the output is not a terminal.
+REDRAW_INTERVAL = 0.25  # [s] Time between two updates of the line on a terminal.
 MIN_ELAPSED = 1.0  # [s] The remaining time is not estimated from a shorter time.
 
 
@@ -197,102 +198,45 @@ def explain_early_interrupt(first_result: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def show_progress() -> Iterator[Callable[[Event], None]]:
-    """Yield a callback that shows progress: a bar on a terminal, otherwise a line on stderr every few seconds."""
-    to = make_console(stderr=True)
-    if not to.is_terminal:
-        yield _print_progress_lines()
-        return
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-    from rich.table import Column
+    """Yield a callback that shows progress on stderr: on a terminal in one line, else in a line every few seconds."""
+    console = make_console(stderr=True)
+    interval = REDRAW_INTERVAL if console.is_terminal else PROGRESS_INTERVAL
+    phase, began, reused_until = (
+        "",
+        time.monotonic(),
+        0,
+    )  # The time of a phase, without results that were reused.
+    printed = -math.inf if console.is_terminal else began
 
-    def keep_width() -> Column:
-        """Return a column that is not narrowed."""
-        return Column(no_wrap=True)
-
-    class ShortenedColumn(TextColumn):
-        """Text that is cut if the terminal is narrow. Rich narrows columns that may wrap before all others."""
-
-        def __init__(self, text: str) -> None:
-            super().__init__(text, markup=False, table_column=Column())
-
-        def render(self, task: Any) -> Any:
-            text = super().render(task)
-            text.no_wrap, text.overflow = True, "ellipsis"
-            return text
-
-    with Progress(
-        BarColumn(min(BAR_WIDTH, to.width // 8), table_column=keep_width()),
-        MofNCompleteColumn(table_column=keep_width()),
-        TimeElapsedColumn(table_column=keep_width()),
-        TextColumn("{task.fields[remaining]}", markup=False),
-        ShortenedColumn("{task.fields[what]}"),
-        console=to,
-        transient=True,
-        refresh_per_second=4,  # Drawing more often would take processor time from the measurement.
-    ) as bar:
-        task = bar.add_task("", total=None, what="starting", remaining="")
-        pace = Pace()
-
-        def show_event(event: Event) -> None:
-            if pace.count_event(
-                event
-            ):  # Another phase begins: its count, clock and remaining time are its own.
-                bar.reset(task)
-            remaining = pace.format_remaining_time(event)
-            bar.update(
-                task,
-                completed=event.done,
-                total=event.total or None,
-                remaining=f"{remaining}:" if remaining else "",
-                what=_format_event(event),
-            )
-
-        yield show_event
-
-
-def _print_progress_lines() -> Callable[[Event], None]:
-    """Return a callback that prints a line of progress every `PROGRESS_INTERVAL` seconds."""
-    pace, printed = Pace(), time.monotonic()
+    def show_line(text: str) -> None:
+        if console.is_terminal:
+            console.file.write(f"\r{text[: console.width - 1]}\x1b[K")
+            console.file.flush()
+        else:
+            click.echo(text, err=True)
 
     def show_event(event: Event) -> None:
-        nonlocal printed
-        pace.count_event(event)
+        nonlocal phase, began, reused_until, printed
         now = time.monotonic()
-        if now - printed >= PROGRESS_INTERVAL:
-            printed = now
-            count = f"{event.done} of {event.total}, " if event.total else ""
-            remaining = pace.format_remaining_time(event)
-            remaining = f", {remaining}" if remaining else ""
-            click.echo(f"{count}{pace.elapsed:.0f} s{remaining}: {_format_event(event)}", err=True)
+        if event.reused or event.phase != phase:
+            phase, began, reused_until = event.phase, now, event.done + event.reused
+        if now - printed < interval:
+            return
+        printed = now
+        count = f"{event.done} of {event.total}, " if event.total else ""
+        remaining = (
+            "" if phase == "writing" else format_remaining_time(event, now - began, event.done - reused_until)
+        )
+        current = ": ".join(filter(None, (event.phase, f"{event.case} {event.solver}".strip())))
+        show_line(f"{count}{now - began:.0f} s{remaining and f', {remaining}'}: {current}")
 
-    return show_event
-
-
-class Pace:
-    """Clock of a phase, from which the remaining time is estimated. Reused results take no time and do not count."""
-
-    def __init__(self) -> None:
-        self.phase, self.began, self.reused_until = "", time.monotonic(), 0
-
-    @property
-    def elapsed(self) -> float:
-        """Time [s] since the phase began."""
-        return time.monotonic() - self.began
-
-    def count_event(self, event: Event) -> bool:
-        """Return whether an event begins another phase, after the first."""
-        if event.reused:
-            self.began, self.reused_until = time.monotonic(), event.done + 1
-        begins = event.phase != self.phase
-        if begins:
-            self.phase, self.began, self.reused_until = event.phase, time.monotonic(), event.done
-        return begins
-
-    def format_remaining_time(self, event: Event) -> str:
-        """Return a phrase such as "about 40 s remain"; empty if it is too early, or if steps take unequal times."""
-        if event.phase == "writing":
-            return ""
-        return format_remaining_time(event, self.elapsed, event.done - self.reused_until)
+    if console.is_terminal:
+        show_line("starting")
+    try:
+        yield show_event
+    finally:
+        if console.is_terminal:
+            show_line("")
 
 
 def format_remaining_time(event: Event, elapsed: float, done: int | None = None) -> str:
@@ -305,8 +249,3 @@ def format_remaining_time(event: Event, elapsed: float, done: int | None = None)
     if remaining < 90.0:
         return f"about {max(1, round(remaining))} s remain"
     return f"about {round(remaining / 60.0)} min remain"
-
-
-def _format_event(event: Event) -> str:
-    text = f"{event.case} {event.solver}".strip()
-    return f"{event.phase}: {text}" if event.phase else text
