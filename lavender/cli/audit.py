@@ -30,14 +30,9 @@ DEFAULT_CLAIM_WORLDS = 8  # Default number of worlds for engines with claims, wh
 @click.command()
 @click.argument("model", metavar="MODEL.xml|SCENE.py", type=FILE)
 @add_worlds_options(worlds=None, steps=200)
-@click.option(
-    "--engine",
-    default="mujoco",
-    show_default=True,
-    metavar="mujoco|mjx|mujoco_warp|kamino|newton-mujoco|genesis",
-    shell_complete=complete_choice,
-    help="Engine that steps the worlds.",
-)
+@click.option("--engine", default="mujoco", show_default=True,
+              metavar="mujoco|mjx|mujoco_warp|kamino|newton-mujoco|genesis", shell_complete=complete_choice,
+              help="Engine that steps the worlds.")  # fmt: skip
 @click.option("--max-velocity-error", type=float, metavar="M/S",
               help="Exit with 1 if a step above its floor has a larger velocity error [m/s, rad/s].")  # fmt: skip
 @click.option("--keep", type=int, metavar="N",

@@ -36,18 +36,10 @@ NARROW_CHECK_OMITS = (
 @click.argument(
     "files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...", shell_complete=complete_case_or_file
 )
-@click.option(
-    "--solvers",
-    type=ListType(str),
-    shell_complete=complete_solver,
-    help="Solvers by name; default: all that accept the problem.",
-)
-@click.option(
-    "--reference",
-    default="osqp",
-    show_default=True,
-    help="Reference solver, with which the others are compared.",
-)
+@click.option("--solvers", type=ListType(str), shell_complete=complete_solver,
+              help="Solvers by name; default: all that accept the problem.")  # fmt: skip
+@click.option("--reference", default="osqp", show_default=True,
+              help="Reference solver, with which the others are compared.")  # fmt: skip
 @click.option("--tol", type=float, default=1e-6, show_default=True, help="Relative residual to reach.")
 @click.option("--time-limit", type=float, metavar="S", help="Time limit of each solve.")
 @precision_option

@@ -6,9 +6,8 @@ import contextlib
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import click
 
@@ -34,29 +33,12 @@ REDRAW_INTERVAL = 0.25  # [s] Time between two updates of the line on a terminal
 MIN_ELAPSED = 1.0  # [s] The remaining time is not estimated from a shorter time.
 
 
-@dataclass(frozen=True)
-class Measured:
-    """Records of a measuring command, measured by this call or reused from its output folder.
-
-    Parameters
-    ----------
-    records : Records
-    stopped : whether Ctrl-C ended the measurement
-    reused : number of records that were not measured again
-    since : date of the first reused record
-    """
+class Measured(NamedTuple):
+    """Records of a measuring command, measured by this call or reused from its output folder."""
 
     records: Records
-    stopped: bool
-    reused: int = 0
-    since: str = ""
-
-    @property
-    def reuse_note(self) -> str:
-        """Sentence on the number of reused records; empty if this call measured all records."""
-        if not self.reused:
-            return ""
-        return f"{self.reused} of {len(self.records)} runs of {self.since} reused; --no-reuse measures again"
+    stopped: bool  # Whether Ctrl-C ended the measurement.
+    reuse_note: str = ""  # Sentence on the number of reused records; empty if this call measured all of them.
 
     @property
     def n_cases_not_loaded(self) -> int:
@@ -151,8 +133,11 @@ def measure_files(
             if not measured:
                 raise
             stopped = True
-    since = before.get(next(iter(measured[0].runs)), "") if reused else ""
-    return Measured(measured[0], stopped, reused, since.replace("T", " ")[:16])
+    if not reused:
+        return Measured(measured[0], stopped)
+    since = before.get(next(iter(measured[0].runs)), "").replace("T", " ")[:16]
+    note = f"{reused} of {len(measured[0])} runs of {since} reused; --no-reuse measures again"
+    return Measured(measured[0], stopped, note)
 
 
 def _make_timed_plan(options: Mapping[str, Any], files: Sequence[str]) -> Plan:

@@ -6,7 +6,6 @@ import contextlib
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -53,12 +52,8 @@ from lavender.io.stored import lock_output, write_text
     default=None,
     help="Measure error and robustness without times, with this number of processes; -1: one for each core.",
 )
-@click.option(
-    "--backend",
-    default="loky",
-    show_default=True,
-    help="The same with the workers of a backend of joblib, such as dask.",
-)
+@click.option("--backend", default="loky", show_default=True,
+              help="The same with the workers of a backend of joblib, such as dask.")  # fmt: skip
 @click.option("--compare", type=PATH, help="Compare with earlier records (.jsonl, or their folder).")
 @click.option(
     "--time-budgets",
@@ -70,9 +65,8 @@ from lavender.io.stored import lock_output, write_text
 @recording_options
 @click.option("--tables", is_flag=True, help="Print every table, warning and line of code.")
 @click.option("--no-reuse", is_flag=True, help="Repeat runs that the folder already holds.")
-@click.option(
-    "--no-figures", is_flag=True, help="Write no figures; they take the largest part of the time of writing."
-)
+@click.option("--no-figures", is_flag=True,
+              help="Write no figures; they take the largest part of the time of writing.")  # fmt: skip
 @click.option("--list", "listed", is_flag=True, help="List the cases of the built-in suite; measure nothing.")
 @click.pass_context
 def report(
@@ -122,7 +116,7 @@ def report(
                 f"{records_files[0]} has no records: measure problems with `lavender report PROBLEM` first"
             )
         if options["solvers"]:
-            measured = replace(measured, records=measured.records.select_solvers(options["solvers"]))
+            measured = measured._replace(records=measured.records.select_solvers(options["solvers"]))
     with show_progress() as watch:
         if not records_files:
             measured = measure_files(context, files, path, watch)

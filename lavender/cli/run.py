@@ -28,34 +28,21 @@ from lavender.io.stored import check_figure_path, check_writable, resolve_destin
 @click.argument("scene", shell_complete=complete_scene)
 @click.option("--steps", type=int, default=240, show_default=True, help="Number of steps.")
 @click.option("--iterations", "solver_iterations", type=int, help="Sweeps per solve, 4 to 64.")
-@click.option(
-    "--warm-start/--no-warm-start",
-    default=None,
-    help="Carry impulses from step to step.  [default: warm-start]",
-)
-@click.option(
-    "--order",
-    help="Order in which a sweep visits the blocks: given, reverse, bottom_up, top_down, alternating, ... "
-    "Default: alternating.",
-)
-@click.option(
-    "--solver",
-    shell_complete=complete_solver,
-    help="Solver of each step, by name. Default: sequential_impulses.",
-)
+@click.option("--warm-start/--no-warm-start", default=None,
+              help="Carry impulses from step to step.  [default: warm-start]")  # fmt: skip
+@click.option("--order",
+              help="Order in which a sweep visits the blocks: given, reverse, bottom_up, top_down, alternating, ... "
+              "Default: alternating.")  # fmt: skip
+@click.option("--solver", shell_complete=complete_solver,
+              help="Solver of each step, by name. Default: sequential_impulses.")  # fmt: skip
 @click.option(
     "--velocity-tol",
     type=float,
     metavar="M/S",
     help="With --solver: velocity error that each solve must reach [m/s, rad/s], in place of its tolerance.",
 )
-@click.option(
-    "--set",
-    "parameters",
-    multiple=True,
-    metavar="NAME=VALUE",
-    help="Set a parameter of the scene, e.g. n=20 or friction=0.3; may be repeated.",
-)
+@click.option("--set", "parameters", multiple=True, metavar="NAME=VALUE",
+              help="Set a parameter of the scene, e.g. n=20 or friction=0.3; may be repeated.")  # fmt: skip
 @click.option("--residual", is_flag=True, help="Also measure the judge's residual of all rows in every step.")
 @click.option("--plot", type=PATH, help="Write a figure of the run (.svg, .png).")
 @click.option("--trace", type=PATH, help="Write the values of every step (.csv).")
@@ -64,11 +51,8 @@ from lavender.io.stored import check_figure_path, check_writable, resolve_destin
     "--replace", is_flag=True, help="With --record: first delete the problems of an earlier recording."
 )
 @click.option("--view", is_flag=True, help="Show the run live in a web page on this machine, until Ctrl-C.")
-@click.option(
-    "--film",
-    type=PATH,
-    help="Write a film of the run: .gif, .mp4, .png pictures, or a file for `lavender view`.",
-)
+@click.option("--film", type=PATH,
+              help="Write a film of the run: .gif, .mp4, .png pictures, or a file for `lavender view`.")  # fmt: skip
 @click.pass_context
 def run(
     context: click.Context,

@@ -13,11 +13,8 @@ from lavender.io.stored import check_figure_path, check_writable, write_figure
 
 @click.command()
 @click.argument("model", metavar="MODEL.xml", type=FILE)
-@click.option(
-    "--states",
-    metavar="FILE.npz|keyframes",
-    help="States to explain, such as states.npz of an audit; default: the initial state.",
-)
+@click.option("--states", metavar="FILE.npz|keyframes",
+              help="States to explain, such as states.npz of an audit; default: the initial state.")  # fmt: skip
 @click.option("--steps", type=int, default=1, show_default=True,
               help="Steps simulated from each state, with its controls; the last one is explained.")  # fmt: skip
 @click.option("--contact", "contacts", multiple=True, metavar="GEOM",

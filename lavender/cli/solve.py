@@ -13,26 +13,17 @@ from lavender.cli.completion import complete_case_or_file, complete_solver
 from lavender.cli.options import PATH, limit_to_one_thread, print_escaped
 from lavender.io.stored import check_writable, write_atomically
 
-#: Fields of the residual that --output writes.
+#: Fields of the solution and of its residual that --output writes, in addition to its status and solver.
+SAVED_FIELDS = ("impulse", "slack", "iterations", "setup_time", "solve_time")
 SAVED_RESIDUAL_FIELDS = ("error", "relative", "energy", "velocity", "roundoff_floor")
 
 
 @click.command()
 @click.argument("file", shell_complete=complete_case_or_file)
-@click.option(
-    "--solver",
-    default="auto",
-    show_default=True,
-    shell_complete=complete_solver,
-    help="Name of the solver; see `lavender solvers`.",
-)
-@click.option(
-    "--tol",
-    type=float,
-    default=1e-6,
-    show_default=True,
-    help="Relative residual to reach; 0 runs exactly --max-iter iterations.",
-)
+@click.option("--solver", default="auto", show_default=True, shell_complete=complete_solver,
+              help="Name of the solver; see `lavender solvers`.")  # fmt: skip
+@click.option("--tol", type=float, default=1e-6, show_default=True,
+              help="Relative residual to reach; 0 runs exactly --max-iter iterations.")  # fmt: skip
 @click.option("--velocity-tol", type=float, metavar="M/S",
               help="Velocity error of every row to reach [m/s], in place of --tol.")  # fmt: skip
 @click.option("--max-iter", type=int, help="Largest number of iterations; default: the solver's.")
@@ -40,17 +31,7 @@ SAVED_RESIDUAL_FIELDS = ("error", "relative", "energy", "velocity", "roundoff_fl
 @click.option("--order", help="Sweep order, for solvers that take one.")
 @click.option("--seed", type=int, help="Seed of a random order.")
 @click.option("--output", type=PATH, help="Write impulse, slack, status and residual to this .npz file.")
-def solve(
-    file: str,
-    solver: str,
-    tol: float,
-    velocity_tol: float | None,
-    max_iter: int | None,
-    time_limit: float | None,
-    order: str | None,
-    seed: int | None,
-    output: Path | None,
-) -> None:
+def solve(file: str, solver: str, tol: float, output: Path | None, **options: Any) -> None:
     """Solve one problem and print the judged result.
 
     FILE is a file or a case of the suite. Exit code 0: the judge accepts the result (within --tol or --velocity-tol, or
@@ -69,32 +50,23 @@ def solve(
         raise InputError(f"{file} holds {len(more) + 1} problems; give one file")
     if output is not None and output.exists() and Path(item.source).exists() and output.samefile(item.source):
         raise InputError(f"--output {output} would overwrite the problem: give another file")
-    given = ("order", order), ("seed", seed), ("velocity_tol", velocity_tol)
-    options: dict[str, Any] = {name: value for name, value in given if value is not None}
+    options = {name: value for name, value in options.items() if value is not None}
     try:
         with Worker() as worker:
-            solution = solve_isolated(
-                worker, item.problem, solver, tol=tol, max_iter=max_iter, time_limit=time_limit, **options
-            )
+            solution = solve_isolated(worker, item.problem, solver, tol=tol, **options)
     except TaskFailed as error:  # The solver ended its process, or was ended after its time limit.
         print_escaped(f"lavender: {solver}: {error}", err=True)
         raise click.exceptions.Exit(EXIT_UNMET) from None
     if output is not None:
         import numpy as np
 
+        results = {name: getattr(solution, name) for name in SAVED_FIELDS}
+        results |= {name: getattr(solution.residual, name) for name in SAVED_RESIDUAL_FIELDS}
+        results |= {"status": solution.status.name, "solver": solution.solver.name}
+
         def write(part: Path) -> None:
             with part.open("wb") as f:
-                np.savez(
-                    f,
-                    impulse=solution.impulse,
-                    slack=solution.slack,
-                    **{name: getattr(solution.residual, name) for name in SAVED_RESIDUAL_FIELDS},
-                    status=solution.status.name,
-                    solver=solution.solver.name,
-                    iterations=solution.iterations,
-                    setup_time=solution.setup_time,
-                    solve_time=solution.solve_time,
-                )
+                np.savez(f, **results)
 
         write_atomically(output, write)
     print_escaped(f"{item.name}: {item.problem.law}, {item.problem.m} rows")

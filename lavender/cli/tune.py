@@ -16,14 +16,8 @@ from lavender.io.stored import lock_output
 
 @click.command()
 @click.argument("model", metavar="MODEL.xml|SCENE.py", type=FILE)
-@click.option(
-    "--engine",
-    default="mujoco",
-    show_default=True,
-    metavar="mujoco|mujoco_warp|kamino",
-    shell_complete=complete_choice,
-    help="Engine whose settings are measured.",
-)
+@click.option("--engine", default="mujoco", show_default=True, metavar="mujoco|mujoco_warp|kamino",
+              shell_complete=complete_choice, help="Engine whose settings are measured.")  # fmt: skip
 @add_worlds_options(worlds=16, steps=200)
 @click.option("--horizon", default=10, show_default=True, help="Steps after which the motion is compared.")
 @click.option("--repeats", default=5, show_default=True, help="Times that each setting is timed.")
