@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, IntArray
+from lavender.base.arrays import FloatArray
 from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import sparse as sp
@@ -34,7 +34,7 @@ from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.problem.ordering import group_blocks_by_island
 from lavender.solvers.costs import RATES, estimate_import_cost
-from lavender.solvers.islands import find_islands, get_rows_of_blocks, restrict_to_blocks
+from lavender.solvers.islands import get_rows_of_blocks, restrict_to_blocks
 from lavender.solvers.newton_systems import general
 from lavender.solvers.registry import get
 from lavender_ext.core.checks import MAX_MAGNITUDE, MIN_MAGNITUDE
@@ -185,10 +185,8 @@ def certify_by_least_violation(log: Any) -> None:
             return
         before, lam = lam, lam.copy()
         steps = MAX_SOFTENED_STEPS * max(1, kernel.islands)
-        if (
-            general.run_newton_steps(soft, kernel, lam, steps, VIOLATION_TOLERANCE, log.time_left).status
-            is Status.INTERRUPTED
-        ):
+        claim = general.run_newton_steps(soft, kernel, lam, steps, VIOLATION_TOLERANCE, log.time_left)
+        if claim.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
         # Try the difference of both impulses, and the last impulse, which is better if other rows' impulses decreased.
         for y in (lam - before, lam):
@@ -199,9 +197,8 @@ def certify_by_least_violation(log: Any) -> None:
         y[outside] = 0.0
         if not prove_infeasibility(problem, y, log.tol, log.deadline).reason:
             break
-    log.record_stage(
-        "least violation", Claim(Status.STALLED, 0, {"certificates": 1}, certificate=y), log.best
-    )
+    claim = Claim(Status.STALLED, 0, {"certificates": 1}, certificate=y)
+    log.record_stage("least violation", claim, log.best)
 
 
 @np.errstate(all="ignore")  # Results that overflow are judged.
@@ -210,12 +207,8 @@ def certify_infeasibility(log: Any) -> None:
     problem = log.problem
     if problem.generalized is None and LINEAR_PROGRAM_STAGE not in [stage.solver for stage in log.stages]:
         certify_by_linear_programs(log)
-    if (
-        log.certificate is None
-        and problem.law == "coulomb"
-        and problem.m <= CERTIFICATE_ROWS
-        and log.best > 1e-6
-    ):
+    is_small = problem.m <= CERTIFICATE_ROWS
+    if log.certificate is None and problem.law == "coulomb" and is_small and log.best > 1e-6:
         log.conflict = find_conflict(problem, log.tol, log.deadline)
 
 
@@ -246,22 +239,14 @@ def certify_by_linear_programs(log: Any) -> None:
 def _list_unsolved_islands(log: Any) -> Any:
     """Yield (problem, rows) of each unsolved island, the smallest first, or the whole problem if it is one island."""
     problem = log.problem
-    count, label = find_islands(problem)
-    if count <= 1:
+    label, table = residuals_by_island(problem.metric, log.impulse)
+    if len(table) <= 1:
         yield problem, slice(None)
         return
-    blocks = group_blocks_by_island(count, label)
-    for i in sorted(_find_unsolved_labels(log, label), key=lambda i: len(blocks[i])):
+    blocks = group_blocks_by_island(len(table), label)
+    for i in sorted(np.flatnonzero(table[:, 0] > log.tol), key=lambda i: len(blocks[i])):
         rows = get_rows_of_blocks(problem, blocks[i])
         yield restrict_to_blocks(problem, blocks[i], rows), rows
-
-
-def _find_unsolved_labels(log: Any, label: IntArray) -> IntArray:
-    """Return the islands with a relative residual above the tolerance."""
-    own, table = residuals_by_island(log.problem.metric, log.impulse)
-    if len(table) == 1:
-        return np.unique(label) if table[0, 0] > log.tol else np.zeros(0, np.int32)
-    return np.unique(label[(table[:, 0] > log.tol)[own]])
 
 
 def _has_simple_bounds(problem: Problem) -> bool:
@@ -337,10 +322,7 @@ def check_infeasibility_claim(
     str
         Description of the solution that `auto` found instead, or empty.
     """
-    if (
-        claim.certificate is not None
-        and not prove_infeasibility(problem, claim.certificate, tol, deadline).reason
-    ):
+    if _is_proof(problem, claim, tol, deadline):
         return claim, True, ""
     spec, left = get("auto"), deadline.get_remaining_seconds()
     if problem.m > CERTIFICATE_ROWS or (left is not None and left <= 0.0):
@@ -349,12 +331,15 @@ def check_infeasibility_claim(
     own_claim = solver.run(solver.prepare(problem), impulse, spec.max_iter, tol, left)
     if own_claim.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
-    if (
-        own_claim.certificate is not None
-        and not prove_infeasibility(problem, own_claim.certificate, tol, deadline).reason
-    ):
+    if _is_proof(problem, own_claim, tol, deadline):
         message = f"{claim.message}; auto found the certificate".removeprefix("; ")
         return replace(claim, certificate=own_claim.certificate, message=message), True, ""
     relative = residual(problem, impulse, "float64").relative
     solution = f"auto found a solution to a relative residual of {relative:.1e}"
     return claim, False, solution if relative <= tol else ""
+
+
+def _is_proof(problem: Problem, claim: Claim, tol: float, deadline: Deadline) -> bool:
+    """Return whether the certificate of a claim proves that no impulse meets `tol`."""
+    y = claim.certificate
+    return y is not None and not prove_infeasibility(problem, y, tol, deadline).reason

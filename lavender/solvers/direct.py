@@ -53,9 +53,10 @@ REFINEMENT_RESIDUAL = 1e-13
 ROUNDS_PER_CHECK = 32  # Number of rounds of exchanges between two checks of the clock and the residual.
 
 
-def _estimate_linear_cost(problem: Problem) -> float:
-    """Estimate the cost to set up a linear problem and to factor A [ns]."""
-    factor = estimate_first_factor_cost(problem.m, problem.max_entries)
+def _estimate_setup_cost(problem: Problem) -> float:
+    """Estimate the cost of the set-up [ns], which includes the factor of a linear problem."""
+    is_linear = problem.law == "linear"
+    factor = estimate_first_factor_cost(problem.m, problem.max_entries) if is_linear else 0.0
     return estimate_matrix_setup_cost(problem) + factor
 
 
@@ -89,9 +90,8 @@ class Direct(Solver):
     needs_scipy = True
 
     def cost(self, problem: Problem) -> Cost:
-        """Estimate the cost of `prepare`, which includes the factor of a linear problem, and of exchanges."""
-        setup = _estimate_linear_cost if problem.law == "linear" else estimate_matrix_setup_cost
-        return Cost(partial(setup, problem), total=partial(estimate_direct_cost, problem))
+        """Estimate the cost of `prepare` and of exchanges."""
+        return Cost(partial(_estimate_setup_cost, problem), total=partial(estimate_direct_cost, problem))
 
     def prepare(self, problem: Problem, like: PivotState | None = None) -> DirectState:
         linear = problem.law == "linear"
@@ -183,8 +183,7 @@ class _Run:
         # The solver stops at a relative residual up to this value, whatever the round-off floor is.
         self.sufficient_residual = REFINEMENT_RESIDUAL if solver.exact else max(REFINEMENT_RESIDUAL, tol)
         self.state, self.problem, self.impulse = state, state.problem, impulse
-        self.max_iter, self.tol = max_iter, tol
-        self.deadline = deadline
+        self.max_iter, self.tol, self.deadline = max_iter, tol, deadline
         self.best_pass: measure.Judged | None = None
         self.late = False  # Whether a round was not started because it would have ended after the deadline.
         self.iterations = 0
@@ -195,14 +194,15 @@ class _Run:
     # -- judging ---------------------------------------------------------------------------------
 
     def judge_iterate(self, x: FloatArray) -> float:
-        """Return the relative residual of x (m,), which must not change afterwards; keep the best x as the result.
-
-        No history is recorded.
-        """
+        """Return the relative residual of x (m,), which must not change afterwards; keep the best x as the result."""
         result = judge_impulse(self.problem, x)
         self.store_if_best(result)
-        relative: float = result.relative
-        return relative
+        return float(result.relative)
+
+    def judge_start_unless_better(self) -> None:
+        """Judge the zero impulse if no iterate is better."""
+        if not self.best <= 1.0:
+            self.judge_iterate(self.problem.start())
 
     def store_if_best(self, result: measure.Judged | None) -> None:
         """Store a judged iterate if it has the smallest residual so far."""
@@ -333,54 +333,38 @@ class _Run:
             proof = self.make_infeasibility_claim(rows.changed) if code in (PASS_ENDED, PASSES_USED) else None
             if proof is not None:
                 return proof
-            if rows.is_over or self.must_give_up(code, rows.passes > 0 or not pivot.symmetric):
+            is_shifted = rows.passes > 0 or not pivot.symmetric
+            is_stuck = code == STUCK or (code == SMALL_PIVOT and is_shifted)
+            if rows.is_over or (is_stuck and not self.patient):
                 self.store_if_best(rows.best)
                 return self.make_claim_of_final_code(pivot, code)
             if self.iterations >= self.max_iter or self.out_of_time:
                 self.store_if_best(rows.best)
-                return self.make_out_of_budget_claim()
-
-    def must_give_up(self, code: int, is_shifted: bool) -> bool:
-        """Return whether the solver stops because pivoting makes no progress and `patience` is false."""
-        return not self.patient and (code == STUCK or (code == SMALL_PIVOT and is_shifted))
+                self.judge_start_unless_better()
+                is_late = self.iterations < self.max_iter
+                return self.make_claim(Status.TIME_LIMIT if is_late else Status.MAX_ITERATIONS)
 
     def make_claim_of_final_code(self, pivot: PivotState, code: int) -> Claim:
         """Return the claim after the final code of the kernel."""
         if code == CYCLING:
-            return self.make_cycling_claim()
-        if self.problem.law != "linear":
-            return (
-                self.make_indefinite_claim(pivot.symmetric)
-                if code == INDEFINITE
-                else self.make_claim_for_best_iterate()
-            )
-        met = self.best <= self.tol or self.is_at_floor() or self.out_of_time
-        if code == SOLVED or (code == PASSES_USED and pivot.symmetric and met):
-            return self.make_claim_for_best_iterate()
-        return self.solve_with_rank_revealing_lu(
-            "A is indefinite" if pivot.symmetric else "A is not symmetric"
-        )
-
-    def make_cycling_claim(self) -> Claim:
-        """Return the claim after exchanges that cycle."""
-        self.notes.append("the exchanges cycle, and A is not symmetric: no energy decreases; see lemke")
-        if not self.best <= 1.0:
-            self.judge_iterate(self.problem.start())
+            self.notes.append("the exchanges cycle, and A is not symmetric: no energy decreases; see lemke")
+            self.judge_start_unless_better()
+        elif self.problem.law != "linear":
+            if code == INDEFINITE:
+                why = (
+                    "A is indefinite"
+                    if pivot.symmetric
+                    else "A is not symmetric, and singular under every shift,"
+                )
+                self.notes.append(f"{why} on the free rows: no solution by this method, see lemke")
+                return self.make_claim(Status.NUMERICAL_ERROR)
+        elif code != SOLVED:
+            met = self.best <= self.tol or self.is_at_floor() or self.out_of_time
+            if not (code == PASSES_USED and pivot.symmetric and met):
+                return self.solve_with_rank_revealing_lu(
+                    "A is indefinite" if pivot.symmetric else "A is not symmetric"
+                )
         return self.make_claim_for_best_iterate()
-
-    def make_out_of_budget_claim(self) -> Claim:
-        """Return the claim after the last iteration or the deadline."""
-        if not self.best <= 1.0:
-            self.judge_iterate(self.problem.start())
-        return self.make_claim(
-            Status.TIME_LIMIT if self.iterations < self.max_iter else Status.MAX_ITERATIONS
-        )
-
-    def make_indefinite_claim(self, symmetric: bool = True) -> Claim:
-        """Return the claim for bounded rows with an A that cannot be factored."""
-        why = "A is indefinite" if symmetric else "A is not symmetric, and singular under every shift,"
-        self.notes.append(f"{why} on the free rows: no solution by this method, see lemke")
-        return self.make_claim(Status.NUMERICAL_ERROR)
 
     def add_singularity_note(self, pivot: PivotState, shifted: bool) -> None:
         """Add a note that A is singular, with its rank for linear systems."""

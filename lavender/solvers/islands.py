@@ -41,9 +41,8 @@ def restrict_to_blocks(problem: Problem, blocks: IntArray, rows: IntArray) -> Pr
     cones = problem.cones._select_blocks(blocks)
     names = Names(len(blocks), lambda: [problem.block_name(i) for i in blocks])
     attributes: dict[str, Any] = {"friction": problem.friction, "names": names, "name": problem.name}
-    b: FloatArray = (
-        problem.b[rows] if max_abs_of_array(problem.b[rows]) >= MIN_MAGNITUDE else np.zeros(len(rows))
-    )
+    b: FloatArray = problem.b[rows]
+    b = b if max_abs_of_array(b) >= MIN_MAGNITUDE else np.zeros(len(rows))
     if problem.generalized is not None:
         assert problem.compliance is not None
         trees = problem.generalized.trees
@@ -55,27 +54,21 @@ def restrict_to_blocks(problem: Problem, blocks: IntArray, rows: IntArray) -> Pr
     bodies = problem.rows
     joints = blocks[blocks < bodies.n_joints]
     contacts = blocks[blocks >= bodies.n_joints] - bodies.n_joints
-    used = np.unique(
-        np.concatenate([bodies.joint_body[joints].ravel(), bodies.contact_body[contacts].ravel()])
-    )
+    pairs = bodies.joint_body[joints], bodies.contact_body[contacts]
+    used = np.unique(np.concatenate([each.ravel() for each in pairs]))
     used = used[used >= 0]
     # The last entry belongs to the static body, -1.
     number_in_part = np.full(bodies.n_bodies + 1, -1, np.int32)
     number_in_part[used] = np.arange(len(used))
-    joint_rows = int(np.diff(bodies.joint_ptr)[joints].sum())
+    joint_sizes = np.diff(bodies.joint_ptr)[joints]
     part = replace(
         bodies,
-        inv_mass=bodies.inv_mass[used],
-        inv_inertia=bodies.inv_inertia[used],
-        v_free=bodies.v_free[used],
-        jac=bodies.jac[rows[:joint_rows]],
-        joint_ptr=np.concatenate([[0], np.cumsum(np.diff(bodies.joint_ptr)[joints])]).astype(np.int32),
-        joint_body=number_in_part[bodies.joint_body[joints]],
-        normal=bodies.normal[contacts],
-        tangent=bodies.tangent[contacts],
-        arm_a=bodies.arm_a[contacts],
-        arm_b=bodies.arm_b[contacts],
-        contact_body=number_in_part[bodies.contact_body[contacts]],
+        **{name: getattr(bodies, name)[used] for name in ("inv_mass", "inv_inertia", "v_free")},
+        **{name: getattr(bodies, name)[contacts] for name in ("normal", "tangent", "arm_a", "arm_b")},
+        jac=bodies.jac[rows[: int(joint_sizes.sum())]],
+        joint_ptr=np.concatenate([[0], np.cumsum(joint_sizes)]).astype(np.int32),
+        joint_body=number_in_part[pairs[0]],
+        contact_body=number_in_part[pairs[1]],
         copy=False,
     )
     assert problem.compliance is not None

@@ -103,10 +103,10 @@ class Lemke(Solver):
             if code == RAY:
                 message = RAY_MESSAGE
                 certificate = _normalise_ray(paths.ray)
-            if (
-                certificate is not None
-                and check_certificate(state.problem, certificate, tol, deadline) is None
-            ):
+            is_proof = certificate is not None and (
+                check_certificate(state.problem, certificate, tol, deadline) is None
+            )
+            if is_proof:
                 status, message = Status.INFEASIBLE, "ended on a secondary ray: no impulse meets every row"
             elif code == DONE and rows.relative <= tol:
                 status, message = Status.CONVERGED, ""
@@ -121,11 +121,8 @@ class Lemke(Solver):
             if status is Status.STALLED:
                 proof = _find_certificate_by_linear_program(state.problem, tol, deadline)
                 if proof is not None:
-                    status, certificate, message = (
-                        Status.INFEASIBLE,
-                        proof,
-                        "a linear program found a certificate",
-                    )
+                    status, certificate = Status.INFEASIBLE, proof
+                    message = "a linear program found a certificate"
             work = rows.work | {"pivots": paths.pivots, "paths": paths.paths}
             return Claim(status, paths.pivots, work, message, form="dense", certificate=certificate)
 

@@ -85,9 +85,9 @@ class PivotState:
                 band, factor = -1, LUFactor(problem)
         #: Whether the factor is sparse.
         self.is_sparse = self.form == "sparse" or (isinstance(factor, LUFactor) and factor.sparse)
-        self.outside = (
-            None if factor is None else TimedFactor(factor, 1e-9 * self._estimate_first_factor_cost())
-        )
+        self.outside: TimedFactor | None = None
+        if factor is not None:
+            self.outside = TimedFactor(factor, 1e-9 * self._estimate_first_factor_cost())
         get_zero_impulse_reference(problem)
         # [s] Time of one round with a compiled factor: first an estimate for free rows, then the last round's time.
         # [ns] Includes the computation of w.
@@ -100,25 +100,22 @@ class PivotState:
 
     def _estimate_first_factor_cost(self) -> float:
         """Estimate the cost of the first factor [ns] from the structure."""
-        cost = estimate_first_factor_cost(
-            self.problem.m, len(self.problem._compressed[1]) if self.is_sparse else np.inf
-        )
-        if self.symmetric:
-            return cost
-        return 2.0 * (max(cost, _estimate_filled_factor_cost(self.problem)) if self.is_sparse else cost)
+        entries = len(self.problem._compressed[1]) if self.is_sparse else np.inf
+        cost = estimate_first_factor_cost(self.problem.m, entries)
+        if self.is_sparse and not self.symmetric:
+            cost = max(cost, _estimate_filled_factor_cost(self.problem))
+        return cost if self.symmetric else 2.0 * cost
 
     @property
     def sweeps(self) -> int:
         """Number of symmetric sweeps that guess the free rows: the minimum for a compiled factor, else by its cost."""
         if self.outside is None:
             return MIN_GUESS_SWEEPS
-        m, data = self.problem.m, self.problem.csr_data
-        factor = estimate_dense_factor_cost(m)
+        m, factor = self.problem.m, estimate_dense_factor_cost(self.problem.m)
         if self.is_sparse:
             factor = min(factor, estimate_sparse_work(self.problem.csr.nnz, m))
-        return int(
-            min(max(MIN_GUESS_SWEEPS, GUESS_COST_FRACTION * factor / (2.0 * data.work)), MAX_GUESS_SWEEPS)
-        )
+        sweeps = GUESS_COST_FRACTION * factor / (2.0 * self.problem.csr_data.work)
+        return int(min(max(MIN_GUESS_SWEEPS, sweeps), MAX_GUESS_SWEEPS))
 
     def is_too_late_to_sweep(self, deadline: Deadline) -> bool:
         """Return whether the sweeps before the first factor would end after the deadline."""

@@ -26,7 +26,7 @@ from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import sparse as sp
 from lavender.judge.certificates import check_certificate
-from lavender.judge.residuals import compute_stopping_residual
+from lavender.judge.residuals import judge_impulse
 from lavender.judge.solution import Claim, Status, sum_work_counts
 from lavender.problem import Problem
 from lavender.problem.cones import project_impulse
@@ -179,9 +179,8 @@ class BoundedRowSolver(Solver):
 
     def start_workers(self, converted: Any, time_limit: float) -> None:
         """Start the worker processes of the inner solver."""
-        self.solver.start_workers(
-            converted.state if isinstance(converted, ConvertedState) else converted, time_limit
-        )
+        state = converted.state if isinstance(converted, ConvertedState) else converted
+        self.solver.start_workers(state, time_limit)
 
     def prepare(self, problem: Problem) -> Any:
         """Prepare the inner solver for the problem, or for its conversion (1) or (2)."""
@@ -192,11 +191,9 @@ class BoundedRowSolver(Solver):
 
     def update(self, converted: Any, problem: Problem) -> Any:
         """Return the state for new numbers; a conversion is built again, because coefficients may become 0."""
-        return (
-            self.prepare(problem)
-            if isinstance(converted, ConvertedState)
-            else self.solver.update(converted, problem)
-        )
+        if isinstance(converted, ConvertedState):
+            return self.prepare(problem)
+        return self.solver.update(converted, problem)
 
     def run(
         self, converted: Any, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None = None
@@ -208,10 +205,7 @@ class BoundedRowSolver(Solver):
         claim = self._run_converted(converted, impulse, max_iter, tol, time_limit)
         if claim.status in (Status.CONVERGED, Status.ROUNDOFF_LIMIT):
             return claim
-        workspace = np.empty_like(start), np.empty_like(start)
-        before, after = (
-            compute_stopping_residual(converted.form.problem, x, *workspace)[0] for x in (start, impulse)
-        )
+        before, after = (judge_impulse(converted.form.problem, x).relative for x in (start, impulse.copy()))
         if before < after:
             impulse[:] = start
         return replace(claim, status=Status.CONVERGED, certificate=None) if before <= tol else claim
@@ -253,8 +247,8 @@ class BoundedRowSolver(Solver):
         if not np.isfinite(projected).all():
             return replace(claim, status=Status.NUMERICAL_ERROR, certificate=None, dual=None)
         impulse[:] = projected
-        workspace = np.empty_like(projected), np.empty_like(projected)
-        relative, above = compute_stopping_residual(form.problem, impulse, *workspace, floor=True)
+        judged = judge_impulse(form.problem, projected)
+        relative, above = judged.relative, judged.above_floor
         status, message, proof = claim.status, claim.message, None
         if relative <= tol:
             status = Status.CONVERGED
@@ -268,11 +262,5 @@ class BoundedRowSolver(Solver):
         elif status in (Status.CONVERGED, Status.ROUNDOFF_LIMIT):
             status = Status.STALLED
         name = "edges of the cones" if form.problem.law == "cone" else "rows with slack"
-        return replace(
-            claim,
-            status=status,
-            message=message,
-            form=", ".join(filter(None, (claim.form, name))),
-            certificate=proof,
-            dual=None,
-        )
+        form_name = ", ".join(filter(None, (claim.form, name)))
+        return replace(claim, status=status, message=message, form=form_name, certificate=proof, dual=None)

@@ -1,4 +1,4 @@
-"""Quantities of a problem's structure: components, bodies of generalised velocities, an elimination order (graph.pxd)."""
+"""Quantities of a problem's structure: bodies of generalised velocities, an elimination order (graph.pxd)."""
 from libc.stdint cimport int32_t
 
 import numpy as np
