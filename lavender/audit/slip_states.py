@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from lavender.audit.settings import MujocoSetting, get_option_value
 from lavender.audit.slip import (
     MIN_EXPLAINED_SLIP,
     REMEDY_STEPS,
@@ -154,22 +155,15 @@ def _change_settings(mj: Any, model: Any, geoms: str) -> Iterator[tuple[str, Any
     The first is the model itself.
     """
     yield "as it is", model
-    ratio, iterations = 10.0 * model.opt.impratio, 10 * int(model.opt.iterations)
-    options: dict[str, dict[str, Any]] = {
-        f'iterations="{iterations}" tolerance="1e-12"': {"iterations": iterations, "tolerance": 1e-12},
-        f'impratio="{ratio:g}"': {"impratio": ratio},
-        'noslip_iterations="20"': {"noslip_iterations": 20},
-    }
-    if model.opt.cone == mj.mjtCone.mjCONE_PYRAMIDAL:
-        cone = {"cone": mj.mjtCone.mjCONE_ELLIPTIC}
-        options |= {'cone="elliptic"': cone} | {
-            f'cone="elliptic" {text}': cone | values for text, values in list(options.items())[1:]
-        }
-    for text, values in options.items():
-        changed = copy.deepcopy(model)
-        for name, value in values.items():
-            setattr(changed.opt, name, value)
-        yield f"<option {text}/>", changed
+    options: list[dict[str, Any]] = [
+        {"iterations": 10 * int(model.opt.iterations), "tolerance": 1e-12},
+        {"impratio": 10.0 * float(model.opt.impratio)},
+        {"noslip_iterations": 20},
+    ]
+    if get_option_value(mj, model, "cone") == "pyramidal":
+        options += [{"cone": "elliptic", **x} for x in ({}, *options[1:])]
+    settings = [MujocoSetting.from_options(mj, model, **x) for x in options]
+    yield from ((s.option_line, s.apply_to(mj, model)) for s in settings if s.options)
     shortest = 2.0 * model.opt.timestep  # MuJoCo uses no shorter time constant.
     if model.geom_solref[:, 0].max(initial=0.0) > shortest:  # Negative values are stiffnesses.
         changed = copy.deepcopy(model)

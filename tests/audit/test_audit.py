@@ -10,7 +10,8 @@ from mujoco_scene import mj, whole_mass
 
 import lavender as lv
 from lavender.audit import audit as module
-from lavender.audit.audit import AUDIT_VERDICTS, audit
+from lavender.audit.audit import audit
+from lavender.audit.result import AUDIT_VERDICTS
 from lavender.audit.simulated_worlds import Frame, Runs
 from lavender.io.efc import from_efc
 from lavender.io.start_states import read_states

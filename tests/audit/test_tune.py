@@ -9,9 +9,11 @@ from calls import EARLY_BOXES as EARLY
 
 import lavender as lv
 from lavender.audit.audit import audit
-from lavender.audit.simulated_worlds import Runs, StepSizes
+from lavender.audit.settings import OPTIONS, PROBLEM_OPTIONS
+from lavender.audit.settings import MujocoSetting as Setting
+from lavender.audit.simulated_worlds import Runs
+from lavender.audit.step_sizes import StepSizes
 from lavender.audit.tune import Measured, Tuning, mujoco_settings, sweep, tune
-from lavender.audit.tune.mujoco_settings import MujocoSetting as Setting
 from lavender.audit.tune.mujoco_settings import MujocoStage as Stage
 from lavender.audit.tune.mujoco_settings import list_first_settings
 
@@ -60,7 +62,7 @@ def test_a_line_means_in_a_model_what_was_measured(options):
         kept = " ".join(w for w in options.split() if w.partition("=")[0] not in names)
         copied = mj.MjModel.from_xml_string(BOXES.format(options=f"{kept} {text}")).opt
         tried = setting.apply_to(mj, plain).opt
-        for name in (*mujoco_settings.OPTIONS, *mujoco_settings.PROBLEM_OPTIONS):
+        for name in (*OPTIONS, *PROBLEM_OPTIONS):
             assert getattr(copied, name) == getattr(tried, name), setting
     assert Setting.from_options(mj, plain, iterations=int(plain.opt.iterations)).option_line == ""
 

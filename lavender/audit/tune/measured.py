@@ -16,10 +16,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from statistics import fmean
 from time import perf_counter
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
+from lavender.audit.settings import Setting
 from lavender.base.arrays import FloatArray
 from lavender.report import machine
 from lavender.report.runner import Event
@@ -30,39 +31,6 @@ ERROR_QUANTILE = 0.99  # Settings are compared by this quantile of the error ove
 MAX_TIME_RATIO = 2.0
 #: Kinds of measurements: the error of a setting, and the times of its steps.
 MEASUREMENTS: tuple[str, ...] = ("judging", "timing")
-
-
-@dataclass(frozen=True)
-class Setting:
-    """Options of an engine that differ from the present ones; a derived class writes them in the engine's syntax."""
-
-    problem_options: ClassVar[tuple[str, ...]] = ()  # Options that change the constraint problem itself.
-    comment: ClassVar[str] = "# {}"  # Format of a comment in the syntax of `option_line`.
-    merge_note: ClassVar[str] = ""  # Note for the user on where to insert `option_line`.
-
-    options: tuple[tuple[str, Any], ...] = ()
-    is_default: bool = field(default=False, compare=False)  # Whether these are the engine's default options.
-
-    @property
-    def option_line(self) -> str:
-        """Line to copy; empty if no option differs."""
-        raise NotImplementedError
-
-    @property
-    def name(self) -> str:
-        """`option_line`, or "the model's own setting" if it is empty."""
-        return self.option_line or "the model's own setting"
-
-    @property
-    def short_name(self) -> str:
-        """Options without the engine's syntax, for narrow tables."""
-        values = ((name, f"{x:g}" if isinstance(x, float) else str(x)) for name, x in self.options)
-        return " ".join(f"{name}={x}" for name, x in values) or "model's own setting"
-
-    @property
-    def changes_problem(self) -> bool:
-        """Whether the setting changes the constraint problem, and not only how it is solved."""
-        return any(name in self.problem_options for name, _ in self.options)
 
 
 @dataclass(eq=False)

@@ -13,31 +13,20 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from time import perf_counter
 from types import SimpleNamespace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from lavender.audit.audit import MAX_PROBLEMS_IN_MEMORY
+from lavender.audit.settings import OPTIONS, MujocoSetting, Setting, get_option_value
 from lavender.audit.simulated_worlds import Runs, has_diverged, simulate_world
-from lavender.audit.tune.measured import Measured, Setting, Stage, make_unmeasured
+from lavender.audit.tune.measured import Measured, Stage, make_unmeasured
 from lavender.audit.tune.tables import MUJOCO, list_options
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.batch.residuals import residual_many
 from lavender.io.efc import from_mujoco_many
 
-MERGE_NOTE = (
-    "Add the line after the model's own <option>: MuJoCo merges both, and a later attribute replaces an earlier one. "
-    "If the line replaces the model's own <option>, its integrator and time step are lost."
-)
-# Prefixes of the names of MuJoCo's enumerators; the remaining part of a name is the MJCF keyword.
-ENUMS = {
-    "solver": "mjSOL_",
-    "cone": "mjCONE_",
-    "jacobian": "mjJAC_",
-}
-OPTIONS = ("solver", "iterations", "tolerance", "ls_iterations", "ls_tolerance", "jacobian")
-PROBLEM_OPTIONS = ("cone", "impratio", "noslip_iterations")  # Options that change the problem.
 CONVERGED_OPTIONS = {
     "solver": "Newton",
     "iterations": 300,
@@ -47,65 +36,10 @@ CONVERGED_OPTIONS = {
 }
 
 
-@dataclass(frozen=True)
-class MujocoSetting(Setting):
-    """Attributes of `<option>` that differ from the model's."""
-
-    problem_options: ClassVar[tuple[str, ...]] = PROBLEM_OPTIONS
-    comment: ClassVar[str] = "<!-- {} -->"
-    merge_note: ClassVar[str] = MERGE_NOTE
-
-    @classmethod
-    def from_options(cls, mj: Any, model: Any, **options: Any) -> MujocoSetting:
-        """Create the setting of the options that differ from the model's, in the order of `OPTIONS`."""
-        has = {name: get_option_value(mj, model, name) for name in (*OPTIONS, *PROBLEM_OPTIONS)}
-        return cls(tuple((name, options[name]) for name in has if options.get(name, has[name]) != has[name]))
-
-    @property
-    def name(self) -> str:
-        """`option_line`, after "MuJoCo's defaults" if the setting is that; or "the model's own setting"."""
-        return f"MuJoCo's defaults: {super().name}" if self.is_default else super().name
-
-    @property
-    def short_name(self) -> str:
-        """Options without the syntax of MJCF; or "MuJoCo's defaults"."""
-        return "MuJoCo's defaults" if self.is_default else super().short_name
-
-    def apply_to(self, mj: Any, model: Any) -> Any:
-        """Return a copy of the model with these options."""
-        configured = copy.copy(model)
-        for name, x in self.options:
-            kind = ENUMS.get(name)
-            setattr(configured.opt, name, x if kind is None else _map_keywords_to_values(mj, name)[x])
-        return configured
-
-    @property
-    def option_line(self) -> str:
-        """`<option>` line to copy into the model; empty if no option differs."""
-        texts = (f'{name}="{x:g}"' if isinstance(x, float) else f'{name}="{x}"' for name, x in self.options)
-        return f"<option {' '.join(texts)}/>" if self.options else ""
-
-
-def _map_keywords_to_values(mj: Any, name: str) -> dict[str, Any]:
-    """Return {MJCF keyword: MuJoCo's value} of an enumerated option."""
-    members: dict[str, Any] = getattr(mj, f"mjt{name.capitalize()}").__members__
-    keywords = {"NEWTON": "Newton", "CG": "CG", "PGS": "PGS"}
-    short = ((key.removeprefix(ENUMS[name]), value) for key, value in members.items())
-    return {keywords.get(key, key.lower()): value for key, value in short}
-
-
 def get_default_options(mj: Any) -> dict[str, Any]:
     """Return MuJoCo's default values of `OPTIONS`."""
     default = SimpleNamespace(opt=mj.MjOption())
     return {name: get_option_value(mj, default, name) for name in OPTIONS}
-
-
-def get_option_value(mj: Any, model: Any, name: str) -> Any:
-    """Return the model's value of an option as MJCF writes it."""
-    x = getattr(model.opt, name)
-    if name not in ENUMS:
-        return float(x) if isinstance(x, float) else int(x)
-    return next(word for word, value in _map_keywords_to_values(mj, name).items() if int(value) == int(x))
 
 
 @dataclass(eq=False)

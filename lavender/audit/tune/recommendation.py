@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from lavender.audit.simulated_worlds import StepSizes, describe_exceedance
-from lavender.audit.tune.measured import Measured, Setting
+from lavender.audit.settings import Setting
+from lavender.audit.step_sizes import StepSizes, describe_exceedance
+from lavender.audit.tune.measured import Measured
 from lavender.base.deadline import format_seconds
 from lavender.problem.derived import cached_property
 from lavender.report.figures import Curve, Figure

@@ -18,14 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from lavender.audit.simulated_worlds import (
-    SPREADS,
-    Runs,
-    StepSizes,
-    can_any_geoms_collide,
-    count_engine_warnings,
-)
-from lavender.audit.tune.measured import Measured, Schedule, Setting, Stage
+from lavender.audit.settings import Setting
+from lavender.audit.simulated_worlds import SPREADS, Runs, can_any_geoms_collide, count_engine_warnings
+from lavender.audit.step_sizes import StepSizes
+from lavender.audit.tune.measured import Measured, Schedule, Stage
 from lavender.audit.tune.mujoco_settings import MujocoStage
 from lavender.audit.tune.recommendation import Tuning
 from lavender.audit.tune.world_settings import make_kamino_stages, make_warp_stages

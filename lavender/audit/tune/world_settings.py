@@ -17,9 +17,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from lavender.audit.engine_scenes import load_build_function, start_scene
+from lavender.audit.settings import MujocoSetting, Setting, get_option_value
 from lavender.audit.simulated_worlds import START_FIELDS, Runs, WarpWorlds, make_frame
-from lavender.audit.tune.measured import Measured, Setting, Stage, make_unmeasured
-from lavender.audit.tune.mujoco_settings import CONVERGED_OPTIONS, MujocoSetting, get_option_value
+from lavender.audit.tune.measured import Measured, Stage, make_unmeasured
+from lavender.audit.tune.mujoco_settings import CONVERGED_OPTIONS
 from lavender.audit.tune.tables import KAMINO, MUJOCO_WARP, list_options
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError

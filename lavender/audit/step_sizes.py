@@ -1,0 +1,89 @@
+"""Rows and contacts of judged steps, and whether enough steps have contact to rate a solver."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lavender.report.table import Table
+from lavender.report.text import format_count, format_percent
+
+# If a smaller fraction of the judged steps has contact, `tune` recommends no setting and an audit warns: mean times,
+# and the error that 1 % of the steps exceed, then describe steps without contact. Examples: 6 % of the steps of
+# dm_control's finger model have contact, none of its stacker model.
+MIN_CONTACT_SHARE = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class StepSizes:
+    """Rows and contacts of each judged step.
+
+    Parameters
+    ----------
+    rows, contacts : (steps,) int
+        Contacts that have rows.
+    can_touch : bool
+        Whether the model has geoms that can collide. If not, the fraction of steps with rows decides.
+    """
+
+    rows: np.ndarray
+    contacts: np.ndarray
+    can_touch: bool
+
+    @property
+    def has_enough_contact(self) -> bool:
+        """Whether enough of the steps have contact to recommend a setting."""
+        return self._n_with_contact >= MIN_CONTACT_SHARE * len(self.rows)
+
+    @property
+    def _n_with_contact(self) -> int:
+        """Number of steps with contact, or with rows if the model has no geoms that can collide."""
+        return int(np.count_nonzero(self.contacts if self.can_touch else self.rows))
+
+    @property
+    def contact_phrase(self) -> str:
+        """Phrase with the number of steps that have contact and the fraction that is needed."""
+        n, object_name = len(self.rows), "contact" if self.can_touch else "a constraint"
+        fraction = f" ({format_percent(self._n_with_contact, n, min(1, self._n_with_contact))})" if n else ""
+        needed = f"{100.0 * MIN_CONTACT_SHARE:g} %"
+        return f"{self._n_with_contact} of {n} steps judged have {object_name}{fraction}, fewer than {needed}"
+
+    @property
+    def size_table(self) -> Table:
+        """Table of the median and maximum number of rows and contacts, and the fraction of steps that have any."""
+        rows = []
+        for name, counts in (("rows", self.rows), ("contacts", self.contacts)):
+            if len(counts):
+                with_any = format_percent(int(np.count_nonzero(counts)), len(counts), 1)
+                rows.append([name, f"{np.median(counts):g}", str(counts.max()), with_any])
+        heads = ["in a step", "median", "maximum", "steps with any"]
+        return Table(heads, rows, words=frozenset(heads[:1]))
+
+    @property
+    def as_dict(self) -> dict[str, Any]:
+        """The contents of `size_table` for numbers.json."""
+        numbers: dict[str, Any] = {"can_touch": self.can_touch, "min_contact_share": MIN_CONTACT_SHARE}
+        for name, counts in (("rows", self.rows), ("contacts", self.contacts)):
+            with_any = len(counts) > 0
+            numbers[name] = {
+                "median": float(np.median(counts)) if with_any else None,
+                "maximum": int(counts.max()) if with_any else None,
+                "share": float(np.mean(counts > 0)) if with_any else None,
+            }
+        return numbers
+
+
+def describe_exceedance(n_worlds: int) -> str:
+    """Return a sentence on the probability that a further world has a larger error than all worlds measured.
+
+    If n + 1 worlds are drawn from one distribution, each has the largest error with probability 1 / (n + 1), whatever
+    the distribution. This does not hold for steps, because the steps of one world depend on each other.
+    """
+    if not n_worlds:
+        return ""
+    return (
+        f"The maximum is that of {format_count(n_worlds, 'world')} and not a bound: a further world that is drawn "
+        f"alike exceeds it with a probability of up to 1/{n_worlds + 1}."
+    )
