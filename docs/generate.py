@@ -98,6 +98,9 @@ The columns of the table are
   M, and *matrix* has A. If a solver reads only A, A is computed from the other forms,
 - *exact*: the solver ends after finitely many steps with the exact solution, up to rounding,
 - *resumable*: n₁ iterations followed by n₂ iterations give the same bits as n₁ + n₂ iterations."""
+BACKENDS_LISTED = """\
+*Backends* are solvers of other packages ([their behaviour](backends.md)). They accept the laws linear and lcp,
+`clarabel_cone` also cone, and read matrices and rows:"""
 ORDERS = """\
 Options are keywords of `lavender.solve`. The option `order=` selects the [sweep order](sweep.md#sweep-orders),
 `seed=` the seed of random orders. If a problem is given as a matrix, `ground=` lists the blocks that touch the
@@ -338,7 +341,9 @@ def solver_overview():
             s.summary,
         )
         for s in specs
+        if not s.external
     ]
+    backends = [f"`{s.name}` ({s.summary.removesuffix(' (QP backend)')})" for s in specs if s.external]
     own = [(f"`{s.name}`", f"`{n}`", text) for s in specs if not s.external for n, text in s.options.items()]
     others = next(s for s in specs if s.external and s.options).options
     takes_order = ", ".join(f"`{s.name}`" for s in specs if s.order)
@@ -348,6 +353,7 @@ def solver_overview():
             "<!-- Written by `python docs/generate.py --pages`. -->",
             INTRODUCTION,
             table(("name", "laws", "reads", "exact", "resumable", "method"), rows),
+            f"{BACKENDS_LISTED}\n{'; '.join(backends)}.",
             "## Options",
             f"{ORDERS}\n{takes_order}.",
             table(("solver", "option", "meaning"), own),
