@@ -48,7 +48,6 @@ the error of `impulse`.
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -62,7 +61,6 @@ from lavender.problem import Names, Problem
 from lavender.problem.cones import Cones
 from lavender.problem.generalized import MIN_TREE_ORDERING_VELOCITIES, Generalized
 from lavender.problem.operators import MAX_SAFE_ENTRY
-from lavender_ext.core.generalized import Operator
 from lavender_ext.io import mujoco_rows
 from lavender_ext.io.mujoco_step import Step
 
@@ -84,16 +82,6 @@ FLOAT32_ADVICE = (
 )
 LAYOUT_NOTE = "(also if opt.jacobian, which determines the layout of efc_J, was changed)"
 NO_TRIANGLE = (np.zeros(1, np.int32), np.zeros(0, np.int32))
-_CODES = (
-    "mjCNSTR_EQUALITY",
-    "mjCNSTR_FRICTION_DOF",
-    "mjCNSTR_FRICTION_TENDON",
-    "mjCNSTR_LIMIT_JOINT",
-    "mjCNSTR_LIMIT_TENDON",
-    "mjCNSTR_CONTACT_FRICTIONLESS",
-    "mjCNSTR_CONTACT_PYRAMIDAL",
-    "mjCNSTR_CONTACT_ELLIPTIC",
-)
 
 
 def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
@@ -128,30 +116,20 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
     """
     step = read_step(model, data)
     kept = step.cache
-    like, dt = kept.first_operator, _get_timestep(step)
-    mass, change = _read_mass(step, data, NO_TRIANGLE if like is None else like.mass[:2])
-    blocks, scale, key = _make_blocks(step, data)
-    jac = _read_jacobian(step, data, scale)
-    rhs, compliance, v_free, is_usual, gap, gaps = mujoco_rows.compute_problem_numbers(
-        step, jac, scale, _get_velocity_before(step), MAX_SAFE_ENTRY
-    )
-    _check_jacobian(*gaps)
-    if not gap <= COMPLIANCE_TOLERANCE:
-        compliance, is_usual = _compute_compliance(data) * scale * scale, False
-    general = None
-    if is_usual and kept.is_plain and mass[0] is like.mass[0]:
-        general = Generalized.from_operator(Operator(*jac, *mass, like), v_free, MAX_SAFE_ENTRY)
-    if general is None:
-        general = Generalized.from_compressed_rows(jac, mass, v_free, like=like)
-        is_usual = is_usual and not general.operator.has_entry_above(MAX_SAFE_ENTRY)
-    if like is None:
-        kept.first_operator = general.operator
-        kept.is_plain = general.order is None and step.n < MIN_TREE_ORDERING_VELOCITIES
-    if change is not None:  # MuJoCo's own a0 is as accurate as opt.tolerance only.
-        rhs = mark_read_only(rhs - dt * general.velocity_of(change))
-        general = general.with_jacobian(v_free=v_free + dt * change)
+    parts = None
+    if kept.is_plain:
+        parts = mujoco_rows.convert_regular_step(
+            step, kept.codes, kept.first_operator, MASS_TOLERANCE, SUM_TOLERANCE, MIN_INDEPENDENT_AXIS_FRACTION,
+            COMPLIANCE_TOLERANCE, MAX_SAFE_ENTRY,
+        )  # fmt: skip
+    build: Any = Problem._from_engine_arrays
+    if parts is not None:
+        blocks, key, operator, rhs, compliance, v_free = parts
+        general = Generalized.from_operator(operator, v_free)
+    else:
+        blocks, key, general, rhs, compliance, is_usual = _convert_step(step, data)
+        build = build if is_usual else Problem
     m = step.m
-    build = Problem._from_engine_arrays if is_usual else Problem
     return build(
         b=rhs,
         cones=Cones._from_blocks(blocks),
@@ -162,6 +140,36 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
         names=Names(blocks.n_blocks, lambda: _make_block_names(kept.mj, model, blocks.ints[2 * m + 1 :], m)),
         name=f"{name} (noslip)" if step.has_noslip else name,
         copy=False,
+    )
+
+
+def _convert_step(step: Step, data: Any) -> tuple[Any, Any, Generalized, FloatArray, FloatArray, bool]:
+    """Convert a step whose data are unusual or invalid, or the first step of a model; see `convert_regular_step`."""
+    kept = step.cache
+    like, dt = kept.first_operator, _get_timestep(step)
+    mass, change = _read_mass(step, data, NO_TRIANGLE if like is None else like.mass[:2])
+    blocks, scale, key = _make_blocks(step, data)
+    jac = _read_jacobian(step, data, scale)
+    rhs, compliance, v_free, is_usual, gap, gaps = mujoco_rows.compute_problem_numbers(
+        step, jac, scale, _get_velocity_before(step), MAX_SAFE_ENTRY
+    )
+    _check_jacobian(*gaps)
+    if not gap <= COMPLIANCE_TOLERANCE:
+        compliance, is_usual = _compute_compliance(data) * scale * scale, False
+    general = Generalized.from_compressed_rows(jac, mass, v_free, like=like)
+    if like is None:
+        kept.first_operator = general.operator
+        kept.is_plain = general.order is None and step.n < MIN_TREE_ORDERING_VELOCITIES
+    if change is not None:  # MuJoCo's own a0 is as accurate as opt.tolerance only.
+        rhs = mark_read_only(rhs - dt * general.velocity_of(change))
+        general = general.with_jacobian(v_free=v_free + dt * change)
+    return (
+        blocks,
+        key,
+        general,
+        rhs,
+        compliance,
+        is_usual and not general.operator.has_entry_above(MAX_SAFE_ENTRY),
     )
 
 
@@ -207,11 +215,6 @@ def jacobian(model: Any, data: Any) -> sp.csr_array:
     step = read_step(model, data)
     indptr, indices, values = _read_jacobian(step, data, np.ones(step.m))
     return sp.csr_array((values, indices, indptr), shape=(step.m, step.n))
-
-
-@cache
-def _get_type_codes(mj: Any) -> Any:
-    return mark_read_only(np.array([int(getattr(mj.mjtConstraint, name)) for name in _CODES], np.int32))
 
 
 def _get_timestep(step: Step) -> float:
@@ -370,7 +373,7 @@ def _make_blocks(step: Step, data: Any) -> tuple[Any, FloatArray, Any]:
     InputError
         An index is out of range, or a friction loss or coefficient is not a bound.
     """
-    codes = _get_type_codes(step.cache.mj)
+    codes = step.cache.codes
     result = mujoco_rows.make_blocks(step, codes)
     if isinstance(result, int):  # The number of the first invalid row.
         kind, which, known = int(data.efc_type[result]), int(data.efc_id[result]), codes.tolist()

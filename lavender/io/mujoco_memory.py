@@ -22,6 +22,10 @@ TYPE_SIZES = {
     "*": 8, "mjtNum": 8, "double": 8, "mjtSize": 8, "size_t": 8, "uintptr_t": 8, "uint64_t": 8, "int64_t": 8,
     "int": 4, "float": 4, "mjtBool": 1, "mjtByte": 1, "char": 1,
 }  # fmt: skip
+ROW_TYPES = (
+    "EQUALITY", "FRICTION_DOF", "FRICTION_TENDON", "LIMIT_JOINT", "LIMIT_TENDON", "CONTACT_FRICTIONLESS",
+    "CONTACT_PYRAMIDAL", "CONTACT_ELLIPTIC",
+)  # fmt: skip
 # A model with rows in compressed form and several contacts, whose members are read in both ways.
 PROBE = """<mujoco><option jacobian="sparse" noslip_iterations="3" timestep="0.003"/><worldbody>
 <geom type="plane" size="1 1 .1"/><body pos="0 0 .09"><freejoint/><geom type="box" size=".1 .1 .1"/></body>
@@ -29,7 +33,7 @@ PROBE = """<mujoco><option jacobian="sparse" noslip_iterations="3" timestep="0.0
 
 
 class ModelCache:
-    """The module MuJoCo, and the operator of a model's first problem.
+    """The module MuJoCo, its numbers of the types of rows, and the operator of a model's first problem.
 
     Later problems share its index arrays if their patterns are equal. `is_plain` states that its velocities keep their
     order.
@@ -37,6 +41,8 @@ class ModelCache:
 
     def __init__(self, mj: Any) -> None:
         self.mj = mj
+        codes = [int(getattr(mj.mjtConstraint, f"mjCNSTR_{name}")) for name in ROW_TYPES]
+        self.codes = mark_read_only(np.array(codes, np.int32))
         self.first_operator: Any = None
         self.is_plain = False
 
@@ -80,7 +86,7 @@ def _make_step(model: Any, data: Any) -> Step:
             f"the MjData has {len(data.qvel)} degrees of freedom and the model {model.nv}; both must belong "
             "together: create the data with mujoco.MjData(model)"
         )
-    kept = _MODELS.setdefault(model, ModelCache(mj))
+    kept = _MODELS.get(model) or _MODELS.setdefault(model, ModelCache(mj))
     try:
         step = _STEPS[data] = Step(model, data, find_offsets(mj), mj.mj_isSparse, kept)
     except ValueError:

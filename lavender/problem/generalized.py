@@ -126,16 +126,8 @@ class Generalized:
         return new
 
     @classmethod
-    def from_operator(
-        cls, operator: kernels.Operator, v_free: FloatArray, bound: float
-    ) -> Generalized | None:
-        """Build the object from an operator in the original order of velocities and a checked v* (nv,).
-
-        M is factored. The result is None if M is not positive definite, or an entry of J, M or M^-1 exceeds `bound`.
-        """
-        operator.factor()
-        if operator.failed >= 0 or operator.has_entry_above(bound):
-            return None
+    def from_operator(cls, operator: kernels.Operator, v_free: FloatArray) -> Generalized:
+        """Build the object from a factored operator in the original order of velocities and a checked v* (nv,)."""
         new = object.__new__(cls)
         new.__dict__.update(v_free=v_free, names=None, order=None, operator=operator)
         return new

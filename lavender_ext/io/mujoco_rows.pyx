@@ -17,6 +17,7 @@ from lavender_ext.core.arrays cimport as_double_pointer, as_int_pointer, make_re
 from lavender_ext.core.blocks cimport Blocks, allocate_blocks
 from lavender_ext.core.validate cimport is_valid_number, is_valid_magnitude, update_max_abs
 from lavender_ext.core.block_types cimport ROW, blocks_t, choose_contact_kind, write_contact_bounds
+from lavender_ext.core.generalized cimport Operator
 from lavender_ext.core.problem cimport Workspace, allocate_bytes
 from lavender_ext.io.mujoco_step cimport Step, step_t
 
@@ -268,7 +269,7 @@ cdef inline double max_ignoring_nan(double maximum, double x) noexcept nogil:
     return x if x > maximum else maximum
 
 
-def make_blocks(Step step, codes):
+cpdef make_blocks(Step step, codes):
     """Return (blocks, scale, key), or the number of a row with an unknown type or an invalid id.
 
     blocks is None if a bound is not a valid number. Its `ints` hold type, id, dim and geom from index 2 m + 1.
@@ -303,7 +304,7 @@ def make_blocks(Step step, codes):
     return made if fits else None, made.numbers[5 * m:6 * m], make_read_only(keys if k == m else keys[:k])
 
 
-def read_jacobian(Step step, scale_):
+cpdef read_jacobian(Step step, scale_):
     """Return (indptr, indices, data) of J, each row times `scale_` (m,); a row's number if its indices are invalid.
 
     The result is None if columns do not ascend, and -1 if efc_J has fewer entries than a dense J.
@@ -370,7 +371,7 @@ def read_jacobian(Step step, scale_):
     return (indptr_, indices_, data_) if at == total else (indptr_, indices_[:at], data_[:at])
 
 
-def extract_lower_triangle_of_mass(Step step, double bound, tuple like):
+cpdef extract_lower_triangle_of_mass(Step step, double bound, tuple like):
     """Return the lower triangle of M as (indptr, indices, data), and max |M x - y| over max (|M| |x| + |y|).
 
     x and y are qacc_smooth and qfrc_smooth. The second number is max |M x - y| / max |y| instead, if that is at most
@@ -424,7 +425,7 @@ def extract_lower_triangle_of_mass(Step step, double bound, tuple like):
     return (like[0], like[1], copy), gap / big if big > 0.0 else gap
 
 
-def find_velocity_before(Step step, double tolerance, double alike):
+cpdef find_velocity_before(Step step, double tolerance, double alike):
     """Return the velocity (nv,) of the last forward pass; None if it is qvel.
 
     After a step it is recovered from the velocities of bodies, which MuJoCo computes before the step. The result is -1 if
@@ -451,7 +452,7 @@ def find_velocity_before(Step step, double tolerance, double alike):
     return v
 
 
-def compute_problem_numbers(Step step, tuple jac, scale_, v_, double usual):
+cpdef compute_problem_numbers(Step step, tuple jac, scale_, v_, double usual):
     """Return (b, compliance, v*, whether they are valid and usual, max |efc_R efc_D - 1|, gaps) of J with scaled rows.
 
         b = dt (aref - J a0),   v* = v + dt a0,   a0 = qacc_smooth
@@ -535,3 +536,35 @@ def compute_problem_numbers(Step step, tuple jac, scale_, v_, double usual):
         gap_1 / big_1 if stored_1 != 0.0 and big_1 != 0.0 else 0.0,
         gap_2 / big_2 if stored_2 != 0.0 and big_2 != 0.0 else 0.0,
         gap_3 / big_3 if stored_3 != 0.0 and big_3 != 0.0 else 0.0, finite)
+
+
+def convert_regular_step(Step step, codes, Operator like, double mass_tolerance, double tolerance, double alike,
+                         double compliance_tolerance, double usual):
+    """Return (blocks, key, operator, b, compliance, v*) with the factor of M; None if one of the checks needs its own message.
+
+    The functions above describe the arguments. M must have the pattern of `like`, and all entries must be at most `usual`.
+    """
+    cdef Operator operator
+    if not 0.0 < step.at.dt < 1.0 / 0.0 or step.at.is_discrete or not step.has_mass:
+        return None
+    mass = extract_lower_triangle_of_mass(step, mass_tolerance, like.mass[:2])
+    if mass is None or not mass[1] <= mass_tolerance or mass[0][0] is not like.mass[0]:
+        return None
+    made = make_blocks(step, codes)
+    if type(made) is int or made[0] is None:
+        return None
+    jac = read_jacobian(step, made[1])
+    v = find_velocity_before(step, tolerance, alike)
+    if type(jac) is not tuple or type(v) is int:
+        return None
+    rhs, compliance, v_free, is_usual, gap, gaps = compute_problem_numbers(step, jac, made[1], v, usual)
+    if not is_usual or not gap <= compliance_tolerance or gaps[3] != 0.0:
+        return None
+    for i in range(3):
+        if not gaps[i] <= tolerance:
+            return None
+    operator = Operator(*jac, *mass[0], like)
+    operator.factor()
+    if operator.failed >= 0 or operator.has_entry_above(usual):
+        return None
+    return made[0], made[2], operator, rhs, compliance, v_free
