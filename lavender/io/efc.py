@@ -33,26 +33,19 @@ from lavender.base.errors import CapabilityError, InputError
 from lavender.base.threads import run_on_threads
 from lavender.batch.data import ERRORS, Batch, check_row_counts, check_shared_lower_triangles
 from lavender.io import mujoco as single
-from lavender.io.mujoco_discrete import MASS_TOLERANCE, compute_discrete_matrix, is_active
-from lavender.io.mujoco_memory import CHANGED_ADVICE
+from lavender.io.mujoco_discrete import MASS_TOLERANCE, compute_discrete_matrix
+from lavender.io.mujoco_memory import CHANGED_ADVICE, read_step
 from lavender.io.start_states import can_sleep
 from lavender.problem import FRICTION_LAWS
 from lavender.problem.cones import Cones, get_block_kinds
 from lavender.problem.generalized import Compressed
+from lavender_ext.io.mujoco_rows import copy_rows
 from lavender_ext.judge.measure import all_finite
 
 # Values of mjtConstraint: equality; friction loss of a joint and of a tendon; elliptic contact, the largest value.
 # Rows of all other types have impulses >= 0.
 EQUALITY, FRICTION, ELLIPTIC = 0, (1, 2), 7
 MAX_CONTACT_ROWS = 6  # The largest condim: a contact has a normal and up to five friction rows.
-# Arrays that are read for each row, in addition to efc_J, and for each contact: type and shape.
-ROW_FIELDS: dict[str, Any] = {
-    **dict.fromkeys(("efc_D", "efc_aref", "efc_force", "efc_frictionloss", "efc_vel"), (float, ())),
-    **dict.fromkeys(("efc_type", "efc_id"), (np.int32, ())),
-}
-CONTACT_FIELDS: dict[str, Any] = {
-    "efc_address": (np.int32, ()), "dim": (np.int32, ()), "geom": (np.int32, (2,)), "friction": (float, (5,)),
-}  # fmt: skip
 CHUNK_ENTRIES = 2**21  # Number of entries of J that are converted to float64 at a time.
 # Largest accepted difference of M a0 and the smooth force, relative to their size: 64 roundings in float64; more in
 # float32, in which the factors of M are rounded, too.
@@ -266,21 +259,21 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
             f"each state has {size} numbers; one of {sorted(kinds)} is needed, the sizes of "
             "mjSTATE_PHYSICS, mjSTATE_FULLPHYSICS and mjSTATE_INTEGRATION of the model"
         )
-    n, nv, sparse = len(values), model.nv, bool(mj.mj_isSparse(model))
+    n, nv = len(values), model.nv
     free, smooth = np.full((n, nv), np.nan), np.zeros((n, nv))
     mass = np.zeros((n, len(model.M_colind)))
     mass[:, model.M_rowadr + model.M_rownnz - 1] = 1.0  # States that are not finite keep the identity as M.
     triangle = model.M_colind, np.append(model.M_rowadr, len(model.M_colind))
-    matrices: dict[
-        int, Compressed
-    ] = {}  # Matrices of the integrator "discrete", which may have other patterns.
+    # Matrices of the integrator "discrete", which may have other patterns.
+    matrices: dict[int, Compressed] = {}
+    no_ints = np.zeros((0, 2), np.int32), np.zeros((0, 4), np.int32)
+    no_rows: Any = np.zeros((0, nv)), np.zeros((0, 5)), *no_ints, np.zeros((0, 5))
+    rows_of_states = [no_rows] * (n + 1)  # State i is entry i + 1.
     pending = iter(range(n))
     threads = min(check_int("threads", threads, 1, None), max(n, 1))
 
-    def work(stop: bytearray) -> tuple[_RowBuffer, _RowBuffer]:
+    def work(stop: bytearray) -> None:
         data = mj.MjData(model)
-        rows = _RowBuffer(n // threads, efc_J=(float, (nv,)), **ROW_FIELDS)
-        contacts = _RowBuffer(n // threads, **CONTACT_FIELDS)
         for i in pending:
             if stop[0]:
                 break
@@ -295,8 +288,9 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
                 if errors == "raise":
                     raise InputError(f"state {i}: {single.DIVERGED_TEXT}")
                 data.efc_force[:] = np.nan
+            step = read_step(model, data)
             free[i], smooth[i], mass[i] = data.qvel, data.qacc_smooth, data.M
-            if is_active(data):
+            if step.is_discrete:
                 try:
                     matrix = compute_discrete_matrix(mj, model, data, CHANGED_ADVICE)
                 except CapabilityError as error:
@@ -305,85 +299,29 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
                 smooth[i] += 0.0 if matrix.change is None else matrix.change
             # MuJoCo's own efc_vel also contains the velocities of moving surfaces.
             mj.mj_mulJacVec(model, data, data.efc_vel, data.qvel)
-            rows.append(i, data, data.nefc, efc_J=jacobian(data))
-            if data.ncon:
-                contacts.append(i, data.contact, data.ncon)
-        return rows, contacts
+            rows_of_states[i + 1] = copy_rows(step)
 
-    def jacobian(data: Any) -> FloatArray:
-        m = data.nefc
-        # MuJoCo may allocate rows of zeros that it leaves out: the array is then longer than m nv.
-        if not sparse:
-            return np.reshape(data.efc_J[: m * nv], (m, nv))
-        jac = np.empty((m, nv))
-        mj.mju_sparse2dense(jac, data.efc_J, data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind)
-        return jac
-
-    parts = run_on_threads(work, threads)
-    rows, ptr = _merge_buffers([row_buffer for row_buffer, _ in parts], n)
-    contacts, contact_ptr = _merge_buffers([contact_buffer for _, contact_buffer in parts], n)
+    run_on_threads(work, threads)
+    counts = [[len(ints), len(contacts)] for _, _, ints, contacts, _ in rows_of_states]
+    ptr, contact_ptr = np.cumsum(counts, axis=0, dtype=np.int64).T
+    jac, numbers, ints, contacts, friction = (
+        np.concatenate(arrays) for arrays in zip(*rows_of_states, strict=True)
+    )
+    rows_of_states.clear()
     triangles = (mass, *triangle) if not matrices else _merge_lower_triangles(matrices, mass, triangle)
-    imported = _import_states(model, rows, ptr, contacts, contact_ptr, triangles, free, smooth)
-    row_arrays = rows["efc_type"], rows["efc_id"]
-    contact_arrays = contacts["dim"], contacts["geom"]
+    contacts[:, 0] += np.where(contacts[:, 0] < 0, 0, np.repeat(ptr[:-1], np.diff(contact_ptr)))
+    elliptic = contacts[:, 0], contacts[:, 1], friction
+    imported = _import_states(model, jac, numbers.T, ints[:, 0], ptr, elliptic, triangles, free, smooth)
 
     def name_blocks_of_world(i: int) -> Any:
-        own_rows, own_contacts = slice(ptr[i], ptr[i + 1]), slice(contact_ptr[i], contact_ptr[i + 1])
-        ints = np.concatenate(
-            [*(x[own_rows] for x in row_arrays), *(x[own_contacts].ravel() for x in contact_arrays)]
-        )
-        return single._make_block_names(mj, model, ints, int(ptr[i + 1] - ptr[i]), 1)
+        row_ints, contact_ints = ints[ptr[i] : ptr[i + 1]], contacts[contact_ptr[i] : contact_ptr[i + 1]]
+        whole = [*row_ints.T, contact_ints[:, 1], contact_ints[:, 2:].ravel()]
+        return single._make_block_names(mj, model, np.concatenate(whole), len(row_ints), 1)
 
     imported.batch.names_of = name_blocks_of_world
     world = np.repeat(np.arange(n), np.diff(contact_ptr))
-    imported.batch.contact_counts = np.bincount(world[contacts["efc_address"] >= 0], minlength=n)
+    imported.batch.contact_counts = np.bincount(world[contacts[:, 0] >= 0], minlength=n)
     return imported
-
-
-class _RowBuffer:
-    """Growing arrays of the rows of many states, in the order in which the states are appended.
-
-    When an array is full, it is enlarged to the size that `states` states are expected to need.
-    """
-
-    def __init__(self, states: int, **kinds: tuple[type, tuple[int, ...]]) -> None:
-        self.arrays: dict[str, Any] = {
-            name: np.empty((0, *shape), dtype) for name, (dtype, shape) in kinds.items()
-        }
-        self.states, self.n, self.capacity = states, 0, 0
-        self.state_numbers: list[int] = []  # Number of the state of each appended range.
-        self.counts: list[int] = []  # Number of entries of each appended range.
-
-    def append(self, i: int, source: Any, count: int, **values: FloatArray) -> None:
-        """Append `count` entries of state i to each array, from `values` or else from attributes of `source`."""
-        begin, end = self.n, self.n + count
-        self.state_numbers.append(i)
-        self.counts.append(count)
-        if end > self.capacity:
-            self.capacity = int(end * min(4.0, 1.25 * max(1.0, self.states / len(self.counts)))) + 1
-            for name, x in self.arrays.items():
-                self.arrays[name] = np.empty((self.capacity, *x.shape[1:]), x.dtype)
-                self.arrays[name][:begin] = x[:begin]
-        for name, x in self.arrays.items():
-            x[begin:end] = values[name] if name in values else getattr(source, name)
-        self.n = end
-
-
-def _merge_buffers(parts: list[_RowBuffer], n: int) -> tuple[dict[str, Any], Any]:
-    """Return the arrays of all n states, sorted by state, and the index of the first entry of each state (n + 1,)."""
-    count, ptr = np.zeros(n, np.int64), np.zeros(n + 1, np.int64)
-    ranges = [(np.array(part.state_numbers, np.int64), np.array(part.counts, np.int64)) for part in parts]
-    for numbers, counts in ranges:
-        count[numbers] = counts
-    np.cumsum(count, out=ptr[1:])
-    if len(parts) == 1:
-        return {name: x[: ptr[-1]] for name, x in parts[0].arrays.items()}, ptr
-    out = {name: np.empty((ptr[-1], *x.shape[1:]), x.dtype) for name, x in parts[0].arrays.items()}
-    for part, (numbers, counts) in zip(parts, ranges, strict=True):
-        destination = np.repeat(ptr[numbers] - (np.cumsum(counts) - counts), counts) + np.arange(part.n)
-        for name, x in part.arrays.items():
-            out[name][destination] = x[: part.n]
-    return out, ptr
 
 
 def _merge_lower_triangles(matrices: dict[int, Compressed], mass: FloatArray, triangle: Any) -> Any:
@@ -410,19 +348,22 @@ def _merge_lower_triangles(matrices: dict[int, Compressed], mass: FloatArray, tr
 
 
 def _import_states(
-    model: Any, rows: Any, ptr: Any, contact: Any, contact_ptr: Any, mass: Any, before: Any, smooth: Any
+    model: Any,
+    jac: Any,
+    numbers: Any,
+    row_type: Any,
+    ptr: Any,
+    contacts: Any,
+    mass: Any,
+    before: Any,
+    smooth: Any,
 ) -> Imported:
     """Build the batch and the impulses from the rows and contacts of all states, one state after the other."""
-    dt, jac, row_type, contacts = float(model.opt.timestep), rows["efc_J"], rows["efc_type"], None
-    if (row_type == ELLIPTIC).any():
-        address = contact["efc_address"]
-        address = np.where(address < 0, -1, address + np.repeat(ptr[:-1], np.diff(contact_ptr)))
-        contacts = (np.zeros(len(address), int), address, contact["dim"], contact["friction"])
-    cones, scale = _make_blocks(
-        row_type[None], rows["efc_frictionloss"][None], np.ones((1, len(row_type)), bool), contacts, dt
-    )
-    target = dt * rows["efc_aref"] + rows["efc_vel"]
-    compliance, lam = 1.0 / rows["efc_D"], dt * rows["efc_force"]
+    dt, (inv_compliance, aref, force, loss, velocity) = float(model.opt.timestep), numbers
+    world = np.zeros(len(contacts[0]), int)
+    contacts = (world, *contacts) if (row_type == ELLIPTIC).any() else None
+    cones, scale = _make_blocks(row_type[None], loss[None], np.ones((1, len(row_type)), bool), contacts, dt)
+    target, compliance, lam = dt * aref + velocity, 1.0 / inv_compliance, dt * force
     if scale is not None:
         s = scale[0]
         jac *= s[:, None]

@@ -46,11 +46,6 @@ class DiscreteMatrix(NamedTuple):
         return Generalized.from_compressed_rows(no_rows, self.lower, force).solve(force)
 
 
-def is_active(data: Any) -> bool:
-    """Return whether the last forward pass used a matrix other than M."""
-    return bool(getattr(data, "efm_active", 0))
-
-
 def compute_discrete_matrix(mj: Any, model: Any, data: Any, advice: str) -> DiscreteMatrix:
     """Build the matrix of the last forward pass from the arrays of MuJoCo.
 

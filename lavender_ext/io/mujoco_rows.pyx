@@ -33,8 +33,7 @@ cdef object new = np.empty, I4 = np.dtype(np.int32), U8 = np.dtype(np.uint64)
 cdef public int32_t lav_export_blocks(int32_t m, const int32_t* type_, const int32_t* id_, const int32_t* codes,
                                       const int32_t* n_objects, const int32_t* dim, const double* friction,
                                       const int32_t* geom, const double* loss, double dt, int32_t* ptr, int32_t* kind,
-                                      double* lower,
-                                      double* upper, double* mu, double* scale, uint64_t* key) noexcept nogil:
+                                      double* lower, double* upper, double* mu, double* scale, uint64_t* key) noexcept nogil:
     """Write the blocks of m rows and return their number; -1 - i if row i has an unknown type or an invalid id.
 
     codes (8) are MuJoCo's types of equality, joint friction, tendon friction, joint limit, tendon limit, frictionless
@@ -473,15 +472,6 @@ cpdef compute_problem_numbers(Step step, tuple jac, scale_, v_, double usual):
     cdef const double* jval = as_double_pointer(jac[2], jptr[m])
     cdef const double* scale = as_double_pointer(scale_, m)
     cdef const double* v = p.qvel if v_ is None else as_double_pointer(v_, n)
-    cdef const double* smooth = p.qacc_smooth
-    cdef const double* aref = p.efc_aref
-    cdef const double* r = p.efc_R
-    cdef const double* inverse = p.efc_D
-    cdef const double* force = p.efc_force
-    cdef const double* vel = p.efc_vel
-    cdef const double* b = p.efc_b
-    cdef const double* push = p.qfrc_constraint
-    cdef const double* a = p.qacc
     cdef double dt = p.dt, c, size, s_v, s_free, f, finite = 0.0, gap_0 = 0.0, gap_1 = 0.0, gap_2 = 0.0, gap_3 = 0.0
     cdef double big_1 = 0.0, big_2 = 0.0, big_3 = 0.0, stored_1 = 0.0, stored_2 = 0.0, stored_3 = 0.0
     cdef double top_v = 0.0, top_free = 0.0, top_b = 0.0
@@ -494,17 +484,17 @@ cpdef compute_problem_numbers(Step step, tuple jac, scale_, v_, double usual):
     cdef double* force_sum = <double*>scratch.at           # J^T f, then |J|^T |f|
     cdef double* change = force_sum + 2 * n                # dt a0
     for j in range(n):
-        change[j] = dt * smooth[j]
+        change[j] = dt * p.qacc_smooth[j]
         force_sum[j] = force_sum[n + j] = 0.0
         free[j] = v[j] + change[j]
         sound &= is_valid_number(free[j])
         top_v = update_max_abs(top_v, v[j])
         top_free = update_max_abs(top_free, change[j])
-        stored_3 = update_max_abs(stored_3, push[j])
-        finite += 0.0 * a[j]
+        stored_3 = update_max_abs(stored_3, p.qfrc_constraint[j])
+        finite += 0.0 * p.qacc[j]
     for i in range(m):
         size = s_v = s_free = 0.0
-        f = force[i] / scale[i] if scale[i] != 0.0 else 0.0
+        f = p.efc_force[i] / scale[i] if scale[i] != 0.0 else 0.0
         for q in range(jptr[i], jptr[i + 1]):
             j = jidx[q]
             c = jval[q]
@@ -514,22 +504,22 @@ cpdef compute_problem_numbers(Step step, tuple jac, scale_, v_, double usual):
             c *= f
             force_sum[j] += c
             force_sum[n + j] += fabs(c)
-        rhs[i] = dt * scale[i] * aref[i] - s_free
-        compliance[i] = r[i] * scale[i] * scale[i]
+        rhs[i] = dt * scale[i] * p.efc_aref[i] - s_free
+        compliance[i] = p.efc_R[i] * scale[i] * scale[i]
         top_b = update_max_abs(top_b, rhs[i])
         sound &= is_valid_magnitude(compliance[i]) and compliance[i] <= usual
-        gap_0 = update_max_abs(gap_0, r[i] * inverse[i] - 1.0)
-        c = scale[i] * vel[i]
+        gap_0 = update_max_abs(gap_0, p.efc_R[i] * p.efc_D[i] - 1.0)
+        c = scale[i] * p.efc_vel[i]
         gap_1 = update_max_abs(gap_1, s_v - c)
         big_1 = update_max_abs(big_1, size * top_v + fabs(c))
-        stored_1 = update_max_abs(stored_1, vel[i])
-        c = scale[i] * dt * b[i]
+        stored_1 = update_max_abs(stored_1, p.efc_vel[i])
+        c = scale[i] * dt * p.efc_b[i]
         gap_2 = update_max_abs(gap_2, rhs[i] + c)
         big_2 = update_max_abs(big_2, size * top_free + fabs(rhs[i]) + fabs(c))
-        stored_2 = update_max_abs(stored_2, b[i])
+        stored_2 = update_max_abs(stored_2, p.efc_b[i])
     for j in range(n):
-        gap_3 = update_max_abs(gap_3, force_sum[j] - push[j])
-        big_3 = update_max_abs(big_3, force_sum[n + j] + fabs(push[j]))
+        gap_3 = update_max_abs(gap_3, force_sum[j] - p.qfrc_constraint[j])
+        big_3 = update_max_abs(big_3, force_sum[n + j] + fabs(p.qfrc_constraint[j]))
     if p.has_moving_surfaces:                           # efc_vel contains the velocities of surfaces, too.
         stored_1 = 0.0
     return make_read_only(rhs_), make_read_only(compliance_), make_read_only(free_), sound and is_valid_magnitude(top_b), gap_0, (
@@ -568,3 +558,40 @@ def convert_regular_step(Step step, codes, Operator like, double mass_tolerance,
     if operator.failed >= 0 or operator.has_entry_above(usual):
         return None
     return made[0], made[2], operator, rhs, compliance, v_free
+
+
+def copy_rows(Step step):
+    """Return copies of the rows and contacts of a forward pass: J (m, nv), and the arrays (m, 5), (m, 2), (c, 4), (c, 5).
+
+    Their columns are efc_D, efc_aref, efc_force, efc_frictionloss and efc_vel; efc_type and efc_id; efc_address, dim and geom of
+    the contacts; friction of the contacts.
+    """
+    cdef const step_t* p = &step.at
+    cdef int32_t i, k, m = <int32_t>p.m, c = <int32_t>p.contacts, n = p.n
+    cdef int64_t q
+    jac_, numbers_, ints_ = new((m, n)), new((m, 5)), new((m, 2), I4)
+    contacts_, friction_ = new((c, 4), I4), new((c, 5))
+    cdef double* jac = as_double_pointer(jac_, <Py_ssize_t>m * n)
+    cdef double* numbers = as_double_pointer(numbers_, 5 * m)
+    cdef int32_t* ints = as_int_pointer(ints_, 2 * m)
+    cdef int32_t* contacts = as_int_pointer(contacts_, 4 * c)
+    cdef double* friction = as_double_pointer(friction_, 5 * c)
+    cdef const double** columns = [p.efc_D, p.efc_aref, p.efc_force, p.efc_frictionloss, p.efc_vel]
+    if m and not step.is_sparse:
+        memcpy(jac, p.efc_J, <size_t>m * n * sizeof(double))
+    else:
+        memset(jac, 0, <size_t>m * n * sizeof(double))
+    for i in range(m):
+        if step.is_sparse:
+            for q in range(p.efc_J_rowadr[i], p.efc_J_rowadr[i] + p.efc_J_rownnz[i]):
+                jac[<Py_ssize_t>i * n + p.efc_J_colind[q]] = p.efc_J[q]
+        for k in range(5):
+            numbers[5 * i + k] = columns[k][i]
+        ints[2 * i] = p.efc_type[i]
+        ints[2 * i + 1] = p.efc_id[i]
+    for i in range(c):
+        memcpy(contacts + 4 * i, p.efc_address + i * p.stride, sizeof(int32_t))
+        memcpy(contacts + 4 * i + 1, p.dim + i * p.stride, sizeof(int32_t))
+        memcpy(contacts + 4 * i + 2, p.geom + i * p.stride, 2 * sizeof(int32_t))
+        memcpy(friction + 5 * i, p.friction + i * p.stride, 5 * sizeof(double))
+    return jac_, numbers_, ints_, contacts_, friction_

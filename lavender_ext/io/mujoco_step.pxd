@@ -12,7 +12,7 @@ ctypedef struct step_t:
     doubles efc_J, efc_D, efc_R, efc_aref, efc_force, efc_vel, efc_b, efc_frictionloss
     ints efc_type, efc_id, efc_J_rownnz, efc_J_rowadr, efc_J_colind
     # Members of the first contact, and the number of bytes between two contacts.
-    bytes_ dim, geom, friction
+    bytes_ dim, geom, friction, efc_address
     Py_ssize_t stride
     # mjData.nefc, ncon, nJ, parena (bytes of the arena in use) and efm_active; mjOption.jacobian and noslip_iterations;
     # mjModel.flg_surfacevel.

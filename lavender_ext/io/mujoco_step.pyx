@@ -24,7 +24,7 @@ cdef enum:
     TIMESTEP = JACOBIAN + 3
     FIRST_CONTACT = TIMESTEP + 1
     DIM = FIRST_CONTACT + 1
-    CONTACT_SIZE = DIM + 3
+    CONTACT_SIZE = DIM + 4
 
 ARRAYS = tuple((
     "qvel qacc qacc_smooth qfrc_smooth qfrc_constraint M cdof cvel efc_J efc_D efc_R efc_aref efc_force efc_vel efc_b "
@@ -34,7 +34,7 @@ MEMBERS = tuple((struct, name) for struct, names in (
     ("mjData", (*ARRAYS, "nefc", "ncon", "nJ", "parena", "efm_active")),
     ("mjModel", ("opt.jacobian", "opt.noslip_iterations", "flg_surfacevel", "opt.timestep")),
     ("mjData", ("contact",)),
-    ("mjContact", ("dim", "geom", "friction", "")),
+    ("mjContact", ("dim", "geom", "friction", "efc_address", "")),
 ) for name in names)
 
 
@@ -53,7 +53,7 @@ cdef class Step:
     ----------
     model, data : mujoco.MjModel, mujoco.MjData
         The model is kept alive. The caller keeps the MjData alive.
-    offsets : (34, 2) int64 or None
+    offsets : (35, 2) int64 or None
         Offset and size of each of MEMBERS [bytes]; an offset of -1 means that there is no such member. The size of mjContact is
         the last offset. None: members are read from attributes.
     find_sparse : callable
@@ -121,7 +121,7 @@ cdef class Step:
             (&p.m)[i] = read_int(self.data_address if i < N_DATA_INTS else self.model_address,
                                  offset[2 * (N_ARRAYS + i)], offset[2 * (N_ARRAYS + i) + 1])
         p.dt = (<const double*>(self.model_address + offset[2 * TIMESTEP]))[0]
-        for i in range(3):
+        for i in range(4):
             (&p.dim)[i] = NULL if contact == NULL else contact + offset[2 * (DIM + i)]
         p.stride = offset[2 * CONTACT_SIZE]
 
@@ -142,7 +142,7 @@ cdef class Step:
             (<void**>p)[i] = get_checked_data_pointer(x, x.size, 1, kind, NULL) if x.size else NULL
             self.arrays.append(x)
         contact = data.contact if p.contacts else None
-        for i, (name, width) in enumerate((("dim", 1), ("geom", 2), ("friction", 5)) if p.contacts else ()):
+        for i, (name, width) in enumerate((("dim", 1), ("geom", 2), ("friction", 5), ("efc_address", 1)) if p.contacts else ()):
             x = getattr(contact, name)
             (&p.dim)[i] = get_checked_data_pointer(x, p.contacts, width, DOUBLE if width == 5 else INT, &p.stride)
             self.arrays.append(x)
@@ -150,7 +150,7 @@ cdef class Step:
     def has_equal_members(self, Step other):
         """Return whether both read the same from their MjData, with rows in compressed form and at least two contacts."""
         cdef int32_t i
-        for i in range(N_ARRAYS + 4):                   # with the contacts' addresses and their distance
+        for i in range(N_ARRAYS + 5):                   # with the contacts' addresses and their distance
             if (<void**>&self.at)[i] != (<void**>&other.at)[i]:
                 return False
         for i in range(N_DATA_INTS + 3):
