@@ -382,7 +382,17 @@ BACKENDS_NUMBERS = """\
 *Linear term* is x2, and 1 is right. *Small part* is x3, and 0.5 is right. *Smallest* is the largest e of 0.1, 0.01,
 ..., 1e-9 that is not returned within 1 %, or 0. *Far bound* is the smallest B of 1e3, 1e4, ..., 1e19 that prevents a
 solution. *Fixed multiplier* is the multiplier of x1, and -1 is right. *Infeasible x* is the first entry of x after the
-program. In all columns, *none* means that nothing was returned."""
+program. In all columns, *none* means that nothing was returned. *Second solve* is "other" if a second solve of one
+object, without a start, gives other bits: the object keeps its step size or its last answer. *Time limit* is the time
+that the backend's own limit counts. Both were observed if the backend has an object with a set-up before the solve."""
+BACKENDS_REPEATED = """\
+The bits of every backend in the tables are the same after programs of other sizes in the same process, and in four
+threads that solve different programs at the same time."""
+
+BACKENDS_MISSING = """\
+Some backends of qpsolvers have no row: `mosek` needs a licence, `nppro` has no public package, `hpipm` and `pdhcg`,
+built from their sources, did not end within 100 s on the program *convex on rows*. `qpoases` and `qpswift` have no
+package either, and were observed with builds of their sources."""
 
 
 def backends_page():
@@ -393,6 +403,7 @@ def backends_page():
     verdicts = ["version", "triangle", "start", "repeated", "contradictory", "unbounded", "singular"]
     verdicts += ["convex_on_rows", "saddle"]
     numbers = ["linear_term", "small_part", "smallest", "far_bound", "fixed_multiplier", "infeasible_x"]
+    numbers += ["second_solve", "time_limit"]
 
     def cell(value):
         return "none" if value is None else value if isinstance(value, str) else f"{value:g}"
@@ -407,7 +418,6 @@ def backends_page():
     notes = [
         f"- `{x.name}` {x.behaviour.version}: {text}" for x in seen for text in x.behaviour.notes.values()
     ]
-    rest = ", ".join(f"`{x.name}`" for x in b.BACKENDS if x.behaviour is None and not x.cones)
     return "\n\n".join(
         (
             "# Backends: what they really do",
@@ -419,13 +429,14 @@ def backends_page():
             "## Accuracy",
             observed(numbers),
             BACKENDS_NUMBERS,
+            BACKENDS_REPEATED,
             "## Programs",
             texts(("name", "program"), b.PROBE_PROGRAMS),
             "## Other observations",
             "\n".join(notes),
             "## Remedies in lavender",
             texts(("observation", "lavender"), b.ADAPTER_REMEDIES),
-            f"Not observed yet: {rest}.",
+            BACKENDS_MISSING,
         )
     )
 

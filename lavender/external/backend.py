@@ -67,6 +67,10 @@ class Behaviour:
         Largest tested size of a solution that is not returned within 1 %; 0 without one.
     far_bound : float
         Size of inactive bounds at which it first fails; inf if it does not fail.
+    second_solve : str
+        Bits of x of a second solve of one object without a start: "same", "other", or "" without such an object.
+    time_limit : str
+        "without set-up" if its time limit does not include the set-up, "with set-up", or "" if this was not observed.
     notes : mapping of str to str
         Other observations: key of the probe -> sentence.
     """
@@ -86,6 +90,8 @@ class Behaviour:
     fixed_multiplier: float = -1.0
     smallest: float = 0.0
     far_bound: float = math.inf
+    second_solve: str = ""
+    time_limit: str = ""
     notes: Mapping[str, str] = field(default_factory=dict)
 
 

@@ -67,20 +67,22 @@ BACKENDS: tuple[Backend, ...] = (
     Backend("osqp", ("osqp",), "osqp", "operator splitting with polishing", ADMM,
             call=native.call_osqp, max_iter=100_000, stoppable=True, interrupts=True,
             behaviour=Behaviour("1.1.3", start="x and y", saddle="raises", infeasible_x="2143289344",
-                linear_term=4e-5, notes={
+                linear_term=4e-5, second_solve="other", time_limit="with set-up", notes={
                 "memory": "An object keeps its step size of earlier solves, also with warm_starting=False.",
                 "kept_y": "A start x without y keeps y of the last solve."})),
     Backend("clarabel", ("clarabel",), "clarabel", "interior point, homogeneous embedding",
             "Goulart, Chen 2024, Clarabel", call=native.call_clarabel, max_iter=200, stoppable=True,
-            behaviour=Behaviour("0.11.1", saddle="right", infeasible_x="0", far_bound=1e10, small_part=40.0)),
+            behaviour=Behaviour("0.11.1", saddle="right", infeasible_x="0", far_bound=1e10, small_part=40.0,
+                second_solve="same", time_limit="without set-up")),
     Backend("piqp", ("qpsolvers", "piqp"), "piqp", "proximal interior point",
             "Schwan, Jiang, Kuhn, Jones 2023, PIQP", settings=PROXIMAL, max_iter=250,
-            behaviour=Behaviour("0.7.0", saddle="right", infeasible_x="0", far_bound=1e9, small_part=2.0, notes={
+            behaviour=Behaviour("0.7.0", saddle="right", infeasible_x="0", far_bound=1e9, small_part=2.0,
+                second_solve="same", notes={
                 "unsorted": "If the indices of a sparse P are not sorted, a solvable program is not solved."})),
     Backend("proxqp", ("qpsolvers", "proxsuite"), "proxsuite", "proximal augmented Lagrangian",
             "Bambade et al. 2022, ProxQP", settings=PROXIMAL | {"rho": PROXQP_PROXIMAL_WEIGHT},
             behaviour=Behaviour("0.8.0", start="x, y and z", singular="wrong", saddle="wrong", infeasible_x="0",
-                linear_term=0.1, notes={
+                linear_term=0.1, second_solve="other", notes={
                 "false_infeasible": "A solvable program with a singular P can be reported as primal infeasible. With "
                     "rho=0.1 it is not.",
                 "dense_triangle": "It reads the lower triangle of a dense P.",
@@ -88,22 +90,22 @@ BACKENDS: tuple[Backend, ...] = (
     Backend("qpalm", ("qpalm",), "qpalm", "proximal augmented Lagrangian, semismooth Newton",
             "Hermans, Themelis, Patrinos 2022, QPALM", call=native.call_qpalm, stoppable=True,
             behaviour=Behaviour("1.3.0", start="x and y", saddle="wrong", infeasible_x="0", linear_term=0.0,
-                smallest=1e-5)),
+                smallest=1e-5, second_solve="other")),
     Backend("daqp", ("daqp",), "daqp", "dual active set", "Arnström, Bemporad, Axehill 2022, DAQP",
             call=native.call_daqp, dense=True, stoppable=True,
             behaviour=Behaviour("0.11.0", "all", "x", contradictory="wrong", convex_on_rows="not found",
-                linear_term=0.03, notes={
+                linear_term=0.03, second_solve="same", time_limit="without set-up", notes={
                 "flag": "Contradictory equalities end with its exit flag -6, which qpsolvers reports as solved."})),
     Backend("highs", ("highspy",), "highspy", "null-space active set", "Huangfu, Hall 2018, HiGHS",
             call=native.call_highs, max_iter=100_000, stoppable=True,
             behaviour=Behaviour("1.16.0", "lower", convex_on_rows="not found", infeasible_x="0", smallest=1e-4,
-                far_bound=1e15, notes={
+                far_bound=1e15, second_solve="same", notes={
                 "free_row": "A free row does not avoid the zeros below 1e-4; q and bounds multiplied by 1024 do."})),
     Backend("scs", ("scs",), "scs", "operator splitting, homogeneous embedding",
             "O'Donoghue 2021, SCS 3", call=native.call_scs, max_iter=100_000, stoppable=True,
             interrupts=True,
             behaviour=Behaviour("3.3.1", start="x, y and s", saddle="raises", infeasible_x="nan", linear_term=3e-5,
-                small_part=0.8, notes={
+                small_part=0.8, second_solve="other", time_limit="without set-up", notes={
                 "start": "A solution as start ends the solve at once if x, y and s are given, not with fewer of them.",
                 "memory": "An object keeps its scale of earlier solves, also with warm_start=False."})),
     Backend("quadprog", ("qpsolvers", "quadprog"), "quadprog", "dual active set, positive definite A",
@@ -122,9 +124,11 @@ BACKENDS: tuple[Backend, ...] = (
             behaviour=Behaviour("2.0.14", "lower", singular="raises", convex_on_rows="raises", saddle="raises",
                 unbounded="raises", infeasible_x="0", linear_term=None, far_bound=1e4, small_part=None)),
     Backend("gurobi", ("qpsolvers", "gurobipy"), "gurobipy", "interior point and simplex", "Gurobi manual",
-            settings=GUROBI, min_tolerance=1e-9, stoppable=True, noisy=True),
+            settings=GUROBI, min_tolerance=1e-9, stoppable=True, noisy=True,
+            behaviour=Behaviour("13.0.3", "mean", saddle="right", linear_term=0.0, far_bound=1e12)),
     Backend("copt", ("qpsolvers", "coptpy"), "coptpy", "interior point", "COPT manual",
-            settings=COPT, min_tolerance=1e-9, stoppable=True, noisy=True),
+            settings=COPT, min_tolerance=1e-9, stoppable=True, noisy=True,
+            behaviour=Behaviour("8.0.7", "mean", convex_on_rows="not found", unbounded="wrong")),
     Backend("mosek", ("qpsolvers", "cvxopt", "mosek"), "cvxopt mosek", "interior point", "MOSEK manual", noisy=True,
             finite=True),
     Backend("qtqp", ("qpsolvers", "qtqp"), "qtqp", "primal-dual interior point", "QTQP manual",
@@ -142,16 +146,21 @@ BACKENDS: tuple[Backend, ...] = (
                 saddle="right", infeasible_x="0", linear_term=0.5, far_bound=1e3, small_part=None, notes={
                 "nan": "With two equal equality rows, NaN is reported as solved."})),
     Backend("jaxopt_osqp", ("qpsolvers", "jaxopt"), "jaxopt", "operator splitting in JAX", ADMM,
-            settings=JAXOPT, dense=True, noisy=True, jax=True, finite=True),
+            settings=JAXOPT, dense=True, noisy=True, jax=True, finite=True,
+            behaviour=Behaviour("0.8.5", "all", convex_on_rows="not found", saddle="wrong", infeasible_x="0",
+                linear_term=8e-7, smallest=1e-2)),
     Backend("hpipm", ("qpsolvers", "hpipm_python"), "hpipm_python (github.com/giaf/hpipm)", "interior point",
             "Frison, Diehl 2020, HPIPM", dense=True),
     Backend("nppro", ("qpsolvers", "nppro"), "nppro", "active set", "NPPro manual", dense=True),
     Backend("pdhcg", ("qpsolvers", "pdhcg"), "pdhcg", "primal-dual hybrid conjugate gradient",
             "Huang et al. 2024, PDHCG", noisy=True),
     Backend("qpoases", ("qpsolvers", "qpoases"), "qpoases", "online active set",
-            "Ferreau et al. 2014, qpOASES", dense=True),
+            "Ferreau et al. 2014, qpOASES", dense=True,
+            behaviour=Behaviour("3.2", "all", saddle="wrong", infeasible_x="0.021276596")),
     Backend("qpswift", ("qpsolvers", "qpSWIFT"), "qpSWIFT", "interior point",
-            "Pandala, Ding, Park 2019, qpSWIFT", dense=True, finite=True),
+            "Pandala, Ding, Park 2019, qpSWIFT", dense=True, finite=True,
+            behaviour=Behaviour("1.0.0", "all", repeated="raises", contradictory="raises", saddle="right",
+                infeasible_x="0", far_bound=1e16)),
     Backend("sip", ("qpsolvers", "sip_qp_python"), "sip-qp-python", "interior point", "SIP manual",
             settings=SIP, max_iter=500, stoppable=True,
             behaviour=Behaviour("0.0.2", "none", saddle="right", infeasible_x="0")),
@@ -164,18 +173,20 @@ BACKENDS: tuple[Backend, ...] = (
 
 #: Programs of the probes, by the field of `Behaviour` that holds the result.
 PROBE_PROGRAMS = {
+    "triangle": "min x.P x/2 - x1 - x2 with |x| <= 9 and P = [[2, 1], [0, 2]], then P = [[2, 0], [1, 2]]",
     "repeated": "min |x|²/2 with the row 0.3 x1 + 0.7 x2 = 1 twice",
     "contradictory": "min |x|²/2 with x1 + x2 = 1 and x1 + x2 = 2",
     "unbounded": "min x1²/2 - x2 with x >= 0, which is unbounded",
     "singular": "min x1²/2 - x2 with |x1| <= 5 and 0 <= x2 <= 1",
-    "convex_on_rows": "min x1²/2 - x2²/2 with x2 = 0.5",
+    "convex_on_rows": "min x1²/2 - x2²/2 with x2 = 0.5 and |x| <= 9",
     "saddle": "min x1²/2 - x2²/2 with |x1| <= 1 and -1 <= x2 <= 2",
     "linear_term": "min x1²/2 - 1e-7 x2 with 0 <= x <= 1",
-    "small_part": "two independent parts with linear terms of 3e6 and 1",
+    "small_part": "min x1² + x1 x2 + x2² - 3e6 (x1 + x2) + x3² + x3 x4 + x4² - x3 + x4 with x >= 0",
     "smallest": "min |x|²/2 - e (x1 + 2 x2) with |x| <= 1",
-    "far_bound": "a program with the bounds |x| <= B, all inactive",
-    "fixed_multiplier": "min |x|²/2 with x1 = 1 as two equal bounds",
-    "infeasible_x": "x1 <= -1 and x1 >= 1",
+    "far_bound": "min x1² + x1 x2/2 + x2²/2 - x1 - x2 with x1 + x2 <= 1 and |x| <= B",
+    "fixed_multiplier": "min |x|²/2 with 1 <= x1 <= 1 and -2 <= x2 <= -2",
+    "infeasible_x": "min |x|²/2 with x1 <= -1 and x1 >= 1",
+    "second_solve": "min x.P x/2 + q.x with |A x| <= 1, with drawn P (30, 30), q (30) and A (20, 30)",
 }
 VERDICT_PHRASES = {
     "right": "is solved",
@@ -190,6 +201,7 @@ TRIANGLE_SENTENCES = {
     "all": "Both triangles of P are used, and an asymmetric P gives a wrong answer.",
     "none": "An asymmetric P is rejected.",
 }
+SECOND_SOLVE_PHRASES = {"same": "the same bits", "other": "other bits"}
 #: Remedy of the adapter for an observation, by field of `Behaviour`.
 ADAPTER_REMEDIES = {
     "triangle": "Both triangles of P are passed equal in every bit, or the one that is read.",
@@ -200,6 +212,7 @@ ADAPTER_REMEDIES = {
     "far_bound": "Far bounds are left out, and are checked at the solution.",
     "fixed_multiplier": "Bounds are passed as rows.",
     "infeasible_x": "A claim of infeasibility returns the start, and counts only with a certificate.",
+    "second_solve": "Each call makes a new object.",
     "contradictory": "The judge contradicts a wrong claim about contradictory rows.",
     "unbounded": "The judge contradicts a wrong claim about an unbounded program.",
 }
@@ -231,8 +244,14 @@ def describe_behaviour(behaviour: Behaviour) -> dict[str, str]:
     )
     sentences["fixed_multiplier"] = f"A fixed variable with a multiplier of -1 has {b.fixed_multiplier:g}."
     sentences["infeasible_x"] = (
-        f"After the rows {PROBE_PROGRAMS['infeasible_x']}, x {found.get(b.infeasible_x, 'holds ' + b.infeasible_x)}."
+        f"After the program {PROBE_PROGRAMS['infeasible_x']}, x {found.get(b.infeasible_x, 'holds ' + b.infeasible_x)}."
     )
+    if b.second_solve:
+        sentences["second_solve"] = (
+            f"A second solve of one object without a start gives {SECOND_SOLVE_PHRASES[b.second_solve]}."
+        )
+    if b.time_limit:
+        sentences["time_limit"] = f"Its time limit is measured {b.time_limit}."
     return sentences | dict(b.notes)
 
 

@@ -19,11 +19,25 @@ import scipy.sparse as sp
 TOLERANCE = 1e-2  # Default tolerances of backends are 1e-3 to 1e-8.
 FAR_BOUNDS = [10.0**k for k in range(3, 20)]
 SMALL_SIZES = [10.0**-k for k in range(1, 10)]
-DENSE_ONLY = ("daqp", "ecos", "quadprog", "jaxopt_osqp", "qpax", "pyqpmad")
+DENSE_ONLY = ("daqp", "ecos", "quadprog", "jaxopt_osqp", "qpax", "pyqpmad", "hpipm", "nppro", "qpoases", "qpswift")
 
 
-def run_alone(name, P, q, sparse=None, settings=(), **arrays):
+def run_alone(name, *arguments, **arrays):
     """Solve a program by qpsolvers, by default with default settings; return the solution or the exception."""
+    with be_quiet():
+        return call_qpsolvers(name, *arguments, **arrays)
+
+
+@contextlib.contextmanager
+def be_quiet():
+    """Discard warnings and standard output, for all threads of the process."""
+    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+        warnings.simplefilter("ignore")
+        yield
+
+
+def call_qpsolvers(name, P, q, sparse=None, settings=(), **arrays):
+    """Call qpsolvers as `run_alone` does, with the output of the backend."""
     import qpsolvers
 
     if "qpax" in name or "jax" in name:
@@ -33,12 +47,10 @@ def run_alone(name, P, q, sparse=None, settings=(), **arrays):
     sparse = name not in DENSE_ONLY if sparse is None else sparse
     arrays = {k: np.array(v, float) for k, v in {"P": P, "q": q, **arrays}.items()}
     arrays = {k: sp.csc_matrix(v) if sparse and v.ndim == 2 else v for k, v in arrays.items()}
-    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
-        warnings.simplefilter("ignore")
-        try:
-            return qpsolvers.solve_problem(qpsolvers.Problem(**arrays), name, **dict(settings))
-        except Exception as error:  # Backends raise their own exceptions.
-            return error
+    try:
+        return qpsolvers.solve_problem(qpsolvers.Problem(**arrays), name, **dict(settings))
+    except Exception as error:  # Backends raise their own exceptions.
+        return error
 
 
 def give_verdict(result, *solutions):
@@ -149,7 +161,8 @@ def draw_bounded_program(n=30, m=20):
     """Draw min x.P x/2 + q.x with |A x| <= 1 and a P whose entries differ in size from A, so that step sizes adapt."""
     rng = np.random.default_rng(1)
     root = rng.normal(size=(n, n))
-    return 50.0 * root @ root.T + 0.01 * np.eye(n), 10.0 * rng.normal(size=n), rng.normal(size=(m, n))
+    P = 50.0 * root @ root.T + 0.01 * np.eye(n)
+    return (P + P.T) / 2.0, 10.0 * rng.normal(size=n), rng.normal(size=(m, n))
 
 
 def osqp_keeps_its_step_size():
