@@ -16,6 +16,7 @@ import importlib
 import importlib.util
 import inspect
 import io
+import itertools
 import os
 import re
 import sys
@@ -450,12 +451,12 @@ in the table. A test runs the engine, if it is installed, and fails if the fact 
 def engine_arrays_page():
     """Return the text of docs/engine-arrays.md: facts about engines."""
     sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "io"))
-    from engine_probes import FACTS
+    from engine_facts import load_facts
 
     parts = ["# Engines: what their arrays mean", "<!-- Written by `python docs/generate.py --pages`. -->"]
     parts.append(ENGINES_INTRODUCTION)
-    for engine in dict.fromkeys(f.engine for f in FACTS):
-        facts = [f for f in FACTS if f.engine == engine]
+    for engine, group in itertools.groupby(load_facts(), lambda f: f.engine):
+        facts = list(group)
         has_handling = any(f.handling for f in facts)
         rows = [(f.subject, f.text, *[f.handling] * has_handling) for f in facts]
         head = ("subject", "fact", *["lavender"] * has_handling)

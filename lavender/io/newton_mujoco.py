@@ -5,8 +5,9 @@
     step = lavender.io.from_newton_mujoco(solver, velocity)
 
 The solver runs MuJoCo Warp; `lavender.io.efc` describes its problem. A step overwrites the velocity, so the caller
-must copy it before the step. If a world has more rows than the engine has memory for, the engine drops some rows:
-`claims.residuals["dropped_rows"]` counts them, and the converted problem does not contain them either.
+must copy it before the step. If the engine has no memory for all contacts or rows, it drops some:
+`claims.residuals["dropped_contacts"]` and `["dropped_rows"]` count them, and the converted problem does not contain
+them either.
 """
 
 from __future__ import annotations
@@ -36,8 +37,9 @@ def from_newton_mujoco(solver: Any, velocity: Any) -> EngineStep:
     Returns
     -------
     EngineStep
-        In float32. `claims.converged` is False in worlds that used up the iterations; `claims.residuals` holds
-        "dropped_rows", the rows (n,) for which the engine had no memory.
+        In float32. `claims.converged` is False in worlds that used up the iterations. For lack of memory, the engine
+        dropped `claims.residuals["dropped_rows"]` rows (n,) of each world, and `["dropped_contacts"]` contacts of all
+        worlds together, which it does not count by world: the number is repeated (n,).
 
     Raises
     ------
@@ -73,7 +75,8 @@ def _convert_solver_arrays(solver: Any, data: Any, model: Any, velocity: Any) ->
         name: getattr(data.efc, name).numpy()[:, :m]
         for name in ("D", "aref", "type", "frictionloss", "force")
     }
-    count = min(count, len(contact.dim))
+    dropped_contacts = max(count - len(contact.dim), 0)
+    count -= dropped_contacts
     world, address, dim, friction = (
         getattr(contact, name).numpy()[:count] for name in ("worldid", "efc_address", "dim", "friction")
     )
@@ -102,5 +105,8 @@ def _convert_solver_arrays(solver: Any, data: Any, model: Any, velocity: Any) ->
         raise AssertionError("from_efc returns impulses if it is given forces")
     iterations = data.solver_niter.numpy().astype(np.int64)
     limit = int(np.max(to_numpy("iterations", solver.mjw_model.opt.iterations)))
-    dropped = {"dropped_rows": (rows - used).astype(float)}
+    dropped = {
+        "dropped_rows": (rows - used).astype(float),
+        "dropped_contacts": np.full(len(rows), float(dropped_contacts)),
+    }
     return EngineStep(result.batch, result.impulse, Claims(iterations < limit, iterations, dropped))

@@ -1,58 +1,10 @@
-"""Facts about arrays and files of other engines, each with a function that runs the engine and checks the fact.
-
-docs/engine-arrays.md is written from this table by `python docs/generate.py --pages`.
-"""
+"""Probes of arrays and settings of engines; see `engine_facts`."""
 
 import contextlib
 import io
-import tempfile
-from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-
-
-@dataclass(frozen=True)
-class EngineFact:
-    """A fact about an engine, and the handling of it in lavender.
-
-    Parameters
-    ----------
-    engine : str
-    module : str
-        Module that must be importable to run `probe`.
-    version : str
-        Version of the engine with which the fact was found.
-    subject, text : str
-        Arrays or settings, and what they hold.
-    handling : str
-        Effect on users of lavender, or how lavender handles it; "" if it does not read this engine's data.
-    probe : callable
-        Function that returns whether the fact still holds.
-    """
-
-    engine: str
-    module: str
-    version: str
-    subject: str
-    text: str
-    handling: str
-    probe: Callable[[], bool]
-
-
-FACTS: list[EngineFact] = []
-
-
-def fact(engine, module, version, subject, text, handling=""):
-    """Return a decorator that adds a fact with the decorated function as its probe."""
-
-    def add(probe):
-        FACTS.append(EngineFact(engine, module, version, subject, text, handling, probe))
-        return probe
-
-    return add
-
+from engine_facts import fact
 
 # -- MuJoCo --------------------------------------------------------------------------------------------
 
@@ -220,151 +172,6 @@ def iterations_limit_the_smooth_acceleration():
     return np.abs(early - exact).max() > 1e-5 * np.abs(exact).max()
 
 
-# -- one URDF in several engines -----------------------------------------------------------------------
-
-INERTIAL = (
-    '<inertial><origin xyz="0.3 0 0"/><mass value="1"/>'
-    '<inertia ixx=".01" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/></inertial>'
-)
-DYNAMICS = '<dynamics damping="2" friction="1"/>'
-LIMIT = '<limit lower="-1" upper="1" effort="5" velocity="3"/>'
-
-
-def write_urdf(kind="continuous", mimic=False, dynamics=""):
-    """Return a URDF of a base and a pendulum, with a second link that mimics the first if `mimic` is set."""
-    second = (
-        f'<link name="b">{INERTIAL}</link><joint name="j2" type="revolute"><parent link="a"/><child link="b"/>'
-        f'<axis xyz="0 1 0"/>{LIMIT}<mimic joint="j1" multiplier="2" offset="0.1"/></joint>'
-    )
-    return (
-        f'<robot name="r"><link name="base">{INERTIAL}</link><link name="a">{INERTIAL}</link>'
-        f'<joint name="j1" type="{kind}"><parent link="base"/><child link="a"/><axis xyz="0 1 0"/>{LIMIT}{dynamics}'
-        f"</joint>{second if mimic else ''}</robot>"
-    )
-
-
-def make_drake(urdf, approximation=None):
-    from pydrake.all import AddMultibodyPlantSceneGraph, DiagramBuilder, Parser
-
-    builder = DiagramBuilder()
-    plant, _ = AddMultibodyPlantSceneGraph(builder, 0.01)
-    if approximation is not None:
-        plant.set_discrete_contact_approximation(approximation)
-    Parser(plant).AddModelsFromString(urdf, "urdf")
-    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base"))
-    plant.Finalize()
-    return plant
-
-
-@fact(
-    *MUJOCO,
-    "URDF: limits of a continuous joint",
-    "A continuous joint has no limits, also if the file has `lower` and `upper`.",
-)
-def mujoco_ignores_limits_of_continuous_joints():
-    return not make_mujoco(write_urdf())[0].jnt_limited.any()
-
-
-@fact(
-    *MUJOCO,
-    "URDF: `mimic`",
-    "A mimic joint becomes a soft joint equality.",
-    "The row has compliance like all rows of MuJoCo.",
-)
-def mujoco_makes_mimic_joints_soft():
-    model, data = make_mujoco(write_urdf("revolute", mimic=True))
-    import mujoco
-
-    mujoco.mj_forward(model, data)
-    return model.neq == 1 and np.allclose(model.eq_data[0, :2], [0.1, 2.0]) and data.efc_R[0] > 0.0
-
-
-@fact(
-    *MUJOCO,
-    "URDF: `effort`, `velocity`, `friction`",
-    "`effort` limits the actuator force of the joint, `friction` is friction loss, and `velocity` is dropped.",
-)
-def mujoco_reads_effort_and_friction():
-    model, _ = make_mujoco(write_urdf("revolute", dynamics=DYNAMICS))
-    return np.allclose(model.jnt_actfrcrange, [[-5, 5]]) and model.dof_frictionloss[0] == 1.0
-
-
-DRAKE = "Drake", "pydrake", "1.51.1"
-
-
-@fact(*DRAKE, "URDF: limits of a continuous joint", "`lower` and `upper` of a continuous joint are enforced.")
-def drake_limits_continuous_joints():
-    plant = make_drake(write_urdf())
-    return plant.GetPositionLowerLimits()[0] == -1.0 and plant.GetPositionUpperLimits()[0] == 1.0
-
-
-@fact(
-    *DRAKE,
-    "URDF: `mimic`",
-    "A mimic joint is an exact constraint with the approximations kSap and kLagged, and is dropped with kTamsi.",
-)
-def drake_drops_mimic_with_tamsi():
-    from pydrake.all import DiscreteContactApproximation as Approximation
-
-    kinds = Approximation.kSap, Approximation.kLagged, Approximation.kTamsi
-    return [make_drake(write_urdf("revolute", mimic=True), k).num_constraints() for k in kinds] == [1, 1, 0]
-
-
-NEWTON = "newton", "newton", "1.8.0"
-
-
-@fact(*NEWTON, "URDF: limits of a continuous joint", "`lower` and `upper` of a continuous joint become limits.")
-def newton_limits_continuous_joints():
-    import newton
-
-    builder = newton.ModelBuilder()
-    with contextlib.redirect_stdout(io.StringIO()):
-        builder.add_urdf(write_urdf())
-        model = builder.finalize(device="cpu")
-    return model.joint_limit_lower.numpy()[0] == -1.0 and model.joint_limit_upper.numpy()[0] == 1.0
-
-
-# -- Pinocchio -----------------------------------------------------------------------------------------
-
-PINOCCHIO = "Pinocchio", "pinocchio", "4.1.0"
-
-
-@fact(
-    *PINOCCHIO,
-    "URDF: `mimic`",
-    "A mimic joint is an independent joint unless `mimic=True` is passed; then it is exact.",
-    "`from_pinocchio` has the joints of the model that you pass.",
-)
-def pinocchio_drops_mimic():
-    import pinocchio
-
-    urdf = write_urdf("revolute", mimic=True)
-    return pinocchio.buildModelFromXML(urdf).nv == 2 and pinocchio.buildModelFromXML(urdf, mimic=True).nv == 1
-
-
-@fact(
-    *PINOCCHIO,
-    "MJCF",
-    "Ranges of slide joints in metres are multiplied by π/180 if the file uses degrees. Only the first body of the "
-    "world is read, gravity of the file is replaced by 9.81 m/s² and joint equalities are not part of the model.",
-    "Compare model.nq, gravity and limits with the file before `from_pinocchio`.",
-)
-def pinocchio_reads_part_of_mjcf():
-    import pinocchio
-
-    xml = """<mujoco model="m"><option gravity="0 0 -3"/><worldbody>
-      <body name="one"><joint name="s" type="slide" axis="1 0 0" range="-1 2" limited="true"/>
-        <geom type="sphere" size=".1" mass="1"/></body>
-      <body name="two"><joint name="h" type="hinge"/><geom type="sphere" size=".1" mass="2"/></body>
-    </worldbody><equality><joint joint1="s" joint2="h"/></equality></mujoco>"""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, "model.xml")
-        path.write_text(xml)
-        model = pinocchio.buildModelFromMJCF(str(path))
-    limits = model.lowerPositionLimit[0], model.upperPositionLimit[0]
-    return model.nv == 1 and np.allclose(limits, np.deg2rad([-1, 2])) and model.gravity.linear[2] == -9.81
-
-
 # -- MJX -----------------------------------------------------------------------------------------------
 
 MJX = "MJX", "mujoco.mjx", "3.17.0"
@@ -477,37 +284,11 @@ def pybullet_divides_forces_by_substeps():
     return np.allclose(sums, [10.0, 2.5], rtol=1e-3)
 
 
-def load_pybullet(bullet, urdf, **options):
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, "robot.urdf")
-        path.write_text(urdf)
-        return bullet.loadURDF(str(path), useFixedBase=True, **options)
+SAPIEN = "SAPIEN", "sapien", "3.0.3"
 
 
 @fact(
-    *PYBULLET,
-    "URDF: motors and inertias",
-    "Each joint has a velocity motor that holds it until its force is set to 0. Inertias of the file are replaced by "
-    "those of the collision shapes unless `URDF_USE_INERTIA_FROM_FILE` is passed.",
-)
-def pybullet_holds_joints():
-    bullet, angles = make_pybullet(), []
-    robot = load_pybullet(bullet, write_urdf("revolute"), flags=bullet.URDF_USE_INERTIA_FROM_FILE)
-    inertia = bullet.getDynamicsInfo(robot, 0)[2]
-    other = bullet.getDynamicsInfo(load_pybullet(bullet, write_urdf("revolute")), 0)[2]
-    for force in (None, 0.0):
-        if force is not None:
-            bullet.setJointMotorControl2(robot, 0, bullet.VELOCITY_CONTROL, force=force)
-        for _ in range(50):
-            bullet.stepSimulation()
-        angles.append(abs(bullet.getJointState(robot, 0)[0]))
-    return angles[0] < 1e-6 < 0.1 < angles[1] and np.allclose(inertia, 0.01) and max(other) < 1e-5
-
-
-@fact(
-    "SAPIEN",
-    "sapien",
-    "3.0.3",
+    *SAPIEN,
     "`get_contacts`",
     "Impulses of contact points have no friction part, and stay at their last values while a body sleeps.",
 )
@@ -531,3 +312,259 @@ def sapien_impulses_have_no_friction():
         points = [p for contact in scene.physx_system.get_contacts() for p in contact.points]
         found.append(sum((np.array(p.impulse) for p in points), np.zeros(3)))
     return abs(found[99][0]) < 1e-6 < found[99][2] and body.is_sleeping and np.array_equal(found[298], found[299])
+
+
+# -- MuJoCo Warp ---------------------------------------------------------------------------------------
+
+WARP = "MuJoCo Warp", "mujoco_warp", "4.0.0"
+
+
+def run_warp(option=">", n=1, **sizes):
+    """Return MuJoCo's model and the data of MuJoCo Warp after `n` steps of a box on a plane."""
+    import mujoco_warp
+    import warp
+
+    warp.config.quiet = True
+    model, data = drop_box(option)
+    with contextlib.redirect_stdout(io.StringIO()), warp.ScopedDevice("cpu"):
+        device_model = mujoco_warp.put_model(model)
+        device_data = mujoco_warp.make_data(model, **sizes)
+        for _ in range(n):
+            mujoco_warp.step(device_model, device_data)
+    return model, data, device_data
+
+
+@fact(
+    *WARP,
+    "`nacon`, `nefc`",
+    "Both are the numbers that the step needed. If `nacon` exceeds the number of stored contacts, the others have no "
+    "rows, and `nefc` does not count these rows. If `nefc` exceeds the number of stored rows, the last are dropped.",
+    '`from_newton_mujoco` reports both as "dropped_contacts" and "dropped_rows" in `claims.residuals`.',
+)
+def warp_counts_what_it_drops():
+    few_contacts, few_rows = run_warp(nconmax=2, njmax=64)[2], run_warp(nconmax=64, njmax=8)[2]
+    counts = [(int(d.nacon.numpy()[0]), int(d.nefc.numpy()[0])) for d in (few_contacts, few_rows)]
+    return counts == [(4, 8), (4, 16)]
+
+
+@fact(
+    *WARP,
+    "`get_data_into`",
+    "The copy is in float32 precision, and `efc_R` is not written.",
+    "`from_mujoco` rejects such data and names float32 and `from_efc`.",
+)
+def warp_get_data_leaves_arrays_unwritten():
+    import mujoco_warp
+
+    model, data, device_data = run_warp(nconmax=64, njmax=64)
+    mujoco_warp.get_data_into(data, model, device_data)
+    return data.nefc > 0 and not np.isclose(data.efc_R, 1.0 / data.efc_D).any()
+
+
+@fact(
+    *WARP,
+    "`noslip_iterations`",
+    "The pass is applied, as in MuJoCo and unlike in MJX.",
+    "Impulses of such steps do not solve the problem of the rows, and the judge finds their error.",
+)
+def warp_applies_noslip():
+    speeds = []
+    for n in (0, 20):
+        option = f'cone="elliptic" noslip_iterations="{n}" gravity="3 0 -9.81">'
+        speeds.append(abs(float(run_warp(option, 200, nconmax=64, njmax=64)[2].qvel.numpy()[0, 0])))
+    return speeds[1] < 1e-6 < 5e-4 < speeds[0]
+
+
+# -- Drake ---------------------------------------------------------------------------------------------
+
+DRAKE = "Drake", "pydrake", "1.51.1"
+
+
+@fact(
+    *DRAKE,
+    "rest depth",
+    "A resting body penetrates more with kSap, in proportion to the time step, than with kLagged, kSimilar and kTamsi: "
+    "a box of 1 kg on four small spheres by 0.28 mm with steps of 10 ms, and by 0.005 mm with the others.",
+    "The problem is rigid: its `correction` is 0 by default, so this depth is not pushed out.",
+)
+def drake_rests_deeper_with_sap():
+    from pydrake.all import (
+        AddMultibodyPlantSceneGraph,
+        CoulombFriction,
+        DiagramBuilder,
+        DiscreteContactApproximation,
+        HalfSpace,
+        RigidTransform,
+        Simulator,
+        SpatialInertia,
+        Sphere,
+    )
+
+    depths = {}
+    for name in ("kSap", "kLagged", "kSimilar", "kTamsi"):
+        for dt in (0.01, 0.001):
+            builder = DiagramBuilder()
+            plant, _ = AddMultibodyPlantSceneGraph(builder, dt)
+            plant.set_discrete_contact_approximation(getattr(DiscreteContactApproximation, name))
+            friction = CoulombFriction(0.5, 0.5)
+            plant.RegisterCollisionGeometry(plant.world_body(), RigidTransform(), HalfSpace(), "ground", friction)
+            body = plant.AddRigidBody("box", SpatialInertia.SolidBoxWithMass(1.0, 0.2, 0.2, 0.2))
+            for k, corner in enumerate(np.array([(x, y, -0.08) for x in (-0.08, 0.08) for y in (-0.08, 0.08)])):
+                plant.RegisterCollisionGeometry(body, RigidTransform(corner), Sphere(0.02), f"foot {k}", friction)
+            plant.SetDefaultFloatingBaseBodyPose(body, RigidTransform([0.0, 0.0, 0.1]))
+            plant.Finalize()
+            simulator = Simulator(builder.Build())
+            simulator.AdvanceTo(2.0)
+            context = plant.GetMyContextFromRoot(simulator.get_context())
+            depths[name, dt] = 0.1 - plant.EvalBodyPoseInWorld(context, body).translation()[2]
+    others = [depth for (name, _), depth in depths.items() if name != "kSap"]
+    sap = depths["kSap", 0.01], depths["kSap", 0.001]
+    return max(others) < 1e-5 < 2e-5 < sap[1] < sap[0] / 8.0 and sap[0] < 1e-3
+
+
+# -- Pinocchio -----------------------------------------------------------------------------------------
+
+PINOCCHIO = "Pinocchio", "pinocchio", "4.1.0"
+
+
+def solve_pinocchio(kind, delassus, **options):
+    """Return the impulses (3,) and the result of one contact with free velocity (2, 0, -1) m/s, tangents first."""
+    import pinocchio
+
+    model = pinocchio.Model()
+    joint = model.addJoint(0, pinocchio.JointModelFreeFlyer(), pinocchio.SE3.Identity(), "body")
+    models, datas = pinocchio.StdVec_ConstraintModel(), pinocchio.StdVec_ConstraintData()
+    contact = pinocchio.PointContactConstraintModel(model, joint)
+    contact.setFriction(0.5)
+    models.append(pinocchio.ConstraintModel(contact))
+    datas.append(pinocchio.ConstraintData(contact.createData()))
+    settings, result = (getattr(pinocchio, f"{kind}Solver{word}")() for word in ("Settings", "Result"))
+    for name, value in options.items():
+        setattr(settings, name, value)
+    matrix = pinocchio.DelassusOperatorDense(np.asfortranarray(delassus))
+    solver = getattr(pinocchio, f"{kind}ConstraintSolver")(3)
+    solver.solve(matrix, np.array([2.0, 0.0, -1.0]), models, datas, settings, result)
+    return np.array(result.retrieveConstraintImpulses()), result
+
+
+@fact(
+    *PINOCCHIO,
+    "`solve_ncp`",
+    "With `solve_ncp=False`, ADMM solves the convex relaxation, and PGS still solves Coulomb's law.",
+    'Compare impulses of PGS with the law "coulomb" only.',
+)
+def pinocchio_pgs_ignores_solve_ncp():
+    found = [solve_pinocchio(k, np.eye(3), solve_ncp=ncp)[0][2] for k in ("ADMM", "PGS") for ncp in (True, False)]
+    return np.allclose(found, [1.0, 1.6, 1.0, 1.0], atol=1e-4)
+
+
+@fact(
+    *PINOCCHIO,
+    "tolerances of ADMM",
+    "A tolerance is met if the absolute or the relative one is, and the absolute ones do not scale with the mass. A "
+    "body of 1 mg that hits the ground with 1 m/s counts as converged, with `dual_feasibility` 2e-8, while it still "
+    "moves into the ground with 0.04 m/s.",
+    "The judge reports the velocity error of such impulses.",
+)
+def pinocchio_tolerances_are_absolute():
+    impulse, result = solve_pinocchio("ADMM", 1e6 * np.eye(3))
+    velocity = 1e6 * impulse[2] - 1.0
+    return result.converged and result.dual_feasibility < 1e-6 and velocity < -0.01
+
+
+# -- Genesis -------------------------------------------------------------------------------------------
+
+GENESIS = "Genesis", "genesis", "1.4.5"
+
+
+def make_genesis(*entities, gravity=(0.0, 0.0, -9.81)):
+    """Return a built scene with the given (morph, options of the material)."""
+    import genesis
+
+    if not getattr(genesis, "_initialized", False):
+        genesis.init(backend=genesis.cpu, logging_level="error")
+    options = genesis.options.SimOptions(dt=0.005, gravity=gravity)
+    scene = genesis.Scene(show_viewer=False, sim_options=options)
+    for morph, material in entities:
+        scene.add_entity(morph(genesis.morphs), material=genesis.materials.Rigid(**material))
+    scene.build()
+    return scene
+
+
+@fact(
+    *GENESIS,
+    "friction, `get_contacts`",
+    "The larger of the two friction coefficients acts. `force_a` is the force on `link_a` in N, with friction.",
+    "Both are contained in the rows, which are read.",
+)
+def genesis_uses_the_larger_friction():
+    floor, box = (lambda morphs: morphs.Plane()), (lambda morphs: morphs.Box(size=(0.2,) * 3, pos=(0, 0, 0.1)))
+    scene = make_genesis((floor, {"friction": 0.2}), (box, {"friction": 0.8, "rho": 125}), gravity=(5.0, 0.0, -10.0))
+    for _ in range(80):
+        scene.step()
+    plane, body = scene.entities
+    force = np.asarray(body.get_contacts(with_entity=plane)["force_a"]).sum(axis=0)
+    return np.allclose(force, [5.0, 0.0, -10.0], atol=1e-2) and abs(float(body.get_vel()[0])) < 0.01
+
+
+# -- Box2D and Siconos ---------------------------------------------------------------------------------
+
+
+@fact(
+    "Box2D",
+    "box2d._box2d",
+    "3.1.0",
+    "`normalImpulse` of `b2ManifoldPoint`",
+    "The impulse is that of the last substep: with 4 substeps, the points of a resting box add up to a quarter of its "
+    "weight times the time step. Without warm starting, they add up to the full amount.",
+)
+def box2d_impulses_are_of_the_last_substep():
+    from box2d import _box2d
+
+    lib, ffi = _box2d.lib, _box2d.ffi
+
+    def add_box(world, kind, y, half_width, half_height):
+        body, shape = ffi.new("b2BodyDef*", lib.b2DefaultBodyDef()), ffi.new("b2ShapeDef*", lib.b2DefaultShapeDef())
+        body.type, body.position.y, shape.density = kind, y, 1.0
+        polygon = ffi.new("b2Polygon*", lib.b2MakeBox(half_width, half_height))
+        return lib.b2CreatePolygonShape(lib.b2CreateBody(world, body), shape, polygon)
+
+    sums = []
+    for n, has_warm_start in ((1, True), (4, True), (4, False)):
+        definition = ffi.new("b2WorldDef*", lib.b2DefaultWorldDef())
+        definition.gravity.y, definition.enableSleep = -10.0, False
+        world = lib.b2CreateWorld(definition)
+        lib.b2World_EnableWarmStarting(world, has_warm_start)
+        add_box(world, 0, -1.0, 50.0, 1.0)
+        shape = add_box(world, 2, 0.5, 0.5, 0.5)
+        for _ in range(60):
+            lib.b2World_Step(world, 0.01, n)
+        contacts = ffi.new("b2ContactData[4]")
+        count = lib.b2Shape_GetContactData(shape, contacts, 4)
+        manifolds = [contacts[i].manifold for i in range(count)]
+        sums.append(sum(m.points[j].normalImpulse for m in manifolds for j in range(m.pointCount)))
+        lib.b2DestroyWorld(world)
+    return np.allclose(sums, [0.1, 0.025, 0.1], rtol=1e-2)
+
+
+@fact(
+    "Siconos",
+    "siconos.numerics",
+    "4.4.0",
+    "`fc3d_compute_error`",
+    "The error is divided by the larger of |q| and |reaction|, which have different units. An impulse that is 10 % too "
+    "large has the error 1.1e-3, 0.09 and 9e-5 for masses of 1 g, 1 kg and 1 t.",
+    "The relative residual does not change with the unit of mass.",
+)
+def siconos_error_changes_with_the_unit_of_mass():
+    import siconos.numerics as numerics
+
+    errors = []
+    for mass in (1e-3, 1.0, 1e3):
+        matrix, q = np.eye(3) / mass, np.array([-1.0, 0.0, 0.0])
+        problem = numerics.FrictionContactProblem(3, matrix, q, np.array([0.5]))
+        reaction = np.array([1.1 * mass, 0.0, 0.0])
+        options = numerics.SolverOptions(numerics.SICONOS_FRICTION_3D_NSGS)
+        velocity = matrix @ reaction + q
+        errors.append(numerics.fc3d_compute_error(problem, reaction, velocity, 1e-8, options, np.linalg.norm(q))[1])
+    return np.allclose(errors, [1.1e-3, 0.1 / 1.1, 0.1 / 1100.0], rtol=1e-6)

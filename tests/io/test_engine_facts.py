@@ -1,10 +1,10 @@
 """Engines behave as the table of docs/engine-arrays.md states."""
 
 import pytest
-from engine_probes import FACTS
+from engine_facts import load_facts
 
 
-@pytest.mark.parametrize("fact", FACTS, ids=lambda f: f"{f.engine}-{f.probe.__name__}")
+@pytest.mark.parametrize("fact", load_facts(), ids=lambda f: f"{f.engine}-{f.probe.__name__}")
 def test_fact_about_an_installed_engine_still_holds(fact):
     pytest.importorskip(fact.module)
     assert fact.probe(), f"{fact.engine} {fact.version}, {fact.subject}: {fact.text}"

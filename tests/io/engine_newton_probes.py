@@ -1,0 +1,128 @@
+"""Probes of arrays and settings of newton's solvers; see `engine_facts`."""
+
+import contextlib
+import io
+import warnings
+
+import numpy as np
+from engine_facts import fact
+
+NEWTON = "newton", "newton", "1.8.0"
+DT = 0.005  # s
+
+
+def run_newton(name, n=60, gravity=(0.0, 0.0, -9.81), friction=(0.5, 0.5), height=0.1, margin=0.0, **options):
+    """Step a box of 1 kg on a plane.
+
+    Returns
+    -------
+    tuple
+        The solver, the velocities (n + 1, 6) of the box, its observables, and the contacts.
+    """
+    import newton
+    import warp
+
+    warp.config.quiet = True
+    solver_class, config = getattr(newton.solvers, name), newton.ModelBuilder.ShapeConfig
+    with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # newton 1.8 warns of newer versions of MuJoCo.
+        builder, world = newton.ModelBuilder(), newton.ModelBuilder()
+        for item in (builder, world):
+            if hasattr(solver_class, "register_custom_attributes"):
+                solver_class.register_custom_attributes(item)
+        builder.add_ground_plane(cfg=config(mu=friction[0], margin=margin))
+        box = world.add_body(xform=warp.transform((0.0, 0.0, height), warp.quat_identity()))
+        shape = config(mu=friction[1], density=125.0, margin=margin)
+        world.add_shape_box(box, hx=0.1, hy=0.1, hz=0.1, cfg=shape)
+        builder.add_world(world)
+        builder.color()
+        model = builder.finalize(device="cpu")
+        model.gravity.assign(np.tile(np.array(gravity, np.float32), (len(model.gravity.numpy()), 1)))
+        solver = solver_class(model, **options)
+        before, after, control = model.state(), model.state(), model.control()
+        pipeline = newton.CollisionPipeline(model)
+        contacts = pipeline.contacts()
+        pipeline.collide(before, contacts)
+        kinds = solver_class.SUPPORTED_OBSERVABLES & {"contact_f", "body_qdd"}
+        observables = solver.observables(kinds, contacts=contacts) if kinds else None
+        velocities = [before.body_qd.numpy()[0].copy()]
+        for _ in range(n):
+            pipeline.collide(before, contacts)
+            before.clear_forces()
+            solver.step(before, after, control, contacts, DT, observables=observables)
+            before, after = after, before
+            velocities.append(before.body_qd.numpy()[0].copy())
+    return solver, np.array(velocities), observables, contacts
+
+
+@fact(
+    *NEWTON,
+    "friction of two shapes",
+    "SolverXPBD and SolverKamino use the mean of both coefficients, and SolverMuJoCo the larger one.",
+    "The coefficients of the rows are those of the solver that was run.",
+)
+def newton_solvers_combine_friction_differently():
+    found = []
+    for name in ("SolverXPBD", "SolverKamino", "SolverMuJoCo"):
+        velocity = run_newton(name, 40, gravity=(6.0, 0.0, -10.0), friction=(0.2, 0.8))[1][:, 0]
+        found.append((velocity[-1] - velocity[20]) / (20 * DT))
+    # A coefficient of 0.5 leaves an acceleration of 1 m/s^2; one of 0.8 holds the box up to the creep of soft contacts.
+    return np.allclose(found[:2], 1.0, atol=0.02) and abs(found[2]) < 0.1
+
+
+@fact(
+    *NEWTON,
+    "SolverKamino: `reaction`, `lambdas`",
+    "`reaction` of its contacts is in N, and `lambdas` of its solution in N s.",
+    "`from_kamino` reads `lambdas`.",
+)
+def kamino_has_reactions_in_newtons():
+    solver = run_newton("SolverKamino")[0]
+    n = int(solver._contacts_kamino.data.model_active_contacts.numpy()[0])
+    force = solver._contacts_kamino.data.reaction.numpy()[:n].sum(axis=0)
+    impulse = solver._solver_kamino.solver_fd.data.solution.lambdas.numpy()[: 3 * n].reshape(n, 3).sum(axis=0)
+    return np.allclose(force[2], 9.81, rtol=1e-3) and np.allclose(impulse[2], 9.81 * DT, rtol=1e-3)
+
+
+@fact(
+    *NEWTON,
+    "`contact_f`",
+    "The observable is the force in N on the body of `rigid_contact_shape0`, with friction, for SolverXPBD, "
+    "SolverKamino, SolverMuJoCo and SolverVBD.",
+)
+def newton_contact_forces_act_on_the_first_shape():
+    sums = []
+    for name in ("SolverXPBD", "SolverKamino", "SolverMuJoCo", "SolverVBD"):
+        _, _, observables, contacts = run_newton(name, gravity=(2.0, 0.0, -9.81))
+        if contacts.rigid_contact_shape0.numpy()[0] != 0:  # Shape 0 is the plane.
+            return False
+        sums.append(observables.contact_f.numpy()[:, :3].sum(axis=0))
+    return np.allclose(sums, [2.0, 0.0, -9.81], atol=0.02)
+
+
+@fact(
+    *NEWTON,
+    "`body_qdd`",
+    "The observable of SolverKamino and SolverMuJoCo is the change of the velocity divided by the time step. It "
+    "contains the impulses of contacts.",
+)
+def newton_accelerations_contain_contacts():
+    found = []
+    for name in ("SolverKamino", "SolverMuJoCo"):
+        _, velocity, observables, _ = run_newton(name, 3)
+        found.append(observables.body_qdd.numpy()[0] - (velocity[-1] - velocity[-2]) / DT)
+    return np.allclose(found, 0.0, atol=1e-3)
+
+
+@fact(
+    *NEWTON,
+    "SolverMuJoCo: `margin`",
+    "Margins of shapes act only with `use_mujoco_contacts=False`. By default, the geoms of MuJoCo have the margin 0.",
+    "Only contacts with rows are read.",
+)
+def newton_drops_margins_in_mujoco():
+    rows = []
+    for is_mujoco in (True, False):
+        solver = run_newton("SolverMuJoCo", 1, height=0.105, margin=0.01, use_mujoco_contacts=is_mujoco)[0]
+        rows.append(int(solver.mjw_data.nefc.numpy()[0]))
+    return rows == [0, 16]
