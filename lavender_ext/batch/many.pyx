@@ -17,7 +17,6 @@ from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.method cimport workspace_t
 from lavender_ext.core.problem cimport Data, bind_body_arrays, derived_t
 from lavender_ext.core.problem import LAWS
-from lavender_ext.core.view cimport view_t
 from lavender_ext.small.call cimport N_COUNTS, Rules, small_rules_t, small_problem_t, judge_small_impulse
 from lavender_ext.batch.task cimport (copy_small_judgement, compute_missing_derived_numbers, judge_task, judge_zero_impulse_of_task,
                                       judge_task_workspace_size, prepare_task_for_small_call,
@@ -215,12 +214,6 @@ cdef struct worker_t:             # memory of one thread
     worker_scratch_t scratch
     task_workspaces_t small
     workspace_t by_island
-
-
-cdef inline bint judge_world_zero(task_t* j, worker_t* h) noexcept nogil:
-    """Judge the zero impulse of a world that is given by J and M; return False if memory is exhausted."""
-    cdef view_t v = view_t(j.p, NULL, NULL, &j.g)
-    return judge_zero_impulse_of_task(j, &v, &h.small.islands, h.workspace.real)
 
 
 cdef class Worlds:
@@ -454,7 +447,8 @@ cdef class Worlds:
             j.push = h.small.call.work.real
         elif (compute_missing_derived_numbers(&j) and j.made.n_empty == 0
               and grow_workspace_to(&h.workspace, 0, max(judge_task_workspace_size(&j), 4 * <int64_t>m + 5 * j.g.n))
-              and grow_workspace_to(&h.by_island, 0, 2 * <int64_t>j.p.n_blocks) and judge_world_zero(&j, h)):
+              and grow_workspace_to(&h.by_island, 0, 2 * <int64_t>j.p.n_blocks)
+              and judge_zero_impulse_of_task(&j, &h.small.islands, h.workspace.real)):
             code, x = READY, h.workspace.real
             if j.cold:
                 set_zero_impulse(&j.p, j.lam, j.slack_error)

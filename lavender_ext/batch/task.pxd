@@ -8,8 +8,8 @@ from libc.stdint cimport int32_t, int64_t
 from libc.math cimport INFINITY, NAN, fabs, sqrt
 from libc.string cimport memset
 
-from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles
-from lavender_ext.core.assemble cimport lav_form_delassus_matrix, lav_list_blocks_of_bodies, lav_expand_rows
+from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles, take_integers
+from lavender_ext.core.assemble cimport lav_form_delassus_matrix, lav_list_blocks_of_bodies
 from lavender_ext.core.validate cimport find_invalid_number
 from lavender_ext.core.method cimport MORE, REACHED, NEEDS_WORKSPACE, options_t, workspace_t, info_t
 from lavender_ext.core.islands cimport island_workspace_integers
@@ -30,7 +30,7 @@ from lavender_ext.small.call cimport (N_COUNTS, RESULT_IS_START, RESULT_SOLVED, 
 from lavender_ext.small.limits cimport (
     max_newton_cost, estimate_newton_cost, limits_t, estimate_newton_step_cost, max_factorisation_work,
 )
-from lavender_ext.small.workspace cimport grow_workspace_to
+from lavender_ext.small.workspace cimport fits_workspace, grow_workspace_to, grow_workspace_to_arena
 from lavender_ext.batch.world cimport THIN_PADDING, LEFT, READY, STARTED, TRIED, compress_dense_rows
 from lavender_ext.velocity_newton.soft cimport needs_no_proximal_terms
 
@@ -80,15 +80,30 @@ cdef struct task_workspaces_t:  # workspaces of one thread
     solve_workspaces_t call     # workspaces of `solve_small`
 
 
-cdef inline bint judge_zero_impulse_of_task(task_t* j, view_t* v, workspace_t* islands, double* w) noexcept nogil:
-    """Judge the zero impulse for E0, V0, its relative residual and the islands; return False if memory is exhausted.
+cdef inline view_t make_judge_view(task_t* j) noexcept nogil:
+    """Return the view of the task's data for the judge."""
+    cdef view_t v = view_t(j.p, NULL, NULL, NULL)
+    if j.general:
+        v.g = &j.g
+    elif j.factored:
+        v.r = &j.r
+    else:
+        v.a = &j.a
+    return v
 
-    v: view of the task's data; w (3 m + `count_judge_scratch`): scratch.
+
+cdef inline bint judge_zero_impulse_of_task(task_t* j, workspace_t* islands, double* w) noexcept nogil:
+    """Judge the zero impulse for E0, V0, its relative residual and the islands, unless they are known.
+
+    Returns False if memory is exhausted. w (3 m + `count_judge_scratch`) is scratch.
     """
+    cdef view_t v = make_judge_view(j)
     cdef ssize_t m = j.p.n_rows
-    if not grow_workspace_to(islands, island_workspace_integers(v), 3 * <int64_t>j.p.n_blocks):
+    if j.zero_residual[0] >= 0.0:
+        return True
+    if not grow_workspace_to(islands, island_workspace_integers(&v), 3 * <int64_t>j.p.n_blocks):
         return False
-    judge_zero_impulse(v, islands.index, &j.islands, islands.real, w + 2 * m, w, w + m, w + 3 * m, j.zero_residual)
+    judge_zero_impulse(&v, islands.index, &j.islands, islands.real, w + 2 * m, w, w + m, w + 3 * m, j.zero_residual)
     j.p.islands = v.p.islands
     return True
 
@@ -149,13 +164,13 @@ cdef inline bint set_impulse_of_empty_rows(const task_t* j, double tol) noexcept
 
 cdef inline int64_t judge_task_workspace_size(const task_t* j) noexcept nogil:
     """Return the number of doubles of scratch of `judge_task`."""
-    cdef view_t v = view_t(j.p, NULL, NULL, &j.g)
+    cdef view_t v = make_judge_view(j)
     return j.g.n + count_judge_scratch(&v)
 
 
 cdef inline void judge_task(task_t* j, double tol, double* x) noexcept nogil:
     """Judge lam, refined for `tol`, and store M^-1 J^T lam in `push`; x (`judge_task_workspace_size`) is scratch."""
-    cdef view_t v = view_t(j.p, NULL, NULL, &j.g)
+    cdef view_t v = make_judge_view(j)
     cdef int32_t m = j.p.n_rows
     j.score = make_empty_score()
     j.score.by_island = j.by_island
@@ -193,9 +208,9 @@ cdef inline void solve_task(task_t* j, workspace_t* workspace, workspace_t* isla
     if not grow_workspace_to(workspace, 0, 3 * <ssize_t>m + j.g.n):
         return
     # residual of the zero impulse
-    v = view_t(j.p, NULL, NULL, &j.g)
-    if j.zero_residual[0] < 0.0 and not judge_zero_impulse_of_task(j, &v, islands, workspace.real):
+    if not judge_zero_impulse_of_task(j, islands, workspace.real):
         return
+    v = make_judge_view(j)
     # cost limits, workspace
     soft = needs_no_proximal_terms(&j.p, &j.g)
     o.work = max_factorisation_work(&j.p, &j.g, limits, soft)
@@ -269,56 +284,43 @@ cdef inline bint form_matrix_of_bodies(task_t* j, small_problem_t* s, workspace_
     cdef int64_t m = j.p.n_rows, k = j.p.n_blocks, n_entries
     cdef int32_t* start
     cdef int32_t* blocks
-    cdef int32_t* near
-    cdef int32_t* ptr
-    cdef double* x
-    if not grow_workspace_to(workspace, j.r.n_bodies + 6 * k + 3 * m + m * m + 7, 3 * (m + 1) + 24 * m + m * m + 1):
-        return False
-    start, x = workspace.index, workspace.real
-    blocks = start + j.r.n_bodies + 1
-    near = blocks + 2 * k + 1
-    ptr = near + 4 * k + 2 + m
+    cdef int32_t* scratch
+    cdef double* jac
+    cdef arena_t arena = make_arena(workspace.real, workspace.index)
+    cdef int32_t _pass
+    for _pass in range(2):                              # The second pass follows if the workspace was too small.
+        start, blocks = take_integers(&arena, j.r.n_bodies + 1), take_integers(&arena, 2 * k + 1)
+        scratch, jac = take_integers(&arena, 4 * k + 2 + m), take_doubles(&arena, 24 * m)
+        j.a.indptr, j.a.indices = take_integers(&arena, m + 1), take_integers(&arena, m * m + 1)
+        j.a.data = take_doubles(&arena, m * m + 1)
+        s.over = view_t(j.p, &j.a, NULL, NULL)
+        s.over.p.d, s.over.p.nu = take_doubles(&arena, m + 1), take_doubles(&arena, m + 1)
+        s.over.p.step = take_doubles(&arena, m + 1)
+        if fits_workspace(workspace, &arena):
+            break
+        if not grow_workspace_to_arena(workspace, &arena):
+            return False
     lav_list_blocks_of_bodies(&j.p, &j.r, start, blocks, &n_entries)
-    j.a.indptr, j.a.indices, j.a.data = ptr, ptr + 2 * (m + 1), x + 3 * (m + 1) + 24 * m
-    lav_expand_rows(&j.p, &j.r, x + 3 * (m + 1), x + 3 * (m + 1) + 12 * m)
-    lav_form_delassus_matrix(&j.p, &j.r, x + 3 * (m + 1), x + 3 * (m + 1) + 12 * m, start, blocks, near, near + 2 * k + 1,
-                             near + 4 * k + 2,
-                 ptr, <int32_t*>j.a.indices, <double*>j.a.data)
-    s.over = view_t(j.p, &j.a, NULL, NULL)
-    s.over.p.d, s.over.p.nu, s.over.p.step = x, x + m + 1, x + 2 * (m + 1)
-    lav_compute_csr_diagonal(&s.over.p, &j.a, ptr + m + 1)
+    lav_form_delassus_matrix(&j.p, &j.r, start, blocks, jac, scratch, <int32_t*>j.a.indptr, <int32_t*>j.a.indices,
+                             <double*>j.a.data)
+    lav_compute_csr_diagonal(&s.over.p, &j.a, scratch)
     s.over.p.nu = j.p.nu
     return True
-
-
-cdef inline view_t make_judge_view(task_t* j) noexcept nogil:
-    """Return the view of the task's data for the judge."""
-    cdef view_t v = view_t(j.p, NULL, NULL, NULL)
-    if j.general:
-        v.g = &j.g
-    elif j.factored:
-        v.r = &j.r
-    else:
-        v.a = &j.a
-    return v
 
 
 cdef inline bint prepare_task_for_small_call(task_t* j, small_problem_t* s, task_workspaces_t* workspaces) noexcept nogil:
     """Set up a task of A or of bodies for a solve or for the judge; return False to defer it, for example with empty rows."""
     cdef int64_t m = j.p.n_rows
     if not j.has_derived:
-        if j.factored:
-            j.has_derived = derive_row_numbers_from_bodies(j, &workspaces.made)
-        else:
-            j.has_derived = derive_row_numbers_from_matrix(j, &workspaces.made)
+        j.has_derived = (derive_row_numbers_from_bodies(j, &workspaces.made) if j.factored
+                         else derive_row_numbers_from_matrix(j, &workspaces.made))
     if not j.has_derived or j.made.n_empty:
         return False
     s.v = make_judge_view(j)
-    if j.zero_residual[0] < 0.0:
-        if not grow_workspace_to(&workspaces.call.work, 0, 3 * m + count_judge_scratch(&s.v)):
-            return False
-        if not judge_zero_impulse_of_task(j, &s.v, &workspaces.islands, workspaces.call.work.real):
-            return False
+    if not (grow_workspace_to(&workspaces.call.work, 0, 3 * m + count_judge_scratch(&s.v))
+            and judge_zero_impulse_of_task(j, &workspaces.islands, workspaces.call.work.real)):
+        return False
+    s.v.p = j.p
     s.over = s.v
     s.zero_residual[0], s.zero_residual[1], s.zero_residual[2] = j.zero_residual[0], j.zero_residual[1], j.zero_residual[2]
     return j.zero_residual[2] >= 0.0

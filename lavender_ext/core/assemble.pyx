@@ -22,7 +22,7 @@ from lavender_ext.core.view cimport get_block_bodies, get_moving_body, rows_t
 cdef object F8 = np.dtype(np.float64), I4 = np.dtype(np.int32)
 
 
-cdef public void lav_expand_rows(const blocks_t* p, const rows_t* r, double* jac, double* minv_jac) noexcept nogil:
+cdef void expand_rows(const blocks_t* p, const rows_t* r, double* jac, double* minv_jac) noexcept nogil:
     """Write J and M^-1 J^T (m, 12) of every row, in the layout of joint rows: linear and angular on body a, then on body b."""
     cdef int32_t i, j, k
     cdef const int32_t* bodies
@@ -135,17 +135,23 @@ cdef inline int32_t index_of_single_bit(int32_t bits) noexcept nogil:
     return 3 if bits == 8 else -1
 
 
-cdef public void lav_form_delassus_matrix(const blocks_t* p, const rows_t* r, const double* jac, const double* minv_jac,
-                              const int32_t* start, const int32_t* blocks, int32_t* neighbors, int32_t* sides,
-                              int32_t* next_, int32_t* indptr, int32_t* indices, double* data) noexcept nogil:
-    """Write the rows of A into indptr (m + 1), indices, data; neighbors, sides (2 k + 1) and next_ (m) are scratch.
+cdef public void lav_form_delassus_matrix(const blocks_t* p, const rows_t* r, const int32_t* start, const int32_t* blocks,
+                                          double* jac, int32_t* scratch, int32_t* indptr, int32_t* indices,
+                                          double* data) noexcept nogil:
+    """Write the rows of A into indptr (m + 1), indices, data, with the lists of `lav_list_blocks_of_bodies`.
 
-    next_[c] is the entry of row c above the diagonal that will be copied next, into the row of that entry's column.
+    jac (24 m) receives J and M^-1 J^T of every row; scratch (4 k + 2 + m).
     """
+    cdef double* minv_jac = jac + 12 * <int64_t>p.n_rows
+    cdef int32_t* neighbors = scratch
+    cdef int32_t* sides = scratch + 2 * <int64_t>p.n_blocks + 1
+    # Entry of each row above the diagonal that will be copied next, into the row of that entry's column.
+    cdef int32_t* next_ = sides + 2 * <int64_t>p.n_blocks + 1
     cdef int32_t i, n, q, j, row, col, end, at, bit, nnz = 0
     cdef double value
     cdef const double* x
     cdef const double* y
+    expand_rows(p, r, jac, minv_jac)
     indptr[0] = 0
     for i in range(p.n_blocks):
         n = list_coupled_blocks(r, i, start, blocks, neighbors)
@@ -230,14 +236,10 @@ def form_delassus_matrix(Data p, Py_ssize_t max_entries, int32_t[::1] start, int
     cdef int32_t nnz
     data_, indices_, indptr_ = np.empty(max_entries + 1), np.empty(max_entries + 1, np.int32), np.zeros(m + 1, np.int32)
     cdef double[::1] jac = np.empty(24 * m + 1), data = data_
-    cdef double* minv_jac = &jac[12 * m]
     cdef int32_t[::1] indices = indices_, indptr = indptr_
     cdef int32_t[::1] scratch = np.empty(4 * p.blocks.n_blocks + 2 + m, np.int32)
     with nogil:
-        lav_expand_rows(&p.blocks, &p.rows, &jac[0], minv_jac)
-        lav_form_delassus_matrix(&p.blocks, &p.rows, &jac[0], minv_jac, &start[0], &blocks[0], &scratch[0],
-                     &scratch[2 * p.blocks.n_blocks + 1], &scratch[0] + 4 * p.blocks.n_blocks + 2, &indptr[0], &indices[0],
-                     &data[0])
+        lav_form_delassus_matrix(&p.blocks, &p.rows, &start[0], &blocks[0], &jac[0], &scratch[0], &indptr[0], &indices[0], &data[0])
     nnz = indptr[m]
     entries = indices_[:nnz], data_[:nnz]
     if nnz < 0.75 * max_entries:                        # Copy only if more than a quarter of the memory is unused.

@@ -27,8 +27,8 @@ cdef void shuffle_blocks(int32_t* order, int32_t first, int32_t end, uint64_t* r
 cdef void reverse_blocks(int32_t* order, int32_t first, int32_t end) noexcept nogil
 cdef void update_sweep_order(int32_t mode, int32_t first_sweep, int32_t* order, int32_t first, int32_t end,
                         uint64_t* rng) noexcept nogil
-cdef int32_t find_body_levels(int32_t n_blocks, const int32_t* body, int32_t n_bodies, int32_t* level) noexcept nogil
-cdef void find_block_levels(int32_t n_blocks, const int32_t* body, const int32_t* level, int32_t* out) noexcept nogil
+cdef int32_t find_block_levels(int32_t n_blocks, const int32_t* body, int32_t n_bodies, int32_t* level,
+                               int32_t* out) noexcept nogil
 cdef void sort_blocks_by_level(int32_t n_blocks, const int32_t* level, int32_t n_levels, int32_t* start,
                         int32_t* order) noexcept nogil
 cdef int32_t color_blocks_by_bodies(int32_t n_blocks, const int32_t* body, int32_t n_bodies, uint64_t* used,

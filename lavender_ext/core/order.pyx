@@ -37,11 +37,13 @@ cdef void update_sweep_order(int32_t mode, int32_t first_sweep, int32_t* order, 
         reverse_blocks(order, first, end)
 
 
-cdef int32_t find_body_levels(int32_t n_blocks, const int32_t* body, int32_t n_bodies, int32_t* level) noexcept nogil:
-    """Compute the breadth-first level of each body from the static ones (body -1); return the number of levels.
+cdef int32_t find_block_levels(int32_t n_blocks, const int32_t* body, int32_t n_bodies, int32_t* level,
+                               int32_t* out) noexcept nogil:
+    """Compute the level of each block in out (n_blocks), 0 on the ground; return an upper bound of the number of levels.
 
-    Bodies without a path to a static body get the last level + 1. `body` is (n_blocks, 2). Edges are relaxed forwards and
-    backwards until no level changes. This is linear for scenes whose bodies are numbered from the ground up.
+    A block is one level above the lower of its two bodies. The levels of bodies, in level (n_bodies), are breadth-first from the
+    static ones (body -1); bodies without a path to a static body get the last level + 1. `body` is (n_blocks, 2). Edges are
+    relaxed forwards and backwards until no level changes, which is linear for scenes whose bodies are numbered from the ground up.
     """
     cdef int32_t i, a, b, la, lb, changed, top = 0, far = 2147483647, _pass
     for i in range(n_bodies):
@@ -67,16 +69,11 @@ cdef int32_t find_body_levels(int32_t n_blocks, const int32_t* body, int32_t n_b
     for i in range(n_bodies):
         if level[i] == far:
             level[i] = top + 1
-    return top + 1
-
-
-cdef void find_block_levels(int32_t n_blocks, const int32_t* body, const int32_t* level, int32_t* out) noexcept nogil:
-    """Compute the level of each block: the lower level of its two bodies plus 1, 0 for a block on the ground."""
-    cdef int32_t i, la, lb
     for i in range(n_blocks):
         la = 0 if body[2 * i] < 0 else level[body[2 * i]] + 1
         lb = 0 if body[2 * i + 1] < 0 else level[body[2 * i + 1]] + 1
         out[i] = la if la < lb else lb
+    return top + 3
 
 
 cdef void sort_blocks_by_level(int32_t n_blocks, const int32_t* level, int32_t n_levels, int32_t* start,
@@ -172,8 +169,7 @@ def compute_block_levels(const int32_t[:, ::1] body, int n_bodies):
     cdef int32_t k = <int32_t>body.shape[0]
     cdef int32_t[::1] level = np.empty(n_bodies + 1, np.int32), out = np.empty(k + 1, np.int32)
     if k:
-        find_body_levels(k, &body[0, 0], n_bodies, &level[0])
-        find_block_levels(k, &body[0, 0], &level[0], &out[0])
+        find_block_levels(k, &body[0, 0], n_bodies, &level[0], &out[0])
     return np.asarray(out)[:k]
 
 

@@ -16,6 +16,7 @@ from libc.string cimport memcpy, memset
 
 import numpy as np
 
+from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles, take_integers
 from lavender_ext.core.arrays cimport ndarray as Array
 from lavender_ext.core.validate cimport all_finite, find_invalid_number
 from lavender_ext.core.generalized cimport multiply_jacobian_transpose, whitened_row_dot
@@ -26,7 +27,7 @@ from lavender_ext.core.velocity cimport compute_body_wrenches, apply_body_invers
 from lavender_ext.core.view cimport generalized_t, view_t
 from lavender_ext.derivative.natural cimport (CLOSED, FREE, HIGH, LOW, OPEN, SLIDES, STICKS, form_scaled_csr,
                                               form_scaled_generalized, form_reduced_system, linearised_t, linearise_all_projections,
-                                              multiply_block_derivatives, natural_t, number_system_rows)
+                                              multiply_block_derivatives, number_system_rows)
 from lavender_ext.factor.factors cimport has_wide
 from lavender_ext.factor.linear cimport (LU, analyse_dense, factor_linear_system_matrix, solve_linear_system,
                                          solve_transposed_linear_system)
@@ -154,48 +155,38 @@ cdef void form_derivative_system(const linearised_t* a, const view_t* v, double 
     form_reduced_system(&a.x, &a.v.p, n, a.system_row, h, g)
 
 
-cdef ssize_t count_projection_derivative_values(const blocks_t* b) noexcept nogil:
-    """Return the number of stored values of P: n for a block of n bounded rows, n^2 for a contact of n rows."""
-    cdef int32_t i, n
-    cdef ssize_t size = 0
+cdef void bind_linearised_arrays(linearised_t* a, arena_t* arena) noexcept nogil:
+    """Take the arrays of the linearisation of a.v from an arena; P has n values for n bounded rows, n^2 for a contact."""
+    cdef const blocks_t* b = &a.v.p
+    cdef int64_t m = b.n_rows, n, values = 0
+    cdef int32_t i
     for i in range(b.n_blocks):
         n = b.ptr[i + 1] - b.ptr[i]
-        size += n if has_independent_rows(b, i) else n * n
-    return size
+        values += n if has_independent_rows(b, i) else n * n
+    a.lam, a.w = take_doubles(arena, m), take_doubles(arena, m)
+    a.x.root, a.x.f, a.x.margin = take_doubles(arena, m), take_doubles(arena, m), take_doubles(arena, m)
+    a.x.p, a.x.edge = take_doubles(arena, values), take_doubles(arena, values)
+    a.system_row, a.x.value_ptr = take_integers(arena, m), take_integers(arena, b.n_blocks + 1)
+    a.x.case_ = <int8_t*>take_integers(arena, (m + 3) // 4)
 
 
-cdef ssize_t linearisation_workspace_size(const blocks_t* b, ssize_t values) noexcept nogil:
-    """Return the number of doubles that `judge_and_linearise` stores."""
-    return 5 * <ssize_t>b.n_rows + 2 * values + (5 * <ssize_t>b.n_rows + 4 * <ssize_t>b.n_blocks + 11) // 8
-
-
-cdef void judge_and_linearise(linearised_t* a, const double* lam, double energy, double velocity, double* at,
-                           double* scratch) noexcept nogil:
+cdef void judge_and_linearise(linearised_t* a, const double* lam, double energy, double velocity, double* scratch) noexcept nogil:
     """Judge and linearise the impulse lam (m) of a.v; energy and velocity are the references of the zero impulse.
 
-    The results are stored in at (`linearisation_workspace_size`). scratch (m + `count_judge_scratch`) is free afterwards.
+    scratch (m + `count_judge_scratch`) is free afterwards.
     """
     cdef const blocks_t* b = &a.v.p
     cdef int32_t m = b.n_rows
-    cdef ssize_t values = count_projection_derivative_values(b)
-    cdef int32_t* ptr = <int32_t*>(at + 5 * m + 2 * values)
     cdef score_t s = make_empty_score()
     if m == 0:
         a.regular = True
         return
-    a.lam, a.w, a.system_row = at, at + m, ptr + b.n_blocks + 1
-    a.x = natural_t(at + 2 * m, at + 3 * m, at + 4 * m, <int8_t*>(a.system_row + m), ptr, at + 5 * m, at + 5 * m + values)
     memcpy(a.lam, lam, m * sizeof(double))
     judge_view(&a.v, a.lam, a.w, scratch, scratch + m, True, &s)
-    linearise_all_projections(b, a.lam, a.w, ptr, &a.x)
+    linearise_all_projections(b, a.lam, a.w, <int32_t*>a.x.value_ptr, &a.x)
     a.rows = number_system_rows(b, &a.x, a.system_row)
     a.relative = relative_residual_of_score(&s, a.w, m, energy, velocity)
     a.above_floor = residual_above_floor(&s, a.relative, relative_floor_of_score(&s, energy, velocity))
-
-
-cdef ssize_t derivative_factor_workspace_size(int32_t n) noexcept nogil:
-    """Return the number of doubles that `factor_derivative_system` stores."""
-    return <ssize_t>n * n + (n + 1) // 2
 
 
 cdef ssize_t derivative_factor_scratch_size(int32_t n, const view_t* v) noexcept nogil:
@@ -204,10 +195,15 @@ cdef ssize_t derivative_factor_scratch_size(int32_t n, const view_t* v) noexcept
     return n * width
 
 
-cdef bint factor_derivative_system(linearised_t* a, const view_t* v, double shift, double* at, double* scratch) noexcept nogil:
-    """Factor G of H + shift, with A of v; return whether it is regular.
+cdef void bind_derivative_factor(linearised_t* a, arena_t* arena) noexcept nogil:
+    """Take the arrays of the factor of G from an arena."""
+    a.g.matrix, a.g.swap = take_doubles(arena, <int64_t>a.rows * a.rows), take_integers(arena, a.rows)
 
-    The factor is stored in at (`derivative_factor_workspace_size`). scratch (`derivative_factor_scratch_size`) is free afterwards.
+
+cdef bint factor_derivative_system(linearised_t* a, const view_t* v, double shift, double* scratch) noexcept nogil:
+    """Factor G of H + shift, with A of v, in the arrays of `bind_derivative_factor`; return whether it is regular.
+
+    scratch (`derivative_factor_scratch_size`) is free afterwards.
     """
     cdef int32_t i, n = a.rows
     cdef double smallest = 1.0 / 0.0, norm_inf = 0.0, x
@@ -215,15 +211,22 @@ cdef bint factor_derivative_system(linearised_t* a, const view_t* v, double shif
     if n == 0:
         return True
     analyse_dense(&a.g, n)
-    a.g.by, a.g.wide, a.g.matrix, a.g.swap = LU, has_wide(), at, <int32_t*>(at + <ssize_t>n * n)
-    form_derivative_system(a, v, shift, at, scratch)
+    a.g.by, a.g.wide = LU, has_wide()
+    form_derivative_system(a, v, shift, a.g.matrix, scratch)
     if factor_linear_system_matrix(&a.g) == 0:
         for i in range(n):
-            x = 1.0 / fabs(at[<ssize_t>i * n + i])    # The factor contains 1 / U_ii.
+            x = 1.0 / fabs(a.g.matrix[<ssize_t>i * n + i])    # The factor contains 1 / U_ii.
             smallest = x if x < smallest else smallest
             norm_inf = x if x > norm_inf else norm_inf
     a.regular = smallest > MIN_PIVOT_RATIO * norm_inf and norm_inf > 0.0
     return a.regular
+
+
+cdef tuple allocate_arena(arena_t* arena):
+    """Allocate what an arena has counted, and begin the arena there; return both buffers, which the caller keeps."""
+    cdef Workspace real = allocate_bytes(arena.n_real * sizeof(double)), index = allocate_bytes(arena.n_index * sizeof(int32_t))
+    arena[0] = make_arena(<double*>real.at, <int32_t*>index.at)
+    return real, index
 
 
 cdef bint prepare_problem_data(Data p):
@@ -276,41 +279,26 @@ cdef class Linear:
     """One linearised solution of `Linears`. `solve` and `adjoint` use the factor that `prepare` computed last."""
     cdef linearised_t at
     cdef Data judge, data                               # the problem for the judge, and the problem with the A that is in G
-    cdef Workspace workspace, factor
-
-    @property
-    def rows(self):
-        """Number of rows of G."""
-        return self.at.rows
-
-    @property
-    def tried(self):
-        """Whether a factorisation was attempted."""
-        return self.at.tried
-
-    @property
-    def regular(self):
-        """Whether G is regular or empty."""
-        return self.at.regular
-
-    @property
-    def relative(self):
-        """Relative residual of the judge."""
-        return self.at.relative
-
-    @property
-    def above_floor(self):
-        """Relative residual that rounding does not explain."""
-        return self.at.above_floor
+    cdef Workspace numbers, integers, factor, swap
+    cdef readonly int rows                              # number of rows of G
+    cdef readonly bint tried                            # whether a factorisation was attempted
+    cdef readonly bint regular                          # whether G is regular or empty
+    cdef readonly double relative                       # relative residual of the judge
+    cdef readonly double above_floor                    # relative residual that rounding does not explain
 
     def prepare(self, Data data, double shift=0.0):
         """Factor G of H + shift, with A of `data` (compressed rows, or J and M); return whether it is regular."""
         cdef view_t v = data.get_pointers()
+        cdef arena_t arena = make_arena(NULL, NULL)
         cdef Workspace spare = allocate_bytes(derivative_factor_scratch_size(self.at.rows, &v) * sizeof(double))
-        self.data, self.factor = data, allocate_bytes(derivative_factor_workspace_size(self.at.rows) * sizeof(double))
+        self.data = data
+        bind_derivative_factor(&self.at, &arena)
+        self.factor, self.swap = allocate_arena(&arena)
+        bind_derivative_factor(&self.at, &arena)
         with nogil:
-            factor_derivative_system(&self.at, &v, shift, <double*>self.factor.at, <double*>spare.at)
-        return self.at.regular
+            factor_derivative_system(&self.at, &v, shift, <double*>spare.at)
+        self.tried, self.regular = self.at.tried, self.at.regular
+        return self.regular
 
     def adjoint(self, velocity, impulse, slack):
         """Return (q (m), s (m), f (n), c (m)) of (1), concatenated, from velocity y (n,), impulse c (m,), slack x (m,).
@@ -417,19 +405,18 @@ cdef class Linears:
     each, number of rows of each). G is factored if A is given by J and M and G has at most `max_rows` rows. An item is skipped,
     and `item` returns None for it, if its data are None, its impulse is not an array of its rows, or d is outside the valid range.
     """
-    cdef Workspace table, workspace, factors
+    cdef Workspace table, numbers, integers, factors, swaps
     cdef list data
     cdef linearised_t* at
     cdef readonly Py_ssize_t n, size                    # number of impulses; length of the result of `adjoint`
 
     def __init__(self, list data, impulses, int32_t max_rows=0):
-        cdef Py_ssize_t i, n = len(data), size = 0, scratch = 1, more = 0
+        cdef Py_ssize_t i, n = len(data), scratch = 1
+        cdef arena_t arena = make_arena(NULL, NULL)
         cdef Data p
         cdef linearised_t* a
         cdef const double* lam
         cdef Py_buffer view
-        cdef double* to
-        cdef double* work
         cdef Workspace spare
         cdef list each = impulses if type(impulses) is list else None
         cdef const double[::1] flat
@@ -447,15 +434,16 @@ cdef class Linears:
                 continue
             a.valid, a.v = True, p.get_pointers()
             a.n = a.v.g.n if a.v.g != NULL else 6 * a.v.r.n_bodies if a.v.r != NULL else 0
-            size += linearisation_workspace_size(&a.v.p, count_projection_derivative_values(&a.v.p))
+            bind_linearised_arrays(a, &arena)
             scratch = max(scratch, a.v.p.n_rows + count_judge_scratch(&a.v))
-        self.workspace, spare = allocate_bytes(size * sizeof(double)), allocate_bytes(scratch * sizeof(double))
-        to = <double*>self.workspace.at
+        self.numbers, self.integers = allocate_arena(&arena)
+        spare = allocate_bytes(scratch * sizeof(double))
         for i in range(n):
             a = self.at + i
             if not a.valid:
                 continue
             p = data[i]
+            bind_linearised_arrays(a, &arena)
             memset(&view, 0, sizeof(Py_buffer))
             try:
                 if each is None:
@@ -466,21 +454,23 @@ cdef class Linears:
                 if not a.valid:
                     continue
                 with nogil:
-                    judge_and_linearise(a, lam, p.reference_energy, p.reference_velocity, to, <double*>spare.at)
+                    judge_and_linearise(a, lam, p.reference_energy, p.reference_velocity, <double*>spare.at)
             finally:
                 PyBuffer_Release(&view)
-            to += linearisation_workspace_size(&a.v.p, count_projection_derivative_values(&a.v.p))
-            if a.v.g != NULL and a.rows <= max_rows:
-                more += derivative_factor_workspace_size(a.rows)
+        arena = make_arena(NULL, NULL)
+        for i in range(n):
+            a = self.at + i
+            if a.valid and a.v.g != NULL and a.rows <= max_rows:
+                bind_derivative_factor(a, &arena)
                 scratch = max(scratch, derivative_factor_scratch_size(a.rows, &a.v))
-        self.factors, spare = allocate_bytes(more * sizeof(double)), allocate_bytes(scratch * sizeof(double))
-        to, work = <double*>self.factors.at, <double*>spare.at
+        self.factors, self.swaps = allocate_arena(&arena)
+        spare = allocate_bytes(scratch * sizeof(double))
         with nogil:
             for i in range(n):
                 a = self.at + i
                 if a.valid and a.v.g != NULL and a.rows <= max_rows:
-                    factor_derivative_system(a, &a.v, 0.0, to, work)
-                    to += derivative_factor_workspace_size(a.rows)
+                    bind_derivative_factor(a, &arena)
+                    factor_derivative_system(a, &a.v, 0.0, <double*>spare.at)
 
     def item(self, Py_ssize_t i):
         """Return item i as a `Linear`, or None if it was skipped."""
@@ -489,7 +479,9 @@ cdef class Linears:
             return None
         item = Linear.__new__(Linear)
         item.at, item.judge, item.data = self.at[i], self.data[i], self.data[i]
-        item.workspace, item.factor = self.workspace, self.factors
+        item.numbers, item.integers, item.factor, item.swap = self.numbers, self.integers, self.factors, self.swaps
+        item.rows, item.tried, item.regular = item.at.rows, item.at.tried, item.at.regular
+        item.relative, item.above_floor = item.at.relative, item.at.above_floor
         return item
 
     def skip_unsolvable(self, double max_residual):

@@ -18,8 +18,8 @@ from lavender_ext.engine.arrays import make_array_views
 
 from lavender_ext.core.block cimport compute_row_error
 from lavender_ext.core.validate cimport all_finite
-from lavender_ext.core.order cimport (RANDOM, SYMMETRIC, update_sweep_order, find_block_levels, find_body_levels,
-                                      color_blocks_by_bodies, reverse_blocks, sort_blocks_by_level)
+from lavender_ext.core.order cimport (RANDOM, SYMMETRIC, update_sweep_order, find_block_levels, color_blocks_by_bodies,
+                                      reverse_blocks, sort_blocks_by_level)
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.velocity cimport compute_velocity_change
 from lavender_ext.core.view cimport rows_t
@@ -112,8 +112,7 @@ cdef inline void set_sweep_order_of_blocks(engine_t* e) noexcept nogil:
         if mode == COLORED:
             levels = color_blocks_by_bodies(n, e.joint_body, nd, e.color_scratch, block_level)
         else:
-            levels = find_body_levels(n, e.joint_body, nd, level) + 2
-            find_block_levels(n, e.joint_body, level, block_level)
+            levels = find_block_levels(n, e.joint_body, nd, level, block_level)
         if mode == TOP_DOWN:
             for i in range(n):
                 block_level[i] = levels - 1 - block_level[i]

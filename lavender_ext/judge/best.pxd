@@ -32,7 +32,7 @@ from lavender_ext.core.csr cimport measure_asymmetry_and_bandwidth
 from lavender_ext.core.start cimport clip_zero_to_row_bounds
 from lavender_ext.core.view cimport view_t
 from lavender_ext.judge.score cimport score_t, unit_roundoff
-from lavender_ext.judge.tally cimport get_block_in_order, index_of_island_begin, index_of_island_end
+from lavender_ext.judge.tally cimport get_island_block, index_of_island_begin, index_of_island_end
 
 
 cdef struct best_t:
@@ -80,11 +80,8 @@ cdef inline void copy_score_without_islands(best_t* s, const blocks_t* p, const 
 cdef inline void copy_island_impulse(const blocks_t* p, int32_t island, const double* lam, double* out) noexcept nogil:
     """Copy the rows of an island from lam to out (m each)."""
     cdef int32_t a, i
-    if p.islands == NULL:
-        memcpy(out, lam, p.n_rows * sizeof(double))
-        return
-    for a in range(p.islands.ptr[island], p.islands.ptr[island + 1]):
-        i = p.islands.order[a]
+    for a in range(index_of_island_begin(p, island), index_of_island_end(p, island)):
+        i = get_island_block(p, a)
         memcpy(out + p.ptr[i], lam + p.ptr[i], (p.ptr[i + 1] - p.ptr[i]) * sizeof(double))
 
 
@@ -113,7 +110,7 @@ cdef inline void compute_objectives(best_t* s, const blocks_t* p, const double* 
     cdef int32_t island, a, i
     if s.by_residual:
         return
-    if p.islands == NULL:
+    if p.islands == NULL:                               # The sums over all rows have another order than the sums of blocks.
         s.objective_now[0] = objective_of_rows(p, 0, p.n_rows, lam, w)
         return
     for island in range(s.n):
@@ -150,11 +147,10 @@ cdef inline bint is_block_inside_bounds(const blocks_t* p, int32_t i, const doub
 
 cdef inline bint has_objective(const blocks_t* p, int32_t island, const double* lam) noexcept nogil:
     """Return whether lam (m) has an objective: it is inside its bounds, and rounding hides no thousandth of b."""
-    cdef const int32_t* order = p.islands.order if p.islands != NULL else NULL
     cdef int32_t a, i, k
     cdef double largest = 0.0, velocity = 0.0
     for a in range(index_of_island_begin(p, island), index_of_island_end(p, island)):
-        i = get_block_in_order(order, a)
+        i = get_island_block(p, a)
         if not is_block_inside_bounds(p, i, lam):
             return False
         for k in range(p.ptr[i], p.ptr[i + 1]):
@@ -165,11 +161,10 @@ cdef inline bint has_objective(const blocks_t* p, int32_t island, const double* 
 
 cdef inline double rounding_of_objective(const blocks_t* p, int32_t island, const double* lam, const double* w) noexcept nogil:
     """Return what rounding may change in the f of lam (m) [J]."""
-    cdef const int32_t* order = p.islands.order if p.islands != NULL else NULL
     cdef int32_t a, i, k
     cdef double size = 0.0
     for a in range(index_of_island_begin(p, island), index_of_island_end(p, island)):
-        i = get_block_in_order(order, a)
+        i = get_island_block(p, a)
         for k in range(p.ptr[i], p.ptr[i + 1]):
             size += fabs(lam[k]) * (fabs(w[k]) + fabs(p.b[k]))
     return 4.0 * unit_roundoff() * size
@@ -197,11 +192,10 @@ cdef inline bint leads_away_to_bound(const blocks_t* p, int32_t k, double lam, d
 cdef inline bint is_force_limited(const best_t* s, const blocks_t* p, int32_t island, const double* lam, const double* w,
                                   const double* e) noexcept nogil:
     """Return whether (5) holds for lam, scored in `now`, with slack w and error e (m each)."""
-    cdef const int32_t* order = p.islands.order if p.islands != NULL else NULL
     cdef int32_t a, i, k
     cdef double limited = 0.0
     for a in range(index_of_island_begin(p, island), index_of_island_end(p, island)):
-        i = get_block_in_order(order, a)
+        i = get_island_block(p, a)
         if has_independent_rows(p, i):
             for k in range(p.ptr[i], p.ptr[i + 1]):
                 if leads_away_to_bound(p, k, lam[k], w[k]):
@@ -211,12 +205,11 @@ cdef inline bint is_force_limited(const best_t* s, const blocks_t* p, int32_t is
 
 cdef inline double compute_free_velocity_error(const blocks_t* p, int32_t island, const double* w, const double* e) noexcept nogil:
     """Return V over the rows whose step leads to no finite bound [m/s], from slack w and error e (m each)."""
-    cdef const int32_t* order = p.islands.order if p.islands != NULL else NULL
     cdef int32_t a, i, k
     cdef double speed = 0.0
     cdef bint rows
     for a in range(index_of_island_begin(p, island), index_of_island_end(p, island)):
-        i = get_block_in_order(order, a)
+        i = get_island_block(p, a)
         rows = has_independent_rows(p, i)
         for k in range(p.ptr[i], p.ptr[i + 1] if rows else p.ptr[i] + 1):       # the normal alone of a contact
             if (w[k] < 0.0 and (not rows or p.upper[k] == INFINITY)) or (w[k] > 0.0 and rows and p.lower[k] == -INFINITY):
@@ -235,14 +228,13 @@ cdef inline bint is_matrix_symmetric(best_t* s, const view_t* v) noexcept nogil:
 cdef inline bint minimises_objective(best_t* s, const view_t* v, int32_t island) noexcept nogil:
     """Return whether the island's solutions minimise f: A is symmetric, and no friction is bounded by Coulomb's law."""
     cdef const blocks_t* p = &v.p
-    cdef const int32_t* order = p.islands.order if p.islands != NULL else NULL
     cdef int32_t a, g
     cdef friction_components_t q
     if s.by_residual:
         return False
     if p.law != CONE:
         for a in range(index_of_island_begin(p, island), index_of_island_end(p, island)):
-            get_friction_components(p, get_block_in_order(order, a), &q)
+            get_friction_components(p, get_island_block(p, a), &q)
             for g in range(q.n):
                 if q.friction_coefficient[g] > 0.0:
                     return False
@@ -352,7 +344,6 @@ cdef inline bint replace_stale_islands(const blocks_t* p, const double* now, dou
 
     now (n, 2) has the relative residuals of lam, at_zero is that of the zero impulse over all rows. Return whether lam changed.
     """
-    cdef const int32_t* order = p.islands.order if p.islands != NULL else NULL
     cdef int32_t island, a, i, k
     cdef double x
     cdef bint changed = False
@@ -360,7 +351,7 @@ cdef inline bint replace_stale_islands(const blocks_t* p, const double* now, dou
         if not now[2 * island] > relative_residual_at_zero(p, island, at_zero):
             continue
         for a in range(index_of_island_begin(p, island), index_of_island_end(p, island)):
-            i = get_block_in_order(order, a)
+            i = get_island_block(p, a)
             for k in range(p.ptr[i], p.ptr[i + 1]):
                 x = clip_zero_to_row_bounds(p, k) if has_independent_rows(p, i) else 0.0
                 changed |= lam[k] != x
@@ -374,7 +365,6 @@ cdef inline void store_zero_if_better(best_t* s, const view_t* v, double energy_
     energy_at_zero [sqrt J] and at_zero are E0 and the relative residual of the zero impulse over all rows.
     """
     cdef const blocks_t* p = &v.p
-    cdef const int32_t* order = p.islands.order if p.islands != NULL else NULL
     cdef int32_t i, a, k, block
     cdef double relative, energy
     cdef bint at_bound
@@ -383,7 +373,7 @@ cdef inline void store_zero_if_better(best_t* s, const view_t* v, double energy_
             continue
         at_bound = False
         for a in range(index_of_island_begin(p, i), index_of_island_end(p, i)):
-            block = get_block_in_order(order, a)
+            block = get_island_block(p, a)
             for k in range(p.ptr[block], p.ptr[block + 1]):
                 at_bound = at_bound or clip_zero_to_row_bounds(p, k) != 0.0
         if at_bound:                                    # f of the clipped zero impulse is not known without a pass.
@@ -395,6 +385,6 @@ cdef inline void store_zero_if_better(best_t* s, const view_t* v, double energy_
         s.start[i] = min(s.start[i], relative)
         s.objective[i] = 0.0
         for a in range(index_of_island_begin(p, i), index_of_island_end(p, i)):
-            block = get_block_in_order(order, a)
+            block = get_island_block(p, a)
             for k in range(p.ptr[block], p.ptr[block + 1]):
                 s.impulse[k] = 0.0

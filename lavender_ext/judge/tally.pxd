@@ -251,6 +251,11 @@ cdef inline int32_t begin_island_scores(const blocks_t* p, score_t* out) noexcep
     return p.islands.n
 
 
+cdef inline int32_t get_island_block(const blocks_t* p, int32_t a) noexcept nogil:
+    """Return the block at index `a` of the list of islands; without islands block a."""
+    return p.islands.order[a] if p.islands != NULL else a
+
+
 cdef inline int32_t index_of_island_begin(const blocks_t* p, int32_t island) noexcept nogil:
     """Return the index in `order` of the first block of an island; without islands all blocks form one."""
     return p.islands.ptr[island] if p.islands != NULL else 0
@@ -323,14 +328,13 @@ cdef inline void score_all_blocks(const blocks_t* p, const double* lam, const do
     sizes (m) is an upper bound of |A| |lam|, from which the floors are computed. If it is NULL, the floor entries are not changed.
     """
     cdef int32_t island, a, i, end, n = begin_island_scores(p, out)
-    cdef const int32_t* order = p.islands.order if p.islands != NULL else NULL
     cdef tally_t own, s = make_empty_tally()
     cdef floor_t floor, f = make_empty_floor()
     for island in range(n):
         own, floor = make_empty_tally(), make_empty_floor()
         end = index_of_island_end(p, island)
         for a in range(index_of_island_begin(p, island), end):
-            i = get_block_in_order(order, a)
+            i = get_island_block(p, a)
             compute_block_error(p, i, lam, w, e)
             add_block_error(p, i, e, &own)
             if sizes != NULL:

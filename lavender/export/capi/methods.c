@@ -137,8 +137,7 @@ static int32_t form_matrix(lav_solver *s) {
   s->q.nu = TAKE(s, double, m);
   s->q.step = TAKE(s, double, m);
   if (s->is_short) return LAV_ERROR_WORKSPACE;
-  k_expand_rows(&s->p, &s->r, jac, jac + 12 * m);
-  k_form_delassus_matrix(&s->p, &s->r, jac, jac + 12 * m, start, blocks, near, near + 2 * k + 1, near + 4 * k + 2, indptr, index, data);
+  k_form_delassus_matrix(&s->p, &s->r, start, blocks, jac, near, indptr, index, data);
   s->a.indptr = indptr;
   s->a.indices = index;
   s->a.data = data;
