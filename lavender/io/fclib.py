@@ -11,20 +11,20 @@ FCLIB's vector `w` is an offset of the velocity, not our slack. Format: Acary, B
 
 from __future__ import annotations
 
-import math
 import os
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, as_array, check_choice
+from lavender.base.arrays import FloatArray, check_choice
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.lazy_import import sparse as sp
 from lavender.io.condensed import SPARSE_ENTRY_BYTES, form_dense_a
-from lavender.io.npz import Stored, build_checked_csr
+from lavender.io.hdf5 import HDF5Reader, import_h5py, write_array, write_matrix
+from lavender.io.npz import Stored
 from lavender.io.stored import MAX_BYTES, NUMBER_BYTES, Budget, write_bytes
 from lavender.problem import Problem
 from lavender.problem.cones import Cones
@@ -39,7 +39,6 @@ PARTS = {
     GLOBAL: {"H": "nm", "M": "nn", "G": "np", "f": "n", "w": "m", "b": "p", "mu": "c", "mu_r": "c"},
 }
 BOUNDS_ROW_BYTES = 64  # [bytes] Memory that `Cones` and b need per row.
-MAX_SCALAR_CHUNK_NUMBERS = 2**17  # A scalar stored in an HDF5 chunk of more numbers than this is rejected.
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,12 +118,10 @@ class Contents:
         general = self._build_generalised_form(max_bytes) if self.form == "global" else None
         if general is not None:
             a, b = None, general.bias(-self._offset())
+        elif self.form == "local":
+            a, b = self._build_local_form()
         else:
-            a, b = (
-                self._build_local_form()
-                if self.form == "local"
-                else self._build_condensed_form(Budget(max_bytes))
-            )
+            a, b = self._build_condensed_form(Budget(max_bytes))
         c, d = len(self.mu), self.spacedim
         tangents = d - 1 if self.mu_r is None else 2
         cones = Cones.contacts(self.mu, tangents, rolling=self.mu_r) + Cones.free(len(b) - c * d)
@@ -179,16 +176,6 @@ class Contents:
     def _impulse(self, point: Mapping[str, FloatArray]) -> FloatArray:
         return np.concatenate([point["r"], point["l"]]) if "l" in point else point["r"]
 
-    def get_stored_impulse(self) -> FloatArray | None:
-        """Return the stored solution (m + p,) [N s], or None."""
-        return self._impulse(self.solution) if "r" in self.solution else None
-
-    def get_stored_slack(self) -> FloatArray | None:
-        """Return the stored u (m + p,) [m/s], zero on equations, or None."""
-        if "u" not in self.solution:
-            return None
-        return np.concatenate([self.solution["u"], np.zeros(len(self.solution.get("l", ())))])
-
 
 # -- reading --------------------------------------------------------------------------------------
 
@@ -210,11 +197,12 @@ def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
         guesses = tuple(problem.impulse_array(file._impulse(g), "guess") for g in file.guesses)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+    point = file.solution
     return Stored(
         problem,
         file.group_name,
-        impulse=file.get_stored_impulse(),
-        slack=file.get_stored_slack(),
+        impulse=file._impulse(point) if "r" in point else None,
+        slack=np.append(point["u"], np.zeros(len(point.get("l", ())))) if "u" in point else None,
         compare=file.compare,
         guesses=guesses,
         info=file.info,
@@ -223,10 +211,10 @@ def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
 
 def read_contents(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Contents:
     """Read the matrices and vectors of an FCLIB file without changing them; raises the errors of `read`."""
-    h5py = _import_h5py()
+    h5py = import_h5py()
     try:
         with h5py.File(path, "r") as file:
-            return _read_file(_Reader(h5py, file, max_bytes))
+            return _read_file(HDF5Reader(h5py, file, max_bytes))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except (OSError, KeyError, RuntimeError, ValueError, TypeError, OverflowError, MemoryError) as error:
@@ -236,174 +224,7 @@ def read_contents(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -
         ) from None
 
 
-class _Reader:
-    """Reader of the datasets of one HDF5 file; it follows no links out of the file and respects the memory limit."""
-
-    def __init__(self, h5py: Any, file: Any, max_bytes: int) -> None:
-        self.h5py, self.file, self.budget = h5py, file, Budget(max_bytes)
-
-    def find_node(self, path: str) -> Any:
-        """Return the group or dataset at a path, or None."""
-        node = self.file
-        for part in path.split("/"):
-            if not isinstance(node, self.h5py.Group):
-                return None
-            link = node.get(part, getlink=True)
-            if link is None:
-                return None
-            if not isinstance(link, self.h5py.HardLink):
-                raise InputError(
-                    f"{path} is a {type(link).__name__} to another place, and links are not followed: store "
-                    "the data in the file itself"
-                )
-            node = node[part]
-        if (
-            isinstance(node, self.h5py.Dataset)
-            and node.fletcher32
-            and node.id.chunk_iter(_stop_at_short_chunk)
-        ):
-            raise InputError(
-                f"{path} has a chunk that is shorter than its checksum, so numbers are missing; the file is "
-                "damaged: write or copy it again"
-            )
-        return node
-
-    def has_path(self, path: str) -> bool:
-        """Return whether the path exists."""
-        return self.find_node(path) is not None
-
-    def reserve_memory(self, paths: Iterable[str]) -> None:
-        """Subtract the memory that these datasets need, if they exist, from the budget."""
-        for path in paths:
-            data = self.find_node(path)
-            if isinstance(data, self.h5py.Dataset) and data.shape is not None:
-                chunk = _get_chunk_length(data) * data.dtype.itemsize
-                self.budget.reserve_bytes(data.size * max(NUMBER_BYTES, data.dtype.itemsize) + chunk, path)
-
-    def find_dataset(self, path: str, kinds: str, count: int | None = None) -> Any:
-        """Return a dataset of `count` numbers (None: any number) without reading it."""
-        data = self.find_node(path)
-        if not isinstance(data, self.h5py.Dataset):
-            raise InputError(
-                f"{path} {'is a group' if data is not None else 'is missing'}; a dataset is needed"
-            )
-        if data.is_virtual or data.external:
-            raise InputError(
-                f"{path} stores its numbers in other files, which are not read: store the numbers in the "
-                "file itself"
-            )
-        if data.dtype.kind not in kinds or data.shape is None:
-            wanted = "whole numbers" if kinds == "iu" else "numbers"
-            raise InputError(f"{path} has type {data.dtype}; {wanted} are needed")
-        if count is not None and data.size != count:
-            raise InputError(f"{path} has {data.size} entries; {count} are needed")
-        return data
-
-    def read_array(self, path: str, kinds: str, count: int | None = None) -> np.ndarray:
-        """Read a dataset as a flat array of `count` numbers (None: any number)."""
-        return np.asarray(self.find_dataset(path, kinds, count)[()]).reshape(-1)
-
-    def read_integer(self, path: str) -> int:
-        """Read a single 32-bit integer."""
-        data = self.find_dataset(path, "iu", 1)
-        if _get_chunk_length(data) > MAX_SCALAR_CHUNK_NUMBERS:
-            raise InputError(
-                f"{path} is one number stored in a chunk of {_get_chunk_length(data)}; up to "
-                f"{MAX_SCALAR_CHUNK_NUMBERS} are read: write it without chunks"
-            )
-        value = int(np.asarray(data[()]).reshape(-1)[0])
-        if not -(2**31) <= value < 2**31:
-            raise InputError(f"{path} is {value}; a signed 32-bit integer is needed")
-        return value
-
-    def read_vector(self, path: str, count: int) -> FloatArray:
-        """Read `count` finite numbers as float64."""
-        return as_array(path, self.read_array(path, "iuf", count), (count,))
-
-    def read_text(self, path: str) -> str:
-        """Read a text; return an empty one if the dataset does not exist or is not a short single text."""
-        data = self.find_node(path)
-        if not isinstance(data, self.h5py.Dataset) or data.size != 1 or data.nbytes > 2**20:
-            return ""
-        if _get_chunk_length(data) > MAX_SCALAR_CHUNK_NUMBERS:
-            return ""
-        value = data[()]
-        value = value.flat[0] if isinstance(value, np.ndarray) else value
-        return value.decode("utf-8", "replace").rstrip("\0") if isinstance(value, bytes) else str(value)
-
-    def read_matrix_shape(self, path: str) -> tuple[int, int]:
-        """Return the numbers of rows and columns that a matrix declares."""
-        m, n = (self.read_integer(f"{path}/{name}") for name in ("m", "n"))
-        if min(m, n) < 0:
-            raise InputError(f"{path} declares {m} rows and {n} columns; both must be at least 0")
-        return m, n
-
-    def read_matrix(self, path: str, shape: tuple[int | None, int | None]) -> sp.csr_array:
-        """Read a sparse matrix of the given shape; None accepts any number.
-
-        FCLIB's `nz` selects the format: -2 compressed rows, -1 compressed columns, nz >= 0 triplets with columns p and
-        rows i.
-        """
-        (m, n), nz, nzmax = (
-            self.read_matrix_shape(path),
-            self.read_integer(f"{path}/nz"),
-            self.read_integer(f"{path}/nzmax"),
-        )
-        if nzmax < 0 or nz < -2 or nz > nzmax:
-            raise InputError(
-                f"{path}: nz is {nz} and nzmax is {nzmax}; nz must be -2 (compressed rows), -1 (compressed "
-                "columns), or the number of triplets, from 0 to nzmax"
-            )
-        if any(want is not None and have != want for have, want in zip((m, n), shape, strict=True)):
-            wanted = " x ".join("any" if s is None else str(s) for s in shape)
-            raise InputError(f"{path} is {m} x {n}; {wanted} is needed")
-        x = as_array(f"{path}/x", self.read_array(f"{path}/x", "iuf"), (None,), finite=False)
-        i, p = self.read_array(f"{path}/i", "iu"), self.read_array(f"{path}/p", "iu")
-        try:
-            if nz == -2:
-                a = build_checked_csr(p, i, x, m, n)
-            elif nz == -1:
-                a = sp.csr_array(build_checked_csr(p, i, x, n, m).T)
-            else:
-                a = _build_from_triplets(p, i, x, nz, m, n)
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from None
-        as_array(f"{path}/x", a.data, (None,), copy=False)
-        return a
-
-
-def _get_chunk_length(data: Any) -> int:
-    """Return the length of a dataset's chunks: HDF5 decompresses whole chunks, even if fewer numbers are read."""
-    return math.prod(data.chunks) if data.chunks else 0
-
-
-def _stop_at_short_chunk(chunk: Any) -> bool | None:
-    """Return True if a chunk is shorter than its checksum of 4 bytes, else None, which continues the iteration.
-
-    HDF5 would read beyond the end of such a chunk.
-    """
-    return True if chunk.size < 4 else None
-
-
-def _build_from_triplets(
-    p: np.ndarray, i: np.ndarray, x: np.ndarray, nz: int, m: int, n: int
-) -> sp.csr_array:
-    """Return the matrix (m, n) of nz triplets: columns p, rows i, values x."""
-    if min(len(p), len(i), len(x)) < nz:
-        raise InputError(
-            f"nz announces {nz} triplets, but p has {len(p)} entries, i {len(i)} and x {len(x)}; at least "
-            f"{nz} are needed in each"
-        )
-    p, i, x = p[:nz], i[:nz], x[:nz]
-    if nz and (p.min() < 0 or i.min() < 0 or p.max() >= n or i.max() >= m):
-        raise InputError(
-            f"the triplets have row indices (i) or column indices (p) outside of the matrix; {m} rows and "
-            f"{n} columns are declared"
-        )
-    return sp.csr_array(sp.coo_array((x, (i.astype(np.int64), p.astype(np.int64))), shape=(m, n)))
-
-
-def _read_file(r: _Reader) -> Contents:
+def _read_file(r: HDF5Reader) -> Contents:
     """Read an open file; check all lengths and the memory limit before reading numbers."""
     present = [name for name in (LOCAL, GLOBAL, LOCAL + ROLLING, GLOBAL + ROLLING) if r.has_path(name)]
     if not present:
@@ -466,7 +287,7 @@ def _read_file(r: _Reader) -> Contents:
     )
 
 
-def _read_point(r: _Reader, group: str, n: int, m: int, p: int) -> dict[str, FloatArray]:
+def _read_point(r: HDF5Reader, group: str, n: int, m: int, p: int) -> dict[str, FloatArray]:
     """Read a solution or guess: r, and u, v and l if they are present; l is required if the problem has equations."""
     point = {"r": r.read_vector(f"{group}/r", m)}
     for name, size in (("u", m), ("v", n), ("l", p)):
@@ -477,7 +298,7 @@ def _read_point(r: _Reader, group: str, n: int, m: int, p: int) -> dict[str, Flo
     return point
 
 
-def _list_guess_groups(r: _Reader) -> list[str]:
+def _list_guess_groups(r: HDF5Reader) -> list[str]:
     """Return the names of the groups of the guesses."""
     if not r.has_path("guesses"):
         return []
@@ -508,13 +329,6 @@ def write(
     CapabilityError
         FCLIB cannot hold something of this problem; every such thing is named.
     """
-    write_contents(make_contents(problem, impulse=impulse, form=form, drop=drop), path)
-
-
-def make_contents(
-    problem: Problem, *, impulse: Any = None, form: str | None = None, drop: Collection[str] = ()
-) -> Contents:
-    """Return the contents of an FCLIB file of this problem; raises the errors of `write`."""
     if not isinstance(problem, Problem):
         raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
     if form is None:
@@ -530,28 +344,31 @@ def make_contents(
     if obstacles:
         text = "; ".join(obstacles)
         raise CapabilityError(f"FCLIB's {form} form cannot hold {text}. An .npz holds everything")
-    mu = problem.cones.mu
-    mu_r = problem.cones.rolling if problem.cones.has_rolling else None
-    spacedim = int(problem.cones.ptr[1])
-    info = {"title": problem.name}
-    points = []
+    points: list[dict[str, FloatArray]] = []
     for point in (impulse, problem.guess):
         if point is None:
+            points.append({})
             continue
         lam = problem.impulse_array(point)
-        entry = {"r": lam, "u": problem.slack(lam)}
+        points.append({"r": lam, "u": problem.slack(lam)})
         if form == "global":
-            entry["v"] = problem.velocity(lam).ravel()
-        points.append(entry)
-    solution = points[0] if impulse is not None else {}
-    guesses = tuple(points[-1:]) if problem.guess is not None else ()
+            points[-1]["v"] = problem.velocity(lam).ravel()
     if form == "local":
         parts: dict[str, Any] = {"W": problem.csr, "q": -problem.b}
     else:
         mass, v = _get_mass_and_free_velocity(problem)
         jac = problem.jacobian
         parts = {"M": mass, "H": sp.csr_array(jac.T), "f": mass @ v, "w": -(problem.b + jac @ v)}
-    return Contents(spacedim, mu, mu_r, solution=solution, guesses=guesses, info=info, **parts)
+    contents = Contents(
+        int(problem.cones.ptr[1]),
+        problem.cones.mu,
+        problem.cones.rolling if problem.cones.has_rolling else None,
+        solution=points[0],
+        guesses=tuple(points[1:]) if points[1] else (),
+        info={"title": problem.name},
+        **parts,
+    )
+    write_contents(contents, path)
 
 
 def _get_mass_and_free_velocity(problem: Problem) -> tuple[sp.csr_array, FloatArray]:
@@ -571,44 +388,35 @@ def _get_mass_and_free_velocity(problem: Problem) -> tuple[sp.csr_array, FloatAr
 
 def _list_unsupported_data(problem: Problem, form: str, drop: Collection[str]) -> list[str]:
     """Return everything of the problem that FCLIB's form cannot hold, each as a phrase for the error message."""
-    c = problem.cones
-    obstacles = []
-    if np.any(~c.is_contact):
-        free = np.isneginf(c.lower) & np.isposinf(c.upper)
-        rows = ~c.contact_rows
-        kind = "free rows" if np.all(free[rows]) else "bounded rows"
-        obstacles.append(f"blocks of bounded rows ({int(rows.sum())} {kind}; contacts only)")
-    if c.has_ellipse:
-        obstacles.append("ellipses (give problem.disk; problem.on_disk converts impulses)")
-    if c.has_box:
-        obstacles.append(
-            "boxes (FCLIB's friction is a disk: give cones.shaped('disk'), which is another law)"
-        )
-    if np.any(c.spin_rows >= 0) or c.has_round:
-        obstacles.append("torsional friction")
-    rolls = np.count_nonzero(c.rolling_rows >= 0)
-    contacts = c.n_tangents[c.is_contact]
-    if 0 < rolls < len(contacts):
-        obstacles.append(f"contacts with and without rolling rows ({rolls} of {len(contacts)}; all, or none)")
-    if problem.n_blocks == 0:
-        obstacles.append("a problem without contacts")
-    elif len(contacts) and (contacts.min() != contacts.max() or contacts[0] == 0):
-        sizes = sorted({int(t) + 1 for t in contacts})
-        obstacles.append(f"contacts of {', '.join(map(str, sizes))} rows (all 2, or all 3)")
-    if problem.friction != "coulomb":
-        obstacles.append("the 'cone' law (FCLIB means Coulomb friction: give problem.relaxed('coulomb'))")
-    if problem.names is not None and "names" not in drop:
-        obstacles.append("names of blocks (drop=('names',) leaves them out)")
-    if problem.key is not None and "key" not in drop:
-        obstacles.append("keys of blocks (drop=('key',) leaves them out)")
-    if problem.generalized is not None and problem.generalized.names is not None and "names" not in drop:
-        obstacles.append("names of velocities (drop=('names',) leaves them out)")
-    if problem.precision != "float64" and "precision" not in drop:
-        obstacles.append(f"the precision {problem.precision!r} (drop=('precision',) leaves it out)")
-    if any("\ud800" <= letter <= "\udfff" for letter in problem.name):
-        obstacles.append("half a surrogate pair in its name (give another name)")
-    if "\0" in problem.name:
-        obstacles.append("a NUL character in its name, which ends texts in FCLIB (give another name)")
+    c, general = problem.cones, problem.generalized
+    rows = ~c.contact_rows
+    is_free = np.isneginf(c.lower) & np.isposinf(c.upper)
+    kind = "free rows" if np.all(is_free[rows]) else "bounded rows"
+    tangents, rolls = c.n_tangents[c.is_contact], np.count_nonzero(c.rolling_rows >= 0)
+    sizes = np.unique(tangents) + 1
+    has_surrogate = any("\ud800" <= letter <= "\udfff" for letter in problem.name)
+    names, key, precision = (name not in drop for name in ("names", "key", "precision"))
+    table: tuple[tuple[Any, str], ...] = (
+        (rows.any(), f"blocks of bounded rows ({int(rows.sum())} {kind}; contacts only)"),
+        (c.has_ellipse, "ellipses (give problem.disk; problem.on_disk converts impulses)"),
+        (c.has_box, "boxes (FCLIB's friction is a disk: give cones.shaped('disk'), which is another law)"),
+        (np.any(c.spin_rows >= 0) or c.has_round, "torsional friction"),
+        (0 < rolls < len(tangents),
+         f"contacts with and without rolling rows ({rolls} of {len(tangents)}; all, or none)"),
+        (problem.n_blocks == 0, "a problem without contacts"),
+        (len(sizes) > 1 or 1 in sizes, f"contacts of {', '.join(map(str, sizes))} rows (all 2, or all 3)"),
+        (problem.friction != "coulomb",
+         "the 'cone' law (FCLIB means Coulomb friction: give problem.relaxed('coulomb'))"),
+        (names and problem.names is not None, "names of blocks (drop=('names',) leaves them out)"),
+        (key and problem.key is not None, "keys of blocks (drop=('key',) leaves them out)"),
+        (names and general is not None and general.names is not None,
+         "names of velocities (drop=('names',) leaves them out)"),
+        (precision and problem.precision != "float64",
+         f"the precision {problem.precision!r} (drop=('precision',) leaves it out)"),
+        (has_surrogate, "half a surrogate pair in its name (give another name)"),
+        ("\0" in problem.name, "a NUL character in its name, which ends texts in FCLIB (give another name)"),
+    )  # fmt: skip
+    obstacles = [text for is_present, text in table if is_present]
     if form == "global":
         obstacles += _list_reasons_against_global_form(problem)
     return obstacles
@@ -642,7 +450,7 @@ def write_contents(file: Contents, path: str | os.PathLike[str]) -> None:
     InputError
         The path cannot be written, or h5py is not installed.
     """
-    h5py = _import_h5py()
+    h5py = import_h5py()
     # The file is built in memory first, because HDF5 ends the process by a signal if the disk is full.
     with h5py.File("in memory", "w", driver="core", backing_store=False) as out:
         _write_file(out, file)
@@ -654,53 +462,30 @@ def write_contents(file: Contents, path: str | os.PathLike[str]) -> None:
 def _write_file(out: Any, file: Contents) -> None:
     """Write all groups of the file."""
     group = out.create_group(file.group_name)
-    _write_array(group, "spacedim", np.array([file.spacedim], np.int32))
+    write_array(group, "spacedim", np.array([file.spacedim], np.int32))
     vectors = group.create_group("vectors")
     for name, shape in PARTS[LOCAL if file.form == "local" else GLOBAL].items():
         part = getattr(file, name)
         if part is not None and len(shape) == 2:
-            _write_matrix(group.create_group(name), part)
+            write_matrix(group.create_group(name), part)
         elif part is not None:
-            _write_array(vectors, name, part)
+            write_array(vectors, name, part)
     if any(file.info.values()):
         info = group.create_group("info")
         for name in ("title", "description", "math_info"):
             text = file.info.get(name, "").encode()
-            _write_array(
+            write_array(
                 info, name, np.array(text, f"S{len(text) + 1}")
             )  # FCLIB expects strings that end in a NUL character.
     if file.solution:
         _write_point(out.create_group("solution"), file.solution)
     if file.guesses:
         guesses = out.create_group("guesses")
-        _write_array(guesses, "number_of_guesses", np.array([len(file.guesses)], np.int32))
+        write_array(guesses, "number_of_guesses", np.array([len(file.guesses)], np.int32))
         for i, guess in enumerate(file.guesses):
             _write_point(guesses.create_group(str(i + 1)), guess)
 
 
-def _write_matrix(group: Any, a: sp.csr_array) -> None:
-    for name, value in (("nzmax", a.nnz), ("m", a.shape[0]), ("n", a.shape[1]), ("nz", -2)):
-        _write_array(group, name, np.array([value], np.int32))
-    for name, array in (("p", a.indptr.astype(np.int32)), ("i", a.indices.astype(np.int32)), ("x", a.data)):
-        _write_array(group, name, array)
-
-
 def _write_point(group: Any, point: Mapping[str, FloatArray]) -> None:
     for name, value in point.items():
-        _write_array(group, name, value)
-
-
-def _write_array(group: Any, name: str, value: Any) -> None:
-    """Write an array with a checksum, so that damage is detected; HDF5 has no checksum for scalars."""
-    value = np.asarray(value)
-    group.create_dataset(name, data=value, fletcher32=bool(value.ndim and value.size))
-
-
-def _import_h5py() -> Any:
-    try:
-        import h5py
-    except ImportError:
-        raise InputError(
-            "FCLIB files are HDF5, which need h5py: pip install 'lavender-contact[fclib]' (or use .npz)"
-        ) from None
-    return h5py
+        write_array(group, name, value)

@@ -1,0 +1,209 @@
+"""Read and write datasets and sparse matrices of HDF5 files: memory is bounded before anything is read."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from lavender.base.arrays import FloatArray, as_array
+from lavender.base.errors import InputError
+from lavender.base.lazy_import import sparse as sp
+from lavender.io.npz import build_checked_csr
+from lavender.io.stored import NUMBER_BYTES, Budget
+
+MAX_SCALAR_CHUNK_NUMBERS = 2**17  # A scalar stored in an HDF5 chunk of more numbers than this is rejected.
+
+
+class HDF5Reader:
+    """Reader of the datasets of one HDF5 file; it follows no links out of the file and respects the memory limit."""
+
+    def __init__(self, h5py: Any, file: Any, max_bytes: int) -> None:
+        self.h5py, self.file, self.budget = h5py, file, Budget(max_bytes)
+
+    def find_node(self, path: str) -> Any:
+        """Return the group or dataset at a path, or None."""
+        node = self.file
+        for part in path.split("/"):
+            if not isinstance(node, self.h5py.Group):
+                return None
+            link = node.get(part, getlink=True)
+            if link is None:
+                return None
+            if not isinstance(link, self.h5py.HardLink):
+                raise InputError(
+                    f"{path} is a {type(link).__name__} to another place, and links are not followed: store "
+                    "the data in the file itself"
+                )
+            node = node[part]
+        if (
+            isinstance(node, self.h5py.Dataset)
+            and node.fletcher32
+            and node.id.chunk_iter(_stop_at_short_chunk)
+        ):
+            raise InputError(
+                f"{path} has a chunk that is shorter than its checksum, so numbers are missing; the file is "
+                "damaged: write or copy it again"
+            )
+        return node
+
+    def has_path(self, path: str) -> bool:
+        """Return whether the path exists."""
+        return self.find_node(path) is not None
+
+    def reserve_memory(self, paths: Iterable[str]) -> None:
+        """Subtract the memory that these datasets need, if they exist, from the budget."""
+        for path in paths:
+            data = self.find_node(path)
+            if isinstance(data, self.h5py.Dataset) and data.shape is not None:
+                chunk = _get_chunk_length(data) * data.dtype.itemsize
+                self.budget.reserve_bytes(data.size * max(NUMBER_BYTES, data.dtype.itemsize) + chunk, path)
+
+    def find_dataset(self, path: str, kinds: str, count: int | None = None) -> Any:
+        """Return a dataset of `count` numbers (None: any number) without reading it."""
+        data = self.find_node(path)
+        if not isinstance(data, self.h5py.Dataset):
+            raise InputError(
+                f"{path} {'is a group' if data is not None else 'is missing'}; a dataset is needed"
+            )
+        if data.is_virtual or data.external:
+            raise InputError(
+                f"{path} stores its numbers in other files, which are not read: store the numbers in the "
+                "file itself"
+            )
+        if data.dtype.kind not in kinds or data.shape is None:
+            wanted = "whole numbers" if kinds == "iu" else "numbers"
+            raise InputError(f"{path} has type {data.dtype}; {wanted} are needed")
+        if count is not None and data.size != count:
+            raise InputError(f"{path} has {data.size} entries; {count} are needed")
+        return data
+
+    def read_array(self, path: str, kinds: str, count: int | None = None) -> np.ndarray:
+        """Read a dataset as a flat array of `count` numbers (None: any number)."""
+        return np.asarray(self.find_dataset(path, kinds, count)[()]).reshape(-1)
+
+    def read_integer(self, path: str) -> int:
+        """Read a single 32-bit integer."""
+        data = self.find_dataset(path, "iu", 1)
+        if _get_chunk_length(data) > MAX_SCALAR_CHUNK_NUMBERS:
+            raise InputError(
+                f"{path} is one number stored in a chunk of {_get_chunk_length(data)}; up to "
+                f"{MAX_SCALAR_CHUNK_NUMBERS} are read: write it without chunks"
+            )
+        value = int(np.asarray(data[()]).reshape(-1)[0])
+        if not -(2**31) <= value < 2**31:
+            raise InputError(f"{path} is {value}; a signed 32-bit integer is needed")
+        return value
+
+    def read_vector(self, path: str, count: int) -> FloatArray:
+        """Read `count` finite numbers as float64."""
+        return as_array(path, self.read_array(path, "iuf", count), (count,))
+
+    def read_text(self, path: str) -> str:
+        """Read a text; return an empty one if the dataset does not exist or is not a short single text."""
+        data = self.find_node(path)
+        if not isinstance(data, self.h5py.Dataset) or data.size != 1 or data.nbytes > 2**20:
+            return ""
+        if _get_chunk_length(data) > MAX_SCALAR_CHUNK_NUMBERS:
+            return ""
+        value = data[()]
+        value = value.flat[0] if isinstance(value, np.ndarray) else value
+        return value.decode("utf-8", "replace").rstrip("\0") if isinstance(value, bytes) else str(value)
+
+    def read_matrix_shape(self, path: str) -> tuple[int, int]:
+        """Return the numbers of rows and columns that a matrix declares."""
+        m, n = (self.read_integer(f"{path}/{name}") for name in ("m", "n"))
+        if min(m, n) < 0:
+            raise InputError(f"{path} declares {m} rows and {n} columns; both must be at least 0")
+        return m, n
+
+    def read_matrix(self, path: str, shape: tuple[int | None, int | None]) -> sp.csr_array:
+        """Read a sparse matrix of the given shape; None accepts any number.
+
+        FCLIB's `nz` selects the format: -2 compressed rows, -1 compressed columns, nz >= 0 triplets with columns p and
+        rows i.
+        """
+        (m, n), nz, nzmax = (
+            self.read_matrix_shape(path),
+            self.read_integer(f"{path}/nz"),
+            self.read_integer(f"{path}/nzmax"),
+        )
+        if nzmax < 0 or nz < -2 or nz > nzmax:
+            raise InputError(
+                f"{path}: nz is {nz} and nzmax is {nzmax}; nz must be -2 (compressed rows), -1 (compressed "
+                "columns), or the number of triplets, from 0 to nzmax"
+            )
+        if any(want is not None and have != want for have, want in zip((m, n), shape, strict=True)):
+            wanted = " x ".join("any" if s is None else str(s) for s in shape)
+            raise InputError(f"{path} is {m} x {n}; {wanted} is needed")
+        x = as_array(f"{path}/x", self.read_array(f"{path}/x", "iuf"), (None,), finite=False)
+        i, p = self.read_array(f"{path}/i", "iu"), self.read_array(f"{path}/p", "iu")
+        try:
+            if nz == -2:
+                a = build_checked_csr(p, i, x, m, n)
+            elif nz == -1:
+                a = sp.csr_array(build_checked_csr(p, i, x, n, m).T)
+            else:
+                a = _build_from_triplets(p, i, x, nz, m, n)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+        as_array(f"{path}/x", a.data, (None,), copy=False)
+        return a
+
+
+def _get_chunk_length(data: Any) -> int:
+    """Return the length of a dataset's chunks: HDF5 decompresses whole chunks, even if fewer numbers are read."""
+    return math.prod(data.chunks) if data.chunks else 0
+
+
+def _stop_at_short_chunk(chunk: Any) -> bool | None:
+    """Return True if a chunk is shorter than its checksum of 4 bytes, else None, which continues the iteration.
+
+    HDF5 would read beyond the end of such a chunk.
+    """
+    return True if chunk.size < 4 else None
+
+
+def _build_from_triplets(
+    p: np.ndarray, i: np.ndarray, x: np.ndarray, nz: int, m: int, n: int
+) -> sp.csr_array:
+    """Return the matrix (m, n) of nz triplets: columns p, rows i, values x."""
+    if min(len(p), len(i), len(x)) < nz:
+        raise InputError(
+            f"nz announces {nz} triplets, but p has {len(p)} entries, i {len(i)} and x {len(x)}; at least "
+            f"{nz} are needed in each"
+        )
+    p, i, x = p[:nz], i[:nz], x[:nz]
+    if nz and (p.min() < 0 or i.min() < 0 or p.max() >= n or i.max() >= m):
+        raise InputError(
+            f"the triplets have row indices (i) or column indices (p) outside of the matrix; {m} rows and "
+            f"{n} columns are declared"
+        )
+    return sp.csr_array(sp.coo_array((x, (i.astype(np.int64), p.astype(np.int64))), shape=(m, n)))
+
+
+def write_matrix(group: Any, a: sp.csr_array) -> None:
+    """Write a matrix in compressed rows, as a group with FCLIB's names of the arrays."""
+    for name, value in (("nzmax", a.nnz), ("m", a.shape[0]), ("n", a.shape[1]), ("nz", -2)):
+        write_array(group, name, np.array([value], np.int32))
+    for name, array in (("p", a.indptr.astype(np.int32)), ("i", a.indices.astype(np.int32)), ("x", a.data)):
+        write_array(group, name, array)
+
+
+def write_array(group: Any, name: str, value: Any) -> None:
+    """Write an array with a checksum, so that damage is detected; HDF5 has no checksum for scalars."""
+    value = np.asarray(value)
+    group.create_dataset(name, data=value, fletcher32=bool(value.ndim and value.size))
+
+
+def import_h5py() -> Any:
+    """Return the module h5py; raise InputError if it is not installed."""
+    try:
+        import h5py
+    except ImportError:
+        raise InputError(
+            "FCLIB files are HDF5, which need h5py: pip install 'lavender-contact[fclib]' (or use .npz)"
+        ) from None
+    return h5py
