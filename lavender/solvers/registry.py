@@ -210,8 +210,9 @@ class SolverSpec:
     Raises
     ------
     InputError
-        An unknown law or operator, an empty set of them, an empty name, `options` that are not a mapping, `requires`
-        that is not a tuple of names, a capability that is not a bool, or a `max_iter` that is not an integer.
+        An unknown law or operator, an empty set of them, an empty name, a `factory` that cannot be called or imported,
+        `options` that are not a mapping, `requires` that is not a tuple of names, a capability that is not a bool, or a
+        `max_iter` that is not an integer.
     """
 
     name: str
@@ -249,6 +250,12 @@ class SolverSpec:
             raise InputError(f"the name of a solver is {self.name!r}; a text that is not empty is needed")
         if not isinstance(self.summary, str):
             raise InputError(f"summary of solver {self.name!r} is {self.summary!r:.80}; a text is needed")
+        parts = self.factory.split(":") if isinstance(self.factory, str) else []
+        if not callable(self.factory) and not (len(parts) == 2 and all(parts)):
+            raise InputError(
+                f"factory of solver {self.name!r} is {self.factory!r:.80}; the class of the solver, another callable "
+                "that returns it, or the text 'module:attribute' is needed"
+            )
         for name, choices in (
             ("laws", LAWS),
             ("operators", OPERATORS),

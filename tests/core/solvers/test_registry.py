@@ -138,6 +138,12 @@ def test_a_plug_in_without_update_is_prepared_anew(register):
     assert solver.solve(lv.Problem.lcp(np.eye(2), [2.0, 3.0])).impulse.tolist() == [2.0, 3.0]
 
 
+@pytest.mark.parametrize("factory", [None, object(), "module", "module:", ":Solver", "a:b:c"])
+def test_spec_with_a_factory_that_cannot_be_called_or_imported_raises(factory):
+    with pytest.raises(lv.InputError, match=r"factory of solver 'mine' is .*'module:attribute'"):
+        named("mine", factory=factory)
+
+
 # -- names ------------------------------------------------------------------------------------------
 
 
