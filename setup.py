@@ -66,7 +66,6 @@ COLD = (
     "factor/graph",
     "factor/sparse",
     "io/",
-    "newton/coupled",
 )
 
 LINK_ARGS, INLINE, LIMITS = [], [], []

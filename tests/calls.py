@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import fields, replace
-from unittest import mock
 
 import numpy as np
 import pytest
@@ -11,8 +10,8 @@ from random_problems import random_tree_parents, tree_mass
 import lavender as lv
 from lavender import registry
 from lavender.judge.certificates import check_certificate
-from lavender.solvers.newton_systems import systems
-from lavender.solvers.newton_systems.systems import make_system
+from lavender.judge.residuals import get_zero_impulse_reference
+from lavender.solvers.newton_systems.systems import MatrixSystem, make_system
 from lavender_ext.driver.driver import Driver
 
 SHORT = ("auto", "direct", "newton")
@@ -160,8 +159,8 @@ def system_in(problem, form):
     """The system of a problem; "sparse": the impulse form factored by panels whatever it costs."""
     if form != "sparse":
         return make_system(problem, form)
-    with mock.patch.multiple(systems, MAX_ALWAYS_DENSE_ROWS=0, CONE_DENSE_FRACTION=2.0, OTHER_DENSE_FRACTION=2.0):
-        system = make_system(problem, "impulse")
+    get_zero_impulse_reference(problem)
+    system = MatrixSystem(problem, may_be_dense=False)
     assert not system.dense
     return system
 

@@ -37,6 +37,7 @@ MODULES = (
     "pivot.principal",
     "factor.graph",
     "factor.linear",
+    "factor.symbolic",
     "engine.arrays",
     "engine.substep",
     "host.memory",

@@ -13,10 +13,10 @@ from lavender.base.lazy_import import sparse as sp
 from lavender.base.lu import factor_sparse_lu
 from lavender.problem import Problem
 from lavender.solvers.factors import USE_WIDE_LANES
-from lavender.solvers.newton_systems.systems import is_dense_faster
 from lavender_ext.derivative.linear import Linear
 from lavender_ext.factor.linear import LinearSystem
 from lavender_ext.factor.sparse import extract_free_part
+from lavender_ext.newton.solve import is_dense_factor_faster
 
 # G counts as singular if its smallest pivot divided by its largest pivot is below this.
 MIN_PIVOT_RATIO = 1e-12
@@ -57,7 +57,7 @@ class System:
     def __init__(self, problem: Problem, linear: Linear) -> None:
         self.problem, self.linear, self.n = problem, linear, linear.rows
         is_symmetric = self.n > MAX_KERNEL_ROWS and not linear.has_sliding_contact and problem.is_symmetric
-        if is_symmetric and not is_dense_faster(problem.csr.nnz, problem.m, True):
+        if is_symmetric and not is_dense_factor_faster(problem.csr.nnz, problem.m, True):
             factor = self._factor_symmetric
         else:
             factor = self._factor_dense if self.n <= MAX_DENSE_ROWS else self._factor_lu

@@ -51,7 +51,6 @@ from lavender.solvers.registry import Solver, SolverSpec
 from lavender.solvers.sweeping import create_stopping_test, make_claim
 from lavender_ext.accelerate import admm
 from lavender_ext.factor.linear import BACKWARD_TOLERANCE, LinearSystem
-from lavender_ext.newton.coupled import scale_matrix_entries
 from lavender_ext.newton.solve import Layout
 
 _START_RHO = 0.1  # [-] First penalty rho, relative to the unit diagonal of B; found by measurements.
@@ -122,7 +121,8 @@ class AdmmState:
             self.is_scaled, self.next_cost = True, 0.0
             return
         a = problem.csr
-        values = scale_matrix_entries(a.indptr, a.indices, a.data, 1.0 / np.sqrt(problem.d))
+        scale = 1.0 / np.sqrt(problem.d)
+        values = np.repeat(scale, np.diff(a.indptr)) * a.data * scale[a.indices]
         self.matrix = sp.csr_array((values, a.indices, a.indptr), shape=a.shape)
         self.lu = not problem.is_symmetric
         self.is_over_bodies, self.has_factor = False, True

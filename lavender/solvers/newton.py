@@ -59,12 +59,12 @@ from lavender.solvers.costs import (
     estimate_newton_cost,
 )
 from lavender.solvers.newton_systems import general
-from lavender.solvers.newton_systems.systems import System, find_bodies, make_system, use_dense_matrix
+from lavender.solvers.newton_systems.systems import System, find_bodies, make_system
 from lavender.solvers.registry import Solver, SolverSpec
 from lavender.solvers.small import NEWTON, estimate_velocity_newton_cost
 from lavender.solvers.warm_start import make_warm_start_claim, warm_start
 from lavender_ext.core.method import OUTCOMES
-from lavender_ext.newton.solve import COUNTED
+from lavender_ext.newton.solve import COUNTED, uses_dense_rows
 
 FORMS = ("auto", "velocity", "impulse")
 # The row form is used if the velocity form is estimated to cost more than this multiple of the row form.
@@ -153,7 +153,7 @@ class Newton(Solver):
                 return estimate_elimination_cost(problem, "velocity elimination")
             if problem.rows is not None and problem.rows.n_bodies > 0:
                 return estimate_elimination_cost(problem, "body elimination")
-        is_sparse = not use_dense_matrix(problem.max_entries, problem.m, problem.law == "cone")
+        is_sparse = not uses_dense_rows(problem.max_entries, problem.m, problem.law == "cone")
         return estimate_matrix_setup_cost(problem) + (estimate_analysis_cost(problem) if is_sparse else 0.0)
 
     def _estimate_min_cost(self, problem: Problem) -> float:

@@ -26,8 +26,8 @@ from lavender.solvers.costs import (
 from lavender.solvers.decisions import DECISIONS, SMALL_ROWS
 from lavender.solvers.islands import find_islands
 from lavender.solvers.newton_systems import general
-from lavender.solvers.newton_systems.systems import MAX_ALWAYS_DENSE_ROWS
 from lavender_ext.batch.many import Limits, solve_new_generalized_problem
+from lavender_ext.newton.solve import MAX_ROWS_ALWAYS_DENSE
 from lavender_ext.small.call import Islands, Rules, Small
 
 # Key in `Derived.cache` of the problem's compiled call, a `Small` or `Islands`; its value is False if there is none.
@@ -67,7 +67,7 @@ def make_limits(
     sweep = RATES["tree"], RATES["sweep row"], RATES["sweep cone"], RATES["sweep velocities"], sweeps
     step = RATES["entry"], RATES["work"]["velocities"], DECISIONS.factorisations
     row_rates = RATES["velocity row"], RATES["velocity contact row"]
-    rows = SMALL_ROWS, MAX_ALWAYS_DENSE_ROWS, DENSE_ROWS_PER_VELOCITY, VELOCITIES_OF_TWO_BODIES
+    rows = SMALL_ROWS, MAX_ROWS_ALWAYS_DENSE, DENSE_ROWS_PER_VELOCITY, VELOCITIES_OF_TWO_BODIES
     return Limits(
         np.array(
             [

@@ -102,6 +102,9 @@ cdef inline void analyse_tree(linear_t* f, int32_t n, const int32_t* lptr, const
 
 
 cdef int64_t cholesky_workspace_size(int32_t n) noexcept nogil
+cdef int32_t analyse_rows(linear_t* f, int32_t n, const int32_t* indptr, const int32_t* indices, int64_t capacity,
+                          arena_t* a) noexcept nogil
+cdef void bind_rows_values(linear_t* f, int32_t nnz, arena_t* a) noexcept nogil
 cdef double analyse_blocks(block_matrix_t* f, int32_t n, int32_t s, const int32_t* nptr, const int32_t* nind,
                            const int32_t* parent, const int32_t* lptr, arena_t* a) noexcept nogil
 cdef void bind_block_factor_indices(block_matrix_t* f, arena_t* a) noexcept nogil
@@ -133,5 +136,4 @@ cdef class LinearSystem:
     cdef readonly int64_t entries                       # number of values of L
 
     cpdef analyse(self)
-    cpdef factor_rows_of_kernel(self, data, double tiny)
     cdef int allocate_factor_memory(self, bint lu) except -1

@@ -5,9 +5,7 @@ from libc.stdint cimport int32_t, int64_t
 
 import numpy as np
 
-from lavender_ext.factor.symbolic import analyse as analyse_pattern
-
-from lavender_ext.core.arena cimport arena_t, take_doubles, take_integers
+from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles, take_integers
 from lavender_ext.core.dot cimport dot
 from lavender_ext.core.tree cimport factor_tree_matrix
 from lavender_ext.core.tree_solve cimport solve_tree_factor
@@ -22,7 +20,8 @@ from lavender_ext.factor.linear cimport (BAND, BLOCKS, CHOLESKY, DENSE, FALLBACK
 from lavender_ext.factor.sparse cimport factor_sparse, solve_sparse
 from lavender_ext.factor.supernodal cimport (panel_width, rows_below, solve_supernodes, supernodal_lu_sign,
                                              supernodal_scratch_size)
-from lavender_ext.factor.symbolic cimport list_factor_rows_by_column, find_supernodes, list_supernode_rows
+from lavender_ext.factor.symbolic cimport (find_supernodes, number_rows, order_rows, find_vertex_supernodes,
+                                           list_factor_rows_by_column, list_supernode_rows)
 
 
 #: Largest accepted backward error (3) of `linear.pxd`.
@@ -46,6 +45,63 @@ cdef inline int64_t* take_offsets(arena_t* a, int64_t count) noexcept nogil:
     """Take `count` int64 of an arena whose integers are aligned to 8 bytes."""
     take_integers(a, a.n_index % 2)
     return <int64_t*>take_integers(a, 2 * count)
+
+
+cdef int32_t analyse_rows(linear_t* f, int32_t n, const int32_t* indptr, const int32_t* indices, int64_t capacity,
+                          arena_t* a) noexcept nogil:
+    """Set order and pattern of a factor of compressed rows of a symmetric pattern, n > 0, and the cost.
+
+    The arena's integers are aligned to 8 bytes. Return 1; 0 if more than `capacity` integers are needed, at least
+    a.n_index; -1 if L has 2^31 entries or more.
+    """
+    cdef int32_t nnz = indptr[n], workspace = nnz + nnz // 4 + n + 1, count, k
+    cdef int64_t below
+    cdef supernodal_t* p = &f.rows.factor
+    cdef int64_t* outside = take_offsets(a, n)
+    cdef int32_t* begin = take_integers(a, n + 1)
+    cdef int32_t* order = take_integers(a, n)
+    cdef int32_t* size = take_integers(a, n)
+    cdef int32_t* parent = take_integers(a, n)
+    cdef int32_t* nptr = take_integers(a, n + 1)
+    cdef int32_t* lptr = take_integers(a, n + 1)
+    cdef int32_t* group = take_integers(a, n + 1)
+    cdef int32_t* nind = take_integers(a, nnz // 2 + n + 1)
+    cdef int32_t* scratch = take_integers(a, 11 * <int64_t>n + 3 + workspace)
+    cdef int32_t* lind
+    f.kind, f.n, f.rows.indptr, f.rows.indices = ROWS, n, indptr, indices
+    if a.n_index > capacity:
+        return 0
+    count = order_rows(n, indptr, indices, workspace, scratch, outside, begin, order, size, nptr, nind, parent, lptr)
+    if count < 0:
+        return -1
+    lind = take_integers(a, lptr[count] + 1)
+    if a.n_index > capacity:
+        return 0
+    k = find_vertex_supernodes(count, nptr, nind, parent, size, lptr, lind, scratch, group, &below)
+    if below > 2147483647:
+        return -1
+    p.n, p.supernodes = n, k
+    p.interrupt = NULL
+    p.order, p.position, p.supernode_of = take_integers(a, n), take_integers(a, n), take_integers(a, n)
+    p.swap, p.local_row = take_integers(a, n), take_integers(a, n)
+    p.first, p.row_ptr, p.row_indices = take_integers(a, k + 1), take_integers(a, k + 1), take_integers(a, below)
+    p.head, p.link, p.next_row = take_integers(a, k), take_integers(a, k), take_integers(a, k)
+    p.value_offset, p.upper_offset = take_offsets(a, k + 1), take_offsets(a, k + 1)
+    if a.n_index > capacity:
+        return 0
+    number_rows(n, count, begin, order, scratch, <int32_t*>p.order, <int32_t*>p.position)
+    f.cost = list_supernode_rows(k, scratch, lptr, lind, group, <int32_t*>p.first, <int32_t*>p.supernode_of, <int32_t*>p.row_ptr,
+                                 <int32_t*>p.row_indices, <int64_t*>p.value_offset, <int64_t*>p.upper_offset)
+    return 1
+
+
+cdef void bind_rows_values(linear_t* f, int32_t nnz, arena_t* a) noexcept nogil:
+    """Take the values of a matrix of nnz entries after `analyse_rows`, and of both of its factors."""
+    cdef supernodal_t* p = &f.rows.factor
+    f.rows.data, f.rows.tdata = take_doubles(a, nnz), take_doubles(a, nnz)
+    f.rows.scale, f.rows.y = take_doubles(a, f.n), take_doubles(a, f.n)
+    p.values, p.upper = take_doubles(a, p.value_offset[p.supernodes]), take_doubles(a, p.upper_offset[p.supernodes])
+    p.scratch = take_doubles(a, supernodal_scratch_size(p, True))
 
 
 cdef double analyse_blocks(block_matrix_t* f, int32_t n, int32_t s, const int32_t* nptr, const int32_t* nind,
@@ -410,30 +466,26 @@ cdef class LinearSystem:
 
     cpdef analyse(self):
         """Compute order, pattern and cost of the factor from the pattern alone; done at the first use."""
-        cdef int32_t n = self.f.n, k
-        cdef int32_t[::1] integers
-        cdef const int32_t[::1] index
-        cdef int64_t[::1] offsets
-        cdef supernodal_t* f = &self.f.rows.factor
-        cdef int32_t* p
+        cdef int32_t n = self.f.n, nnz, outcome = 0
+        cdef int64_t capacity
+        cdef int32_t[::1] index
+        cdef const int32_t[::1] indptr = self.indptr, indices = self.indices
+        cdef arena_t a
         if self.f.kind == DENSE or self.analysis is not None:
             return
-        self.analysis = analyse_pattern(self.indptr, self.indices)
-        integers, offsets, self.f.cost = self.analysis
-        k = <int32_t>(offsets.shape[0] // 2 - 1)
-        p = &integers[0]                                # The layout is that of `symbolic.analyse`.
-        f.order, f.position, f.supernode_of, f.swap, f.local_row = p, p + n, p + 2 * n, p + 3 * n, p + 4 * n
-        f.first, f.row_ptr = p + 5 * n, p + 5 * n + k + 1
-        f.head = p + 5 * n + 2 * (k + 1)
-        f.link, f.next_row, f.row_indices = f.head + k, f.head + 2 * k, f.head + 3 * k
-        f.value_offset, f.upper_offset = &offsets[0], &offsets[0] + k + 1
-        f.n, f.supernodes, f.wide = n, k, self.f.wide
-        f.interrupt = &self.python.interrupt
-        self.entries = f.value_offset[k]
-        index = self.indptr
-        self.f.rows.indptr = &index[0]
-        index = self.indices
-        self.f.rows.indices = &index[0] if index.shape[0] else NULL
+        nnz = <int32_t>indices.shape[0]
+        capacity = 50 * <int64_t>n + 8 * <int64_t>nnz
+        while outcome == 0:
+            index = np.empty(capacity + 2, np.int32)
+            a = make_arena(NULL, &index[0])
+            with nogil:
+                outcome = analyse_rows(&self.f, n, &indptr[0], &indices[0] if nnz else NULL, capacity, &a)
+            capacity = a.n_index + 10 * <int64_t>n + nnz
+        if outcome < 0:
+            raise OverflowError("the factor has 2^31 entries or more")
+        self.analysis = index
+        self.f.rows.factor.wide, self.f.rows.factor.interrupt = self.f.wide, &self.python.interrupt
+        self.entries = self.f.rows.factor.value_offset[self.f.rows.factor.supernodes]
 
     cdef int allocate_factor_memory(self, bint lu) except -1:
         """Allocate the memory that the next factorisation needs, L U or L L^T, unless it is allocated."""
@@ -468,13 +520,6 @@ cdef class LinearSystem:
             f.upper, self.f.rows.tdata = &x[0], &x[size]
             self.f.rows.tptr, self.f.rows.tind = &index[0], &index[0] + n + 2
         return 0
-
-    cpdef factor_rows_of_kernel(self, data, double tiny):
-        """Prepare compressed rows for a kernel that writes the entries to `data` (nnz,) and factors them by L L^T or L U."""
-        cdef double[::1] x = data
-        self.allocate_factor_memory(True)
-        self.data = data
-        self.f.rows.data, self.f.tiny, self.f.shift = &x[0], tiny, 0.0
 
     @property
     def n(self):
@@ -573,4 +618,4 @@ cdef class LinearSystem:
     def order(self):
         """Row (n,) that is eliminated first, second, ...; for a matrix in compressed rows."""
         self.analyse()
-        return self.analysis[0][:self.f.n]
+        return np.asarray(<int32_t[:self.f.n]><int32_t*>self.f.rows.factor.order).copy()

@@ -192,3 +192,13 @@ cdef inline double list_supernode_rows(int32_t supernodes, const int32_t* starts
         work += width * (0.5 * (<double>below * below + <double>below * width) + <double>width * width / 6.0)
     first[supernodes] = starts[group[supernodes]]
     return work
+
+
+cdef int32_t order_rows(int32_t n, const int32_t* indptr, const int32_t* indices, int32_t workspace, int32_t* scratch,
+                            int64_t* outside, int32_t* begin, int32_t* order, int32_t* size, int32_t* nptr, int32_t* nind,
+                            int32_t* parent, int32_t* lptr) noexcept nogil
+cdef int32_t find_vertex_supernodes(int32_t count, const int32_t* nptr, const int32_t* nind, const int32_t* parent,
+                            const int32_t* size, const int32_t* lptr, int32_t* lind, int32_t* scratch, int32_t* group,
+                            int64_t* below) noexcept nogil
+cdef void number_rows(int32_t n, int32_t count, const int32_t* begin, const int32_t* order, int32_t* starts,
+                          int32_t* row_order, int32_t* position) noexcept nogil

@@ -4,14 +4,12 @@ Consecutive rows with the same columns are one vertex; its size is the number of
 """
 from libc.stdint cimport int32_t, int64_t
 
-import numpy as np
-
 from lavender_ext.factor.minimum_degree cimport minimum_degree_order
-from lavender_ext.factor.symbolic cimport (apply_postorder, compute_block_elimination_tree, list_factor_rows_by_column,
-                                           find_supernodes, list_supernode_rows)
+from lavender_ext.factor.symbolic cimport (apply_postorder, compute_block_elimination_tree, find_supernodes,
+                                           list_factor_rows_by_column)
 
 
-cdef public int32_t lav_find_equal_rows(int32_t n, const int32_t* indptr, const int32_t* indices, int32_t* vertex,
+cdef int32_t find_equal_rows(int32_t n, const int32_t* indptr, const int32_t* indices, int32_t* vertex,
                                         int32_t* first) noexcept nogil:
     """Group consecutive rows with the same columns to vertices: write the vertex of each row.
 
@@ -37,7 +35,7 @@ cdef public int32_t lav_find_equal_rows(int32_t n, const int32_t* indptr, const 
     return count
 
 
-cdef public int32_t lav_find_vertex_graph(int32_t count, const int32_t* indptr, const int32_t* indices, const int32_t* vertex,
+cdef int32_t find_vertex_graph(int32_t count, const int32_t* indptr, const int32_t* indices, const int32_t* vertex,
                                           const int32_t* first, int32_t* ptr, int32_t* neighbour) noexcept nogil:
     """List the neighbours of each vertex, without itself; return the length of all lists. Columns must ascend."""
     cdef int32_t k, q, j, last, total = 0
@@ -54,7 +52,7 @@ cdef public int32_t lav_find_vertex_graph(int32_t count, const int32_t* indptr, 
     return total
 
 
-cdef public int32_t lav_order_rows(int32_t n, const int32_t* indptr, const int32_t* indices, int32_t workspace,
+cdef int32_t order_rows(int32_t n, const int32_t* indptr, const int32_t* indices, int32_t workspace,
                                    int32_t* scratch, int64_t* outside, int32_t* begin, int32_t* order, int32_t* size,
                                    int32_t* nptr, int32_t* nind, int32_t* parent, int32_t* lptr) noexcept nogil:
     """Order the vertices of a symmetric pattern for elimination, and count the columns of L.
@@ -71,15 +69,15 @@ cdef public int32_t lav_order_rows(int32_t n, const int32_t* indptr, const int32
     cdef int32_t* rank = vertex
     cdef int32_t count, i, k, total
     cdef int64_t below = 0
-    count = lav_find_equal_rows(n, indptr, indices, vertex, begin)
-    total = lav_find_vertex_graph(count, indptr, indices, vertex, begin, graph_ptr, neighbour)
+    count = find_equal_rows(n, indptr, indices, vertex, begin)
+    total = find_vertex_graph(count, indptr, indices, vertex, begin, graph_ptr, neighbour)
     for i in range(count):
         integers[i] = graph_ptr[i]
         size[i] = begin[i + 1] - begin[i]
     integers[count] = total
     minimum_degree_order(count, size, workspace, neighbour, integers, outside, head, order)
     # The order has overwritten the lists of the graph.
-    total = lav_find_vertex_graph(count, indptr, indices, vertex, begin, graph_ptr, neighbour)
+    total = find_vertex_graph(count, indptr, indices, vertex, begin, graph_ptr, neighbour)
     apply_postorder(count, graph_ptr, neighbour, order, rank, nptr, nind, parent, integers)
     for i in range(count):
         size[i] = begin[order[i] + 1] - begin[order[i]]
@@ -93,7 +91,7 @@ cdef public int32_t lav_order_rows(int32_t n, const int32_t* indptr, const int32
     return count
 
 
-cdef public int32_t lav_supernodes(int32_t count, const int32_t* nptr, const int32_t* nind, const int32_t* parent,
+cdef int32_t find_vertex_supernodes(int32_t count, const int32_t* nptr, const int32_t* nind, const int32_t* parent,
                                    const int32_t* size, const int32_t* lptr, int32_t* lind, int32_t* scratch, int32_t* group,
                                    int64_t* below) noexcept nogil:
     """Find supernodes of vertices: write their first vertices to group (count + 1); return their number.
@@ -111,7 +109,7 @@ cdef public int32_t lav_supernodes(int32_t count, const int32_t* nptr, const int
     return k
 
 
-cdef public void lav_number_rows(int32_t n, int32_t count, const int32_t* begin, const int32_t* order, int32_t* starts,
+cdef void number_rows(int32_t n, int32_t count, const int32_t* begin, const int32_t* order, int32_t* starts,
                                  int32_t* row_order, int32_t* position) noexcept nogil:
     """Write the row at each position, the position of each row, and the first position of each vertex (count + 1)."""
     cdef int32_t i, j, c = 0
@@ -122,43 +120,3 @@ cdef public void lav_number_rows(int32_t n, int32_t count, const int32_t* begin,
             position[j] = c
             c += 1
     starts[count] = n
-
-
-def analyse(indptr, indices):
-    """Return (integers, offsets, multiply-adds of L L^T) of a `supernodal_t` for a matrix with a symmetric pattern."""
-    cdef int32_t n = <int32_t>len(indptr) - 1, nnz = <int32_t>len(indices), count, k, workspace = nnz + nnz // 4 + n + 1
-    cdef const int32_t[::1] ptr = indptr, ind = indices
-    cdef const int32_t* entries = &ind[0] if nnz else NULL
-    cdef int64_t below
-    cdef double work
-    cdef int32_t[::1] scratch = np.empty(19 * n + nnz // 2 + workspace + 9, np.int32), lind, integers
-    cdef int64_t[::1] outside = np.empty(2 * n + 2, np.int64), offsets
-    cdef int32_t* begin = &scratch[0]                   # n + 1
-    cdef int32_t* order = begin + n + 1
-    cdef int32_t* size = order + n
-    cdef int32_t* parent = size + n
-    cdef int32_t* nptr = parent + n                     # n + 1
-    cdef int32_t* lptr = nptr + n + 1                   # n + 1
-    cdef int32_t* group = lptr + n + 1                  # n + 1
-    cdef int32_t* nind = group + n + 1                  # nnz / 2 + n + 1
-    cdef int32_t* s = nind + nnz // 2 + n + 1           # 11 n + 3 + workspace
-    cdef int32_t* first
-    cdef int32_t* row_ptr
-    with nogil:
-        count = lav_order_rows(n, &ptr[0], entries, workspace, s, &outside[0], begin, order, size, nptr, nind, parent, lptr)
-    if count < 0:
-        raise OverflowError("the factor has 2^31 entries or more")
-    lind = np.empty(lptr[count] + 1, np.int32)
-    with nogil:
-        k = lav_supernodes(count, nptr, nind, parent, size, lptr, &lind[0], s, group, &below)
-    if below >= 2**31:
-        raise OverflowError("the supernodes have 2^31 rows or more")
-    integer_array, offset_array = np.empty(5 * n + 5 * k + 2 + below, np.int32), np.empty(2 * k + 2, np.int64)
-    integers, offsets = integer_array, offset_array
-    first = &integers[0] + 5 * n
-    row_ptr = first + k + 1
-    with nogil:
-        lav_number_rows(n, count, begin, order, s, &integers[0], &integers[0] + n)
-        work = list_supernode_rows(k, s, lptr, &lind[0], group, first, &integers[0] + 2 * n, row_ptr, row_ptr + k + 1 + 3 * k,
-                                   &offsets[0], &offsets[0] + k + 1)
-    return integer_array, offset_array, work

@@ -1,4 +1,4 @@
-"""Newton's method over the rows of a dense A, or over bodies, as workspace, start and step (`core/method.pxd`).
+"""Newton's method over the rows of A, or over bodies, as workspace, start and step (`core/method.pxd`).
 
 The unit of work is a factorisation; a step may do one or two more than requested. After CERTIFICATE, `options_t.proven`
 = 1 ends the solve; without it the next step continues.
@@ -9,17 +9,21 @@ same method, with arrays that `newton_t` points to, and its linear systems for t
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy, memset
 
+from types import SimpleNamespace
+
 import numpy as np
 
 from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles, take_integers
 from lavender_ext.core.arrays cimport get_data_pointer, allocate_zeros
 from lavender_ext.core.method cimport (CERTIFICATE, MORE, NEEDS_WORKSPACE, UNFIT, info_t, Method, method_t, options_t,
                                        require_workspace, workspace_t)
+from lavender_ext.core.block_types cimport CONE
+from lavender_ext.core.csr cimport measure_asymmetry_and_bandwidth
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport rows_t, view_t
 from lavender_ext.factor.factors cimport block_matrix_t, has_wide
-from lavender_ext.factor.linear cimport (NO_FACTOR, LinearSystem, PythonCalls, analyse_blocks, analyse_dense,
-                                         bind_block_factor_indices, bind_block_factor_values)
+from lavender_ext.factor.linear cimport (FALLBACK, PythonCalls, analyse_blocks, bind_block_factor_indices,
+                                         bind_block_factor_values, fallback_t)
 from lavender_ext.newton.bodies cimport (bind_pattern, form_panel, form_velocity_panel, needs_lu, order_bodies, order_elements,
                                          pattern_t, use_panel)
 from lavender_ext.newton.elements cimport elements_t
@@ -29,18 +33,21 @@ from lavender_ext.newton.phases cimport begin_active_set, count_active_bound_cha
 from lavender_ext.newton.plan cimport start_newton_solve, step_newton_solve
 from lavender_ext.newton.run cimport (N_COUNTED, bind_indices, bind_values, convex_residual, newton_t, scale_problem,
                                       set_problem, set_reference, write_certificate, write_impulse)
-from lavender_ext.newton.scaling cimport index_unfixed_elements, form_scaled_matrix, is_problem_supported
+from lavender_ext.newton.rows cimport (ANY_FORM, MAX_ALWAYS_DENSE_ROWS, analyse_row_system, bind_row_values, form_row_system,
+                                       has_dense_rows, is_dense_faster)
+from lavender_ext.newton.scaling cimport index_unfixed_elements, is_problem_supported
 from lavender_ext.newton.steps cimport (begin_interior_point, form_de_saxce_matrices, take_interior_point_step,
                                         multiply_cone_duals, compute_all_normal_shifts)
-from lavender_ext.newton.system cimport (BARRIER, DENSE, NATURAL, PAIR, SPARSE, dense_workspace_size, external_t,
+from lavender_ext.newton.system cimport (BARRIER, DENSE, NATURAL, PAIR, SPARSE, external_t,
                                          multiply_by_natural_map_derivative, solve_natural_map_system,
                                          solve_natural_map_system_refined, factor_newton_system, evaluate_system_natural_map,
                                          determinant_sign, solve_newton_system, multiply_system_matrix)
 
 SYSTEMS = {"barrier": BARRIER, "pair": PAIR, "natural": NATURAL}
+#: Up to this many rows, A is stored as a full matrix.
+MAX_ROWS_ALWAYS_DENSE = MAX_ALWAYS_DENSE_ROWS
 #: Compliance eps of a path of smoothed problems, relative to d.
 COMPLIANCE = path_compliance()
-cdef double PIVOT_TOLERANCE = 1e-13     # A pivot of a sparse matrix is lost up to this multiple of its diagonal entry.
 #: Names of the counts of `Solve.counts` in the message of a solution.
 COUNTED = (
     "exchanges",
@@ -54,6 +61,19 @@ COUNTED = (
     "path steps",
     "shifted Newton steps",
 )
+
+
+def is_dense_factor_faster(double entries, double rows, bint cones):
+    """Return whether a dense factorisation of these rows and entries of A is faster than a supernodal one.
+
+    `cones` states whether the problem has the cone law.
+    """
+    return is_dense_faster(entries, rows, cones)
+
+
+def uses_dense_rows(double entries, double rows, bint cones):
+    """Return whether H of these rows and entries is stored as a full matrix."""
+    return has_dense_rows(entries, rows, cones)
 
 
 # -- the method on plain structs --------------------------------------------------------------------------------
@@ -97,37 +117,30 @@ cdef int32_t step_newton_system(const view_t* v, const options_t* o, const works
     return how
 
 
-cdef inline void bind_dense_rows(newton_t* n, int64_t m, arena_t* a) noexcept nogil:
-    """Take H and the matrix (m, m), and L L^T or L H."""
-    n.s.h, n.linear.matrix = take_doubles(a, m * m), take_doubles(a, m * m)
-    n.linear.lower = n.s.multiplied = take_doubles(a, m * m)
-
-
-cdef inline void use_dense_rows(newton_t* n, int32_t wide) noexcept nogil:
-    """Use the dense H."""
-    analyse_dense(&n.linear, n.sc.e.m)
-    n.linear.wide, n.linear.factored, n.s.form = wide, NO_FACTOR, DENSE
-
-
 cdef int32_t rows_workspace_size(const view_t* v, const options_t* o, workspace_t* r) noexcept nogil:
-    """Write the workspace sizes for the largest case: no row is fixed, and all contacts have six rows with friction."""
+    """Write the workspace of a dense A in the largest case; of a sparse A estimate the integers, and `start` finds the rest."""
     cdef newton_t n
-    cdef int64_t m = v.p.n_rows
+    cdef int64_t m = v.p.n_rows, entries = v.a.indptr[m]
     cdef arena_t a = make_arena(NULL, NULL)
     set_problem(&n, &v.p, v.a, NULL, NULL)
     take_integers(&a, head())
     bind_indices(&n, &a)
-    bind_values(&n, 6 * m, &a)
-    bind_dense_rows(&n, m, &a)
+    if m <= MAX_ALWAYS_DENSE_ROWS:
+        bind_values(&n, 6 * m, &a)                      # No row is fixed, and all contacts have six rows with friction.
+        bind_row_values(&n, m, True, &a)
+    elif not has_dense_rows(entries, m, v.p.law == CONE):
+        take_integers(&a, 60 * m + 11 * entries)
     r.n_index, r.n_real = a.n_index, a.n_real
     return is_problem_supported(&v.p)
 
 
-cdef int32_t start_newton_over_rows(const view_t* v, const options_t* o, workspace_t* r, const double* lam) noexcept nogil:
-    cdef newton_t* n = state_of(r)
+cdef inline int32_t analyse_rows_in_workspace(newton_t* n, const view_t* v, workspace_t* r) noexcept nogil:
+    """Find the elements, choose the form of A and analyse a sparse one; return MORE, NEEDS_WORKSPACE or UNFIT."""
+    cdef arena_t a = make_arena(NULL, r.index)
     cdef workspace_t need
-    cdef arena_t a = make_arena(r.real, r.index)
-    rows_workspace_size(v, o, &need)
+    cdef int32_t outcome, form = ANY_FORM
+    cdef int32_t bands[2]
+    rows_workspace_size(v, NULL, &need)
     if not require_workspace(r, need.n_index, need.n_real):
         return NEEDS_WORKSPACE
     memset(n, 0, sizeof(newton_t))
@@ -135,11 +148,32 @@ cdef int32_t start_newton_over_rows(const view_t* v, const options_t* o, workspa
     take_integers(&a, head())
     bind_indices(n, &a)
     index_unfixed_elements(&n.sc, v)
+    if v.p.n_rows > MAX_ALWAYS_DENSE_ROWS and measure_asymmetry_and_bandwidth(v.a, v.p.d, v.p.n_rows, n.linear.swap, bands) > 1e-14:
+        form = DENSE                                    # Factors of a sparse A without symmetry may lose pivots.
+    outcome = analyse_row_system(n, v.a, form, r.n_index, &a)
+    if outcome == 0:
+        r.n_index = a.n_index + v.a.indptr[v.p.n_rows]
+        return NEEDS_WORKSPACE
+    r.is_bound = outcome > 0
+    r.work = n.linear.cost
+    return MORE if r.is_bound else UNFIT
+
+
+cdef int32_t start_newton_over_rows(const view_t* v, const options_t* o, workspace_t* r, const double* lam) noexcept nogil:
+    cdef newton_t* n = state_of(r)
+    cdef arena_t counted = make_arena(NULL, NULL), a = make_arena(r.real, NULL)
+    cdef int32_t how = MORE if r.is_bound else analyse_rows_in_workspace(n, v, r)
+    if how != MORE:
+        return how
+    set_problem(n, &v.p, v.a, NULL, NULL)
+    bind_values(n, n.sc.small, &counted)
+    bind_row_values(n, n.sc.e.m, n.s.form == DENSE, &counted)
+    if not require_workspace(r, r.n_index, counted.n_real):
+        return NEEDS_WORKSPACE
     bind_values(n, n.sc.small, &a)
     scale_problem(n, v)
-    bind_dense_rows(n, n.sc.e.m, &a)
-    use_dense_rows(n, o.wide)
-    n.s.symmetric = form_scaled_matrix(&n.sc, v.a, v.p.n_rows, n.linear.swap, <double*>n.s.h)
+    bind_row_values(n, n.sc.e.m, n.s.form == DENSE, &a)
+    form_row_system(n, v.a, o.wide)
     return begin(n, o, lam)
 
 
@@ -237,13 +271,37 @@ cdef int32_t call_linear_factor(void* at, int32_t what, double eps) noexcept wit
 
 cdef void call_linear_solve(void* at, double* x) noexcept with gil:
     cdef Solve self = <Solve>at
-    cdef double[::1] view = <double[:self.m]>x
-    cdef const double[::1] solution
+    solve_by_object(self.others, self.python, x, self.m)
+
+
+cdef int32_t call_sparse_fallback(void* at) noexcept with gil:
+    cdef Solve self = <Solve>at
+    if self.python.error is not None:                   # The caller is about to raise it.
+        return 0
     try:
-        solution = self.others.solve(np.asarray(view))
-        view[:] = solution
+        self.factored = self.splu(self.sparse)
+        return 1
+    except RuntimeError:                                # The matrix is singular.
+        return 0
     except BaseException as error:
         self.python.store_error(error)
+        return 0
+
+
+cdef void solve_by_sparse_fallback(void* at, double* x) noexcept with gil:
+    cdef Solve self = <Solve>at
+    solve_by_object(self.factored, self.python, x, self.m)
+
+
+cdef inline void solve_by_object(object factored, PythonCalls python, double* x, int32_t m) noexcept:
+    """Overwrite x (m) with the solution by a Python object; an exception is stored and leaves NaN."""
+    cdef double[::1] view = <double[:m]>x
+    cdef const double[::1] solution
+    try:
+        solution = factored.solve(np.array(view))
+        view[:] = solution
+    except BaseException as error:                      # The step ends, and its caller raises the error, also for Ctrl-C.
+        python.store_error(error)
         view[:] = np.nan
 
 
@@ -319,7 +377,8 @@ cdef class Solve(Method):
     cdef PythonCalls python
     cdef list held
     cdef object others, real, index
-    cdef LinearSystem linear                            # of a sparse H
+    cdef fallback_t fallback
+    cdef object splu, sparse, factored                  # of a sparse H
     cdef readonly object keep, block, ptr, part, wptr, fixed, scale, theta, g, lower, upper, reach
     cdef readonly object v, einv, p, pair, bt           # small matrices of all elements
     cdef readonly int m
@@ -376,30 +435,58 @@ cdef class Solve(Method):
         """Set the object that factors the augmented system."""
         self.others, self.n.s.others = others, &self.calls
 
-    def use_dense_matrix(self, double[:, ::1] h, bint symmetric, bint wide):
-        """Use the dense matrix h (m, m) = H."""
-        cdef double[::1] whole = np.empty(self.m * self.m + 1)
-        cdef double[::1] lower = np.empty(dense_workspace_size(self.m, self.has_friction) + 1)
-        self.held += [h, whole, lower]
-        self.n.s.symmetric, self.n.s.h = symmetric, &h[0, 0] if self.m else NULL
-        self.n.linear.matrix, self.n.linear.lower, self.n.s.multiplied = &whole[0], &lower[0], &lower[0]
-        use_dense_rows(self.n, has_wide() if wide else 0)
+    def use_rows(self, Data matrix, bint symmetric, bint wide, splu, bint may_be_dense=True):
+        """Use H over the rows of `matrix`, dense or in compressed rows; `splu` factors the latter if pivots are lost.
 
-    def use_sparse_matrix(self, indptr, indices, values, LinearSystem linear, to, other, h, diagonal, bint symmetric):
-        """Use H in compressed rows. Its linear system `linear` has the pattern of the graph (to, other) of elements.
-
-        h has the entries of H in these rows, diagonal (m,) those on the diagonal.
+        `splu` is called with an object with data, indices and indptr, and returns one with `solve(r)`, or raises RuntimeError.
         """
-        cdef double[::1] matrix = np.empty(len(h) + 1), y = np.empty(self.m)
-        self.held += [indptr, indices, values, to, other, h, diagonal, matrix, y]
-        self.n.s.form, self.n.s.symmetric, self.n.s.y = SPARSE, symmetric, &y[0]
-        self.n.s.a.indptr, self.n.s.a.indices = <int32_t*>get_data_pointer(indptr), <int32_t*>get_data_pointer(indices)
-        self.n.s.a.data = <double*>get_data_pointer(values)
-        self.n.s.coupled.to, self.n.s.coupled.other = <int32_t*>get_data_pointer(to), <int32_t*>get_data_pointer(other)
-        self.n.s.coupled.diagonal, self.n.s.coupled.h = <int32_t*>get_data_pointer(diagonal), <double*>get_data_pointer(h)
-        linear.factor_rows_of_kernel(np.asarray(matrix)[:len(h)], PIVOT_TOLERANCE)
-        self.n.s.coupled.indptr = linear.f.rows.indptr
-        self.linear, self.n.s.linear = linear, &linear.f
+        cdef newton_t* n = self.n
+        cdef int64_t rows = self.data.blocks.n_rows, entries = matrix.csr.indptr[rows], capacity = 60 * rows + 11 * entries
+        cdef int32_t outcome = 0
+        cdef arena_t a
+        while outcome == 0:
+            index = np.empty(capacity + 2, np.int32)
+            a = make_arena(NULL, <int32_t*>get_data_pointer(index))
+            outcome = analyse_row_system(n, &matrix.csr, ANY_FORM if may_be_dense else SPARSE, capacity, &a)
+            capacity = a.n_index + entries
+        if outcome < 0:
+            raise OverflowError("the factor has 2^31 entries or more")
+        a = make_arena(NULL, NULL)
+        bind_row_values(n, n.sc.e.m, n.s.form == DENSE, &a)
+        real = np.empty(a.n_real + 1)
+        a = make_arena(<double*>get_data_pointer(real), NULL)
+        bind_row_values(n, n.sc.e.m, n.s.form == DENSE, &a)
+        with nogil:
+            form_row_system(n, &matrix.csr, has_wide() if wide else 0)
+        n.s.symmetric = symmetric
+        self.held += [matrix, index, real]
+        if n.s.form == SPARSE:
+            entries = n.s.coupled.indptr[self.m]
+            self.sparse = SimpleNamespace(data=part(real, n.linear.rows.data, entries),
+                                          indices=part(index, n.s.coupled.indices, entries),
+                                          indptr=part(index, n.s.coupled.indptr, self.m + 1))
+            self.splu, self.fallback = splu, fallback_t(<void*>self, call_sparse_fallback, solve_by_sparse_fallback)
+            n.linear.fallback, n.linear.rows.factor.interrupt = &self.fallback, &self.python.interrupt
+
+    @property
+    def is_dense(self):
+        """Whether H is stored as a full matrix."""
+        return self.n.s.form == DENSE
+
+    @property
+    def uses_fallback(self):
+        """Whether `splu` computed the last factor."""
+        return self.n.linear.factored == FALLBACK
+
+    @property
+    def cost(self):
+        """Multiply-adds of a factor L L^T over rows."""
+        return self.n.linear.cost
+
+    @property
+    def entries(self):
+        """Number of entries of a sparse H."""
+        return self.n.s.a.indptr[self.m]
 
     def jacobian(self, const int32_t[:, ::1] pair, const int32_t[::1] column=None):
         """Return K = D^-1/2 J M^-1/2 (rows, 12) of the bodies and the used columns of a body: 1, 2, 3 or all 6.
@@ -456,8 +543,6 @@ cdef class Solve(Method):
     def step(self, int work, double[::1] impulse):
         """Do `work` factorisations or a few more. Write the best impulse (rows,) to `impulse`; return the outcome."""
         Method.step(self, work, impulse)
-        if self.linear is not None:
-            self.linear.python.raise_error()
         self.python.raise_error()
         return self.how
 

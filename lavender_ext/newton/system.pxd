@@ -17,8 +17,7 @@ from lavender_ext.core.validate cimport all_finite, norm_inf
 from lavender_ext.core.dot cimport dot
 from lavender_ext.core.block_types cimport CONE
 from lavender_ext.core.view cimport csr_t
-from lavender_ext.factor.linear cimport (CHOLESKY, CHOLESKY_OR_LU, LU, NO_FACTOR, cholesky_workspace_size,
-                                         factor_linear_system_matrix,
+from lavender_ext.factor.linear cimport (CHOLESKY, CHOLESKY_OR_LU, LU, NO_FACTOR, factor_linear_system_matrix,
                                          compute_determinant_sign, solve_linear_system, solve_linear_system_checked, linear_t)
 from lavender_ext.newton.cones cimport has_lower_bound, has_upper_bound
 from lavender_ext.newton.coupled cimport form_coupled_entries, coupled_t
@@ -71,11 +70,6 @@ cdef struct system_t:
     double* t                   # (m)
     double* q                   # (m)
     double* y                   # (bodies s) BODIES, (m) SPARSE
-
-
-cdef inline int64_t dense_workspace_size(int64_t m, int32_t cones) noexcept nogil:
-    """Return the number of doubles that store L L^T, or L H if the problem has cones."""
-    return m * m if cones else cholesky_workspace_size(<int32_t>m)
 
 
 cdef inline void multiply_system_matrix(system_t* s, const double* x, double* out) noexcept nogil:
@@ -209,6 +203,10 @@ cdef inline int32_t factor_sparse(system_t* s, int32_t what, double eps) noexcep
         f.by, f.d = CHOLESKY, s.q
         for j in range(s.e.m):
             s.q[j] = f.rows.data[s.coupled.diagonal[j]]         # A pivot is compared with its diagonal entry.
+        if factor_linear_system_matrix(f) == 0 or f.fallback != NULL:
+            return f.pivots.small == 0
+        f.by = LU
+        f.d = NULL
     return factor_linear_system_matrix(f) == 0
 
 

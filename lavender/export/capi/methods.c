@@ -179,10 +179,10 @@ static int32_t start_newton(lav_solver *s) {
     s->drive.index = TAKE(s, int32_t, s->drive.n_index);
     s->drive.real = TAKE(s, double, s->drive.n_real);
     if (s->is_short) return LAV_ERROR_WORKSPACE;
-    how = s->view.a ? core_method_MORE : begin_newton(s, s->newton_options.tol, s->newton_options.budget); /* Starting with the last options gives the workspace size. */
+    how = begin_newton(s, s->newton_options.tol, s->newton_options.budget); /* Starting with the last options gives the workspace size. */
   }
   if (how == core_method_UNFIT) return LAV_ERROR_FACTOR;
-  s->driven = s->view.a == NULL;
+  s->driven = 1;
   return LAV_OK;
 }
 

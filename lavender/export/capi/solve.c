@@ -85,21 +85,11 @@ static int64_t sweeps_workspace_size(const lav_problem *q, const lav_options *o,
 
 #ifndef LAV_SWEEPS_ONLY
 static int64_t newton_workspace_size(const lav_problem *q, const lav_options *o, int32_t n_v) {
-  const int64_t m = q->n_rows, k = q->n_blocks, nv = q->n_velocities;
-  const int32_t one = LAV_CONTACT, ends[2] = {0, q->n_rows};
-  struct core_view_view_t view;
-  struct core_method_options_t newton;
-  struct core_method_workspace_t workspace;
-  csr_t none = {NULL, NULL, NULL};
+  const int64_t m = q->n_rows, k = q->n_blocks, nv = q->n_velocities, sparse = 40 * (int64_t)q->n_entries + 100 * m;
   (void)o, (void)n_v;
   if (q->form == LAV_VELOCITIES) return 60 * m + 18 * k + 2 * nv * (nv < 180 ? nv : 180) + 2048;
   if (q->form == LAV_BODIES) return 170 * m + 12 * k + 450 * (int64_t)q->n_bodies + 2048;
-  memset(&view, 0, sizeof view);
-  memset(&newton, 0, sizeof newton);
-  view.p.n_blocks = m > 0, view.p.n_rows = q->n_rows, view.p.kind = &one, view.p.ptr = ends, view.a = &none;
-  newton.method = driver_driver_NEWTON;
-  k_workspace_size(&view, &newton, &workspace);
-  return workspace.n_index / 2 + workspace.n_real + 16;
+  return 200 * m + 12 * k + (m <= 150 || 3 * m * m < sparse ? 3 * m * m : sparse) + 2048; /* A dense A needs the first, a sparse A depends on its fill. */
 }
 
 /* Workspace to form A of bodies. */

@@ -75,6 +75,7 @@ PARTS = {
             "core.order",
             "engine.newton_substep",
             "factor.linear",
+            "factor.symbolic",
             "judge.measure",
             "newton.solve",
             "newton.warm_start",

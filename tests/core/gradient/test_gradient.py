@@ -259,7 +259,9 @@ def test_every_factor_gives_the_same_gradients(kind, operator, monkeypatch):
         monkeypatch.setattr("lavender.gradient.system.MAX_KERNEL_ROWS", small)
         monkeypatch.setattr(sys.modules["lavender.gradient.derivative"], "MAX_KERNEL_ROWS", small)
         monkeypatch.setattr("lavender.gradient.system.MAX_DENSE_ROWS", dense)
-        monkeypatch.setattr("lavender.gradient.system.is_dense_faster", lambda nnz, m, cones, few=few: few == 0.0)
+        monkeypatch.setattr(
+            "lavender.gradient.system.is_dense_factor_faster", lambda nnz, m, cones, few=few: few == 0.0
+        )
         d = lv.derivative(p, solution)
         found.append(d.vjp(**weights))
     names = ["b", "lower", "mu"] + (["v_free", "J", "compliance"] if p.matrix is None else ["A"])

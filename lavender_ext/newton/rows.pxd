@@ -1,0 +1,162 @@
+"""The operator H over the rows of A, dense or in compressed rows (`coupled.pxd`): choice of the form, memory, values.
+
+`analyse_row_system` needs the elements and the pattern of A, `form_row_system` its values. Factors of a sparse matrix without
+symmetry may lose pivots, and hosts without another factorisation then use a dense H (`start_newton_over_rows`).
+"""
+from libc.stdint cimport int32_t, int64_t
+
+from lavender_ext.core.arena cimport arena_t, take_doubles, take_integers
+from lavender_ext.core.block_types cimport CONE
+from lavender_ext.core.view cimport csr_t
+from lavender_ext.factor.linear cimport NO_FACTOR, analyse_dense, analyse_rows, bind_rows_values
+from lavender_ext.newton.coupled cimport (copy_coupled_entries, coupled_t, list_coupled_rows, list_neighbours, merge_graphs,
+                                          transpose_graph)
+from lavender_ext.newton.elements cimport elements_t
+from lavender_ext.newton.run cimport newton_t
+from lavender_ext.newton.scaling cimport form_scaled_matrix, scaled_t
+from lavender_ext.newton.system cimport DENSE, SPARSE
+
+
+cdef enum:
+    ANY_FORM = -1
+    MAX_ALWAYS_DENSE_ROWS = 150     # Up to this many rows, a dense factor is faster than a sparse factor.
+    MAX_DENSE_ROWS = 6000       # A matrix with more rows is not stored as a full matrix; at this size one takes 288 MB.
+
+
+cdef inline double pivot_tolerance() noexcept nogil:
+    """Return the fraction of its diagonal entry up to which a pivot of a sparse matrix is lost."""
+    return 1e-13
+
+
+cdef inline bint is_dense_faster(double entries, double rows, bint cones) noexcept nogil:
+    """Return whether a dense factor is faster, if the fraction of nonzeros of A is above 0.4 for the cone law, else 0.25.
+
+    A full block of s^1/2 m rows has the fraction s, and a multiply-add of a dense factor costs a quarter of a sparse one. The
+    fraction is smaller for bounded rows, because dense factors contain only the free rows, and for Coulomb's law, because
+    supernodal factors of its asymmetric matrices may lose pivots.
+    """
+    return entries > (0.4 if cones else 0.25) * rows * rows
+
+
+cdef inline bint has_dense_rows(double entries, double rows, bint cones) noexcept nogil:
+    """Return whether H is stored as a full matrix."""
+    return rows <= MAX_ALWAYS_DENSE_ROWS or is_dense_faster(entries, rows, cones) and rows <= MAX_DENSE_ROWS
+
+
+cdef inline int32_t list_unfixed_entries(const scaled_t* s, int32_t rows, const csr_t* a, int32_t* place, csr_t* h) noexcept nogil:
+    """Write the columns or the data of the rows that are not fixed, unless they are NULL; return the number of entries.
+
+    place (rows) receives the index of each row among them, -1 of a fixed one.
+    """
+    cdef int32_t i, j, q, count = 0
+    for j in range(rows):
+        place[j] = -1
+    for i in range(s.e.m):
+        place[s.keep[i]] = i
+    for i in range(s.e.m):
+        if h.indptr != NULL:
+            (<int32_t*>h.indptr)[i] = count
+        for q in range(a.indptr[s.keep[i]], a.indptr[s.keep[i] + 1]):
+            j = place[a.indices[q]]
+            if j < 0:
+                continue
+            if h.indices != NULL:
+                (<int32_t*>h.indices)[count] = j
+            if h.data != NULL:
+                (<double*>h.data)[count] = s.scale[i] * a.data[q] * s.scale[j]
+            count += 1
+    if h.indptr != NULL:
+        (<int32_t*>h.indptr)[s.e.m] = count
+    return count
+
+
+cdef inline bint list_coupled_graph(const elements_t* e, const csr_t* h, coupled_t* c, int64_t capacity,
+                                    arena_t* arena) noexcept nogil:
+    """Take and list the graph of the elements that H couples in either direction; return False without the integers."""
+    cdef int32_t n = e.n, count, i, j
+    cdef int32_t* element = take_integers(arena, e.m)
+    cdef int32_t* mark = take_integers(arena, n)
+    cdef int32_t* ptr = take_integers(arena, n + 2)
+    cdef int32_t* to = take_integers(arena, n + 2)
+    cdef int32_t* near
+    cdef int32_t* other
+    c.to = take_integers(arena, n + 1)
+    if arena.n_index > capacity:
+        return False
+    for i in range(n):
+        for j in range(e.ptr[i], e.ptr[i + 1]):
+            element[j] = i
+    count = list_neighbours(e, h, element, mark, ptr, NULL)
+    near, other = take_integers(arena, count), take_integers(arena, count)
+    if arena.n_index > capacity:
+        return False
+    list_neighbours(e, h, element, mark, ptr, near)
+    transpose_graph(n, ptr, near, to, other)
+    transpose_graph(n, to, other, ptr, near)            # Neighbours now ascend.
+    c.other = take_integers(arena, merge_graphs(n, ptr, near, to, other, c.to, NULL))
+    if arena.n_index > capacity:
+        return False
+    merge_graphs(n, ptr, near, to, other, c.to, c.other)
+    return True
+
+
+cdef inline int32_t analyse_row_system(newton_t* n, const csr_t* a, int32_t form, int64_t capacity, arena_t* arena) noexcept nogil:
+    """Set the form of H, the faster one if `form` is ANY_FORM, and analyse a sparse one.
+
+    Return 1; 0 if more than `capacity` integers are needed, at least arena.n_index; -1 if the factor is too large.
+    """
+    cdef scaled_t* s = &n.sc
+    cdef coupled_t* c = &n.s.coupled
+    cdef csr_t h = csr_t(NULL, NULL, NULL)
+    cdef int32_t rows = n.problem.p.n_rows, m = s.e.m, count
+    cdef int32_t* place
+    n.s.form = DENSE
+    if form == DENSE or form == ANY_FORM and m <= MAX_ALWAYS_DENSE_ROWS or m == 0:
+        return 1
+    place = take_integers(arena, rows)
+    if arena.n_index > capacity:
+        return 0
+    count = list_unfixed_entries(s, rows, a, place, &h)
+    if form == ANY_FORM and has_dense_rows(count, m, s.e.n < m and n.problem.p.law == CONE):
+        return 1
+    n.s.form = SPARSE
+    n.s.a.indptr, n.s.a.indices = take_integers(arena, m + 1), take_integers(arena, count)
+    n.s.a.data = NULL
+    if arena.n_index > capacity:
+        return 0
+    list_unfixed_entries(s, rows, a, place, &n.s.a)
+    if not list_coupled_graph(&s.e, &n.s.a, c, capacity, arena):
+        return 0
+    c.indptr, c.diagonal = take_integers(arena, m + 1), take_integers(arena, m)
+    if arena.n_index > capacity:
+        return 0
+    count = list_coupled_rows(c, &s.e, NULL)
+    c.indices = take_integers(arena, count)
+    n.linear.rows.tptr, n.linear.rows.tind = take_integers(arena, m + 2), take_integers(arena, count)
+    if arena.n_index > capacity:
+        return 0
+    list_coupled_rows(c, &s.e, c.indices)
+    return analyse_rows(&n.linear, m, c.indptr, c.indices, capacity, arena)
+
+
+cdef inline void bind_row_values(newton_t* n, int64_t m, bint dense, arena_t* a) noexcept nogil:
+    """Take H of m rows, and the matrix with its factor."""
+    if dense:
+        n.s.h, n.linear.matrix = take_doubles(a, m * m), take_doubles(a, m * m)
+        n.linear.lower = n.s.multiplied = take_doubles(a, m * m)        # L L^T, or L H
+    else:
+        n.s.a.data, n.s.y = take_doubles(a, n.s.a.indptr[m]), take_doubles(a, m)
+        n.s.coupled.h = take_doubles(a, n.s.coupled.indptr[m])
+        bind_rows_values(&n.linear, n.s.coupled.indptr[m], a)
+
+
+cdef inline void form_row_system(newton_t* n, const csr_t* a, int32_t wide) noexcept nogil:
+    """Form H and set whether it is symmetric."""
+    n.linear.wide, n.linear.factored = wide, NO_FACTOR
+    if n.s.form == DENSE:
+        analyse_dense(&n.linear, n.sc.e.m)
+        n.s.symmetric = form_scaled_matrix(&n.sc, a, n.problem.p.n_rows, n.linear.swap, <double*>n.s.h)
+        return
+    n.linear.rows.factor.wide, n.linear.tiny, n.linear.shift = wide, pivot_tolerance(), 0.0
+    list_unfixed_entries(&n.sc, n.problem.p.n_rows, a, n.linear.swap, &n.s.a)
+    n.s.symmetric = copy_coupled_entries(&n.s.coupled, n.sc.e.m, &n.s.a, n.linear.swap)
