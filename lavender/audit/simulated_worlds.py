@@ -118,7 +118,7 @@ class Runs:
 
     @property
     def sleep_note(self) -> str:
-        """Sentence about a model whose sleep is not simulated; else empty."""
+        """Sentence about a model with sleep, which is not simulated; else empty."""
         return SLEEP_NOTE if can_sleep(*load_model(self.model)) else ""
 
     def with_start_states(self, states: Any) -> Runs:

@@ -91,7 +91,7 @@ def report(
         _list_suite()
         return
     from lavender.report.engine import read_engine_answers
-    from lavender.report.records import read
+    from lavender.report.store import read
     from lavender.report.text import format_count, list_skip_reasons
 
     for limit in options["time_budgets"]:

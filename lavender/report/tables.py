@@ -1,7 +1,7 @@
 """Make the tables of a report: group-bys of its frame of runs, with units in the names of columns.
 
-The time of a solver to a tolerance on a case is the shortest time of its runs to this or a tighter tolerance whose
-judged residual is at most the tolerance. Runs with a fixed budget do not count, since a reader cannot choose the budget
+The time of a solver to a tolerance on a case is the shortest time of its runs to this or a tighter tolerance with a
+judged residual of at most the tolerance. Runs with a fixed budget do not count, since a reader cannot choose the budget
 in advance. Single cases count from a cold start, steps of a sequence with carried impulses if the solver takes a start.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -258,12 +259,16 @@ def tabulate_engines(report: Contents) -> Frame:
         ranking = rank_solvers(report.frame[report.frame["case"].isin(cases)], report.tolerance, report.limit)
         engine = e.rank(report.records, cases, report.tolerance, report.limit)
         first = ranking.iloc[0] if len(ranking) and ranking["solved"].iloc[0] else None
+        relative = e.lines["relative"]
+        worst = e.lines.sort_values("velocity", na_position="first").iloc[-1]
         rows.append({
-            "recorded": e.folder, "steps": e.steps, "not recorded": e.left_out, "rows": e.rows,
+            "recorded": Path(e.folder).name, "steps": len(e.lines), "not recorded": e.left_out,
+            "rows": e.lines["rows"].median(),
             "engine's own": f"{e.solver}{'' if engine is None else count_solved(engine['solved'], len(cases))}",
             f"own {target} [s]": math.nan if engine is None or not engine["solved"] else engine["mean"],
-            "residual, median [-]": e.relative, "worst [-]": e.worst, "above floor": e.above_floor,
-            "stopped early": e.unconverged, "velocity error [m/s]": e.velocity, "worst row": e.where,
+            "residual, median [-]": relative.median(), "worst [-]": relative.max(),
+            "above floor": e.above_floor, "stopped early": e.unconverged,
+            "velocity error [m/s]": worst["velocity"], "worst row": worst["worst"],
             "first here": "none" if first is None else ranking.index[0],
             f"first {target} [s]": math.nan if first is None else first["mean"],
         })  # fmt: skip

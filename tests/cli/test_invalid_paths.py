@@ -30,7 +30,8 @@ from lavender.report import machine
 from lavender.report.files import summarise
 from lavender.report.findings import Report
 from lavender.report.page import render_page
-from lavender.report.records import KINDS, Skip, Store, make_file_name, to_json
+from lavender.report.records import KINDS, Skip, make_file_name, to_json
+from lavender.report.store import Store
 from lavender.report.terminal import print_report
 from lavender.report.timing import format_call
 from lavender.sim.engine import run

@@ -19,7 +19,7 @@ from worked import python
 
 import lavender as lv
 from lavender import report, suite
-from lavender.report import cases, machine, records, runner, timing, workers
+from lavender.report import cases, machine, runner, store, timing, workers
 from lavender.report.records import from_json, to_json
 from lavender.report.timing import format_call
 
@@ -299,7 +299,7 @@ def test_run_ctrl_c_keeps_the_records_that_were_made(tmp_path, plug_in):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="an open file cannot be removed there")
 def test_store_removed_file_is_an_error(tmp_path, monkeypatch):
-    monkeypatch.setattr(records, "SYNC_INTERVAL", -1.0)
+    monkeypatch.setattr(store, "SYNC_INTERVAL", -1.0)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "sub").mkdir()
     with report.Store("sub/records.jsonl") as opened:
