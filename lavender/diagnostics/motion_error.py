@@ -215,12 +215,7 @@ def _compute_error(problem: Problem, x: FloatArray, reference: FloatArray) -> Mo
 
 def _compute_velocity_change(problem: Problem, impulse: FloatArray) -> FloatArray | None:
     """Compute M^-1 J^T x (6 n,) or (nv,) [m/s, rad/s] of an impulse x (m,); None if M is not known."""
-    if problem.generalized is not None:
-        return problem.generalized.change(impulse)
-    if problem.rows is None:
-        return None
-    velocity: FloatArray = problem.rows.inverse_mass_matrix() @ (problem.jacobian.T @ impulse)
-    return velocity
+    return None if problem.matrix is not None else problem.compute_velocity_change(impulse).ravel()
 
 
 def _compute_slack_change(problem: Problem, impulse: FloatArray, velocity: FloatArray | None) -> FloatArray:

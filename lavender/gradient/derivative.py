@@ -201,9 +201,7 @@ class Derivative:
 
     def _apply_mobility(self, x: FloatArray) -> FloatArray:
         """Compute the velocity change M^-1 J^T x (nv,)."""
-        if self.problem.generalized is not None:
-            return self.problem.generalized.change(x)
-        return self._apply_inverse_mass(self._apply_jacobian_transposed(x))
+        return self.problem.compute_velocity_change(x).ravel()
 
     def _apply_a(self, x: FloatArray, transpose: bool = False) -> FloatArray:
         """Compute A x or A^T x (m,)."""

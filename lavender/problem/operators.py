@@ -344,16 +344,22 @@ class Operators(ProblemData):
         CapabilityError
             The problem was given as a matrix.
         """
-        if self.generalized is not None:
-            return self.generalized.v_free + self.generalized.change(self.impulse_array(impulse))
-        if self.rows is None:
+        general = self.rows if self.generalized is None else self.generalized
+        if general is None:
             raise CapabilityError(
                 "this problem was given as a matrix; velocities need J and M (make it with "
                 "Problem.from_rows or Problem.from_jacobian)"
             )
+        return general.v_free + self.compute_velocity_change(self.impulse_array(impulse))
+
+    def compute_velocity_change(self, impulse: FloatArray) -> FloatArray:
+        """Compute M^-1 J^T x of impulses x (m,), in the shape of `velocity`; the problem is not given as a matrix."""
+        if self.generalized is not None:
+            return self.generalized.change(impulse)
+        assert self.rows is not None
         v = np.zeros((self.rows.n_bodies, 6))
-        measure.write_velocity_change(self.data, self.impulse_array(impulse), v)
-        return self.rows.v_free + v
+        measure.write_velocity_change(self.data, impulse, v)
+        return v
 
     def start(self) -> FloatArray:
         """Return Pi(0) (m,) [N s], the zero impulse clipped to the bounds, as a new array."""
