@@ -251,8 +251,7 @@ def resolve_index(i: Any, n: int, thing: str = "world") -> int | list[int]:
     index = np.array(entries)
     if len(shape) != 1 or (index.dtype.kind not in "biu" and index.size):
         raise InputError(f"{name} is {i!r:.60}; whole numbers, or a mask, are needed")
-    positions: list[int] = np.arange(n)[index if index.size else []].tolist()
-    return positions
+    return list(map(int, np.arange(n)[index if index.size else []]))
 
 
 def check_float(
@@ -340,6 +339,8 @@ def as_csr(name: str, value: Any, *, copy: bool = True, unit: str = "", too_many
 def get_common_precision(*values: Any) -> str:
     """Return "float32" if all values that are not None are dense or sparse arrays of float32, else "float64"."""
     types = {getattr(x, "dtype", None) for x in values if x is not None}
+    if FLOAT64 in types:
+        return "float64"
     # float32 in the other byte order is a different dtype of the same precision.
     is_single = bool(types) and all(isinstance(x, np.dtype) and x.newbyteorder("=") == FLOAT32 for x in types)
     return "float32" if is_single else "float64"

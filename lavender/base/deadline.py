@@ -21,8 +21,6 @@ class TooLate(Exception):
 class Stopwatch:
     """Measures the time since its creation."""
 
-    __slots__ = ("_start",)
-
     def __init__(self) -> None:
         self._start = perf_counter()
 
