@@ -81,26 +81,18 @@ class AdmmState:
         self.factorisations = self.reported = 0
         self.watch: Any = None
         self.factor: Any = None
-        self.is_scaled = self.is_analysed = False
-        self.next_cost = 0.0  # Cost [ns] of the next step: scaling, analysis, or a factor.
+        self.next_cost = 0.0  # Cost [ns] of the next step.
+        self.next_steps = [self._scale_problem, self._analyse_matrix, self.update_factor]
 
     def scale_and_factor(self) -> None:
         """Scale, analyse and factor; raise TooLate before a step that is expected to end after the deadline."""
-        if not self.is_scaled:
-            if self.deadline.is_set:
-                self.next_cost = _estimate_scaling_cost(self.problem)
-            self._check_deadline()
-            self._scale_problem()
-        if not self.is_analysed:
-            self._check_deadline()
-            self.next_cost = self._estimate_first_factor_cost()
-            self.is_analysed = True
-        if self.factor is None:
-            self.factor = self._factor()
-
-    def _check_deadline(self) -> None:
-        if not self.deadline.fits(self.next_cost):
-            raise TooLate
+        if self.watch is None and self.deadline.is_set:
+            self.next_cost = _estimate_scaling_cost(self.problem)
+        while self.next_steps:
+            if not self.deadline.fits(self.next_cost):
+                raise TooLate
+            self.next_steps[0]()
+            del self.next_steps[0]
 
     def _scale_problem(self) -> None:
         """Build the stopping test, the splitting and the scaled form of the problem."""
@@ -117,8 +109,7 @@ class AdmmState:
             self.is_over_bodies, self.theta, self.jacobian = True, form.theta, form.jacobian
             self.body_work, self.body_solve = _count_body_work(problem), None
             self.has_factor = self.body_work <= MAX_FACTOR_WORK_PER_ENTRY * form.jacobian.nnz
-            # There is no matrix to analyse before the first factor.
-            self.is_scaled, self.next_cost = True, 0.0
+            self.next_cost = 0.0  # There is no matrix to analyse before the first factor.
             return
         a = problem.csr
         scale = 1.0 / np.sqrt(problem.d)
@@ -129,22 +120,22 @@ class AdmmState:
         if problem.m:
             self.matrix = make_pattern_symmetric(self.matrix)
             self.system = LinearSystem(get_sorted_csr_arrays(self.matrix)[:2], USE_WIDE_LANES)
-        self.is_scaled, self.next_cost = True, estimate_analysis_cost(problem) if problem.m else 0.0
+        self.next_cost = estimate_analysis_cost(problem) if problem.m else 0.0
 
-    def _estimate_first_factor_cost(self) -> float:
-        """Estimate the cost [ns] of the first factor from the structure; later costs are measured."""
+    def _analyse_matrix(self) -> None:
+        """Analyse the matrix, if there is one, and estimate the cost of the first factor; later costs are measured."""
         problem, rates = self.problem, RATES
+        self.next_cost = 0.0
         if self.is_over_bodies:
             assert problem.rows is not None
             n = 6 * problem.rows.n_bodies
             setup = rates["scipy calls"] + rates["layout entry"] * _JACOBIAN_ROW_ENTRIES * problem.m
             setup += rates["analysis entry"] * _NORMAL_ENTRIES_PER_VELOCITY * n
             work = rates["panels work"] * self.body_work if self.has_factor else 0.0
-            return float(setup + rates["form row"] * n + work)
-        if not problem.m:
-            return 0.0
-        work = (1.0 + self.lu) * _analyse_panels(self.system).cost
-        return float(rates["form row"] * problem.m + rates["panels work"] * work)
+            self.next_cost = float(setup + rates["form row"] * n + work)
+        elif problem.m:
+            work = (1.0 + self.lu) * _analyse_panels(self.system).cost
+            self.next_cost = float(rates["form row"] * problem.m + rates["panels work"] * work)
 
     @property
     def inner_iterations(self) -> int:
@@ -168,14 +159,14 @@ class AdmmState:
         """Number of iterations in which the residual falls tenfold; NaN if it does not fall."""
         return np.nan if self.watch is None else float(self.watch.sweeps_per_decade)
 
-    def _factor(self) -> tuple[Any, ...]:
-        """Return the factor, or conjugate gradients, for the present rho, and measure the time to compute it."""
-        self._check_deadline()
+    def update_factor(self) -> None:
+        """Set the factor, or conjugate gradients, for the present rho, and measure the time to compute it."""
+        if not self.deadline.fits(self.next_cost):
+            raise TooLate
         watch = Stopwatch()
-        factor = self._factor_with_fallbacks()
+        self.factor = self._factor_with_fallbacks()
         self.factorisations += self.has_factor
         self.next_cost = 1e9 * watch.elapsed_seconds
-        return factor
 
     def _factor_with_fallbacks(self) -> tuple[Any, ...]:
         """Factor the matrix. If that breaks down, try L U, then L U of the full matrix, if these are allowed.
@@ -333,7 +324,7 @@ class ADMM(Solver):
                 rho = splitting.rho
                 count -= splitting.run(impulse, count, state.factor)
                 if splitting.rho != rho:
-                    state.factor = state._factor()
+                    state.update_factor()
 
         try:
             result = make_claim(*state.watch.run_python(iterate, impulse, max_iter, tol))
