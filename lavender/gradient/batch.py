@@ -20,15 +20,7 @@ from lavender_ext.derivative.linear import Linears
 
 
 class _LazySequence(Sequence[Any]):
-    """Sequence with one object for each of n problems; an object is created at its first use.
-
-    Parameters
-    ----------
-    n : int
-        Number of problems.
-    items : dict of int to object
-        Objects that exist already.
-    """
+    """Sequence with one object for each of n problems, created at its first use; `items` holds existing objects."""
 
     def __init__(self, n: int, items: dict[int, Any]) -> None:
         self._n, self._items = n, items

@@ -534,16 +534,11 @@ class Builders(Operators):
                 "depends on them: give target or b, too"
             )
         if general is not None and any(x is not None for x in (J, M, v_free)):
-            general = (
-                general.with_jacobian(J, v_free)
-                if M is None
-                else Generalized(
-                    general.jac if J is None else J,
-                    general.mass if M is None else M,
-                    general.v_free if v_free is None else v_free,
-                    general.names,
-                )
-            )
+            if M is None:
+                general = general.with_jacobian(J, v_free)
+            else:
+                jac, free = general.jac if J is None else J, general.v_free if v_free is None else v_free
+                general = Generalized(jac, M, free, general.names)
         if general is not None and general.m != self.m:
             raise InputError(f"J has {general.m} rows; {self.m} are needed, as the problem has")
         if target is not None and general is not None:

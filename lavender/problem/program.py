@@ -524,13 +524,7 @@ def _check_bounds(lb: FloatArray, ub: FloatArray) -> None:
 
 
 def _factor_hessian(lower: Compressed, jac: Compressed, q: FloatArray) -> tuple[Generalized, bool]:
-    """Return J and M = P of (4), and whether P is singular; M is then not factored.
-
-    Raises
-    ------
-    InputError
-        P is not positive semidefinite.
-    """
+    """Return J and M = P of (4), and whether P is singular and not factored; raise InputError for an indefinite P."""
     momentum, unfactored = -q, Generalized.from_validated(jac, lower)
     definite = _factor_shifted(unfactored, np.zeros(len(q)), momentum)
     if definite is not None and definite.operator.least_pivot > MAX_SINGULAR_PIVOT:

@@ -293,13 +293,7 @@ class RowAssembly:
         return check_float(name, value, **RANGES.get(name, {}))
 
     def _check_values(self, block_type: str, values: Iterable[Any]) -> tuple[Any, ...]:
-        """Return the arguments of one block as lists and floats.
-
-        Raises
-        ------
-        InputError
-            An argument is invalid; the message names it.
-        """
+        """Return the arguments of one block as lists and floats; raise InputError at an invalid one."""
         x: dict[str, Any] = {}
         for name, value in zip(ARGUMENTS[block_type], values, strict=True):
             word = name.rstrip("?")

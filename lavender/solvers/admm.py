@@ -171,12 +171,7 @@ class AdmmState:
     def _factor_with_fallbacks(self) -> tuple[Any, ...]:
         """Factor the matrix. If that breaks down, try L U, then L U of the full matrix, if these are allowed.
 
-        Raises
-        ------
-        _Breakdown
-            No factorisation succeeds.
-        TooLate
-            The last of these factorisations would end after the deadline.
+        Raise `_Breakdown` if no factorisation succeeds, and TooLate if the last one would end after the deadline.
         """
         m, rho = self.problem.m, self.splitting.rho
         if m == 0:
