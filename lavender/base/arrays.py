@@ -435,8 +435,6 @@ def as_names(things: str, value: Any, count: int) -> tuple[str, ...]:
 
 def are_equal(x: object, y: object) -> bool:
     """Return whether two fields are equal: arrays in shape and every value, None only with None."""
-    if x is None or y is None:
-        return x is y
     if isinstance(x, np.ndarray) or isinstance(y, np.ndarray):
         return np.array_equal(x, y)  # type: ignore[arg-type]
     return bool(x == y)

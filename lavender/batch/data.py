@@ -241,11 +241,8 @@ class Batch(Sequence[Problem]):
         batch._bodies = arrays, more, {name for name, x in arrays.items() if x.ndim > n_axes[name]}
         if n:
             first = batch[0]
-            batch.shape, batch.precision = (n, first.m), first.precision
-            nv = 6 * first.rows.n_bodies if first.rows is not None else 0
-            batch.velocity_shape = (n, nv)
-            batch.at["rows"], batch.at["row"] = first.m, first.m * np.arange(n)
-            batch.at["velocities"], batch.at["velocity"] = nv, nv * np.arange(n)
+            batch.precision = first.precision
+            batch._set_equal_sizes(first.m, 6 * first.rows.n_bodies if first.rows is not None else 0)
             batch.at["blocks"] = first.cones.n_blocks
         return batch
 
@@ -255,10 +252,14 @@ class Batch(Sequence[Problem]):
         batch: Batch = object.__new__(cls)
         friction = check_choice("friction", friction, FRICTION_LAWS)
         batch._n, batch.friction, batch.precision, batch._arrays = n, friction, precision, None
-        batch.shape, batch.velocity_shape = (n, m), (n, 0)
-        batch.at = np.zeros(n, WORLD)
-        batch.at["rows"], batch.at["row"] = m, m * np.arange(n)
+        batch._set_equal_sizes(m, 0)
         return batch
+
+    def _set_equal_sizes(self, m: int, nv: int) -> None:
+        """Set shapes and offsets of worlds with m rows and nv velocities each."""
+        self.shape, self.velocity_shape = (self._n, m), (self._n, nv)
+        self.at, i = np.zeros(self._n, WORLD), np.arange(self._n)
+        self.at["rows"], self.at["row"], self.at["velocities"], self.at["velocity"] = m, m * i, nv, nv * i
 
     # Function that returns the names of a world's blocks.
     names_of: Callable[[int], Sequence[str]] | None = None
@@ -423,18 +424,10 @@ class Batch(Sequence[Problem]):
         elif self._arrays is None or self.cones.has_ellipse:
             worlds.set_from_problems([], [None] * len(self), [])
         else:
-            mass = self._arrays[1]
-            max_asymmetry = (
-                MAX_ASYMMETRY_FLOAT32 if mass is not None and mass.dtype == np.float32 else MAX_ASYMMETRY
-            )
-            worlds.set_from_arrays(
-                self._arrays,
-                (self._jac_row, self._mass_row),
-                self._pattern,
-                self.cones._blocks,
-                LAWS[self.friction],
-                max_asymmetry,
-            )
+            is_single = self._arrays[1] is not None and self._arrays[1].dtype == np.float32
+            strides, law = (self._jac_row, self._mass_row), LAWS[self.friction]
+            asymmetry = MAX_ASYMMETRY_FLOAT32 if is_single else MAX_ASYMMETRY
+            worlds.set_from_arrays(self._arrays, strides, self._pattern, self.cones._blocks, law, asymmetry)
         return worlds
 
     def _get_body_arrays(self) -> Any:

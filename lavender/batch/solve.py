@@ -256,15 +256,8 @@ class Solutions(WorldResults, Sequence[Solution]):
         except LavenderError as error:
             raise self._make_fault(i, error) from None
         start = self._impulse[self._get_rows(i)]
-        return create_unjudged(
-            problem,
-            self._spec,
-            self._options,
-            start,
-            self.tol,
-            f"{NO_STAGE_MESSAGE}, unjudged",
-            keeps_start=True,
-        )
+        message = f"{NO_STAGE_MESSAGE}, unjudged"
+        return create_unjudged(problem, self._spec, self._options, start, self.tol, message, keeps_start=True)
 
     def _make_solution(self, i: int) -> Solution:
         """Build the solution of a world that the compiled loop processed."""
@@ -273,13 +266,8 @@ class Solutions(WorldResults, Sequence[Solution]):
         impulse, late = self._impulse[self._get_rows(i)].copy(), self._worlds.code[i] == CODE["late"]
         impulse.setflags(write=False)
         status = Status.TIME_LIMIT if late else Status.CONVERGED
-        return Solution.with_late_fields(
-            impulse,
-            status,
-            self.tol,
-            self._time_per_world,
-            (self._make_postponed_fields, (i, impulse, status)),
-        )
+        rest = self._make_postponed_fields, (i, impulse, status)
+        return Solution.with_late_fields(impulse, status, self.tol, self._time_per_world, rest)
 
     def _make_postponed_fields(self, i: int, impulse: FloatArray, status: Status) -> dict[str, Any]:
         """Compute the fields of a solution that are computed only at its first access."""
@@ -393,13 +381,8 @@ def solve_many(
             return int(hand.solve_worlds(tol, *limits))
         if deadline.has_passed(0.0):
             return int(hand.judge_worlds(tol, False, True))
-        return int(
-            hand.solve_worlds(
-                tol,
-                *limits,
-                COST_PER_SECOND * (deadline.get_remaining_seconds(MIN_TIME_LIMIT) or MIN_TIME_LIMIT),
-            )
-        )
+        seconds = deadline.get_remaining_seconds(MIN_TIME_LIMIT) or MIN_TIME_LIMIT
+        return int(hand.solve_worlds(tol, *limits, COST_PER_SECOND * seconds))
 
     def solve_single(i: int) -> None:
         # Build the problem of the first late world only, so that a solver that does not accept the batch's problems
