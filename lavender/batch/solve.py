@@ -172,17 +172,18 @@ class Solutions(WorldResults, Sequence[Solution]):
             return None if self._given_starts is None else self._given_starts[self._get_rows(i)]
         return self._starts[i]
 
-    def store_late_solution(self, i: int, solution: Solution) -> None:
-        """Store a late world. Its start is judged when its numbers are read."""
-        self._solutions[i] = solution
-        self._impulse[self._get_rows(i)] = solution.impulse
-        self._late_worlds.append(i)
-
-    def store_late_start(self, i: int) -> None:
-        """Store the start of a late world of a batch. Its problem is built when its numbers are read."""
-        if self._cold:
-            self._impulse[self._get_rows(i)] = self.problems.start(i)  # type: ignore[attr-defined]
-        self._worlds.code[i] = CODE["late"]
+    def store_late_world(self, i: int, unjudged: Solution | None = None) -> None:
+        """Store a late world with its start, or an unjudged solution. It is judged when its numbers are read."""
+        if unjudged is None:
+            self._worlds.code[i] = CODE["late"]
+            start = self.get_start(i)
+            if start is None:
+                start = (
+                    self.problems.start(i) if isinstance(self.problems, Batch) else self.problems[i].start()
+                )
+        else:
+            self._solutions[i], start = unjudged, unjudged.impulse
+        self._impulse[self._get_rows(i)] = start
         self._late_worlds.append(i)
 
     def _judge_late_worlds(self) -> None:
@@ -250,7 +251,7 @@ class Solutions(WorldResults, Sequence[Solution]):
         return self._solutions[i]
 
     def _make_late_solution(self, i: int) -> Solution:
-        """Build the solution of a late world of a batch, of which nothing was read before the deadline."""
+        """Build the solution of a late world."""
         try:
             problem = self.problems[i]
         except LavenderError as error:
@@ -385,26 +386,18 @@ def solve_many(
         return int(hand.solve_worlds(tol, *limits, COST_PER_SECOND * seconds))
 
     def solve_single(i: int) -> None:
-        # Build the problem of the first late world only, so that a solver that does not accept the batch's problems
-        # raises an error.
-        is_further_world = (
-            isinstance(worlds, Batch) and solutions._late_worlds and solutions._worlds.code[i] != CODE["bad"]
-        )
-        if is_further_world and deadline.has_passed():
-            solutions.store_late_start(i)
+        is_batch, code = isinstance(worlds, Batch), solutions._worlds.code[i]
+        if deadline.is_set and not is_batch:
+            deadline.reserve_seconds(-1e-9 * RATES["late world"])
+        if deadline.has_passed():
+            # Of a batch, build the problem of the first late world only, so that a solver that does not accept the
+            # batch's problems raises an error.
+            if not (is_batch and solutions._late_worlds and code != CODE["bad"]):
+                check_accepted(worlds[i], spec, deadline)
+            solutions.store_late_world(i)
             return
         problem, start = worlds[i], solutions.get_start(i)
-        has_failed = solutions._worlds.code[i] == CODE["tried"]
-        if deadline.is_set:
-            if not isinstance(worlds, Batch):
-                deadline.reserve_seconds(-1e-9 * RATES["late world"])
-            if deadline.has_passed():
-                check_accepted(problem, spec, deadline)
-                unsolved = create_unjudged(
-                    problem, spec, named, start, tol, f"{NO_STAGE_MESSAGE}, unjudged", keeps_start=True
-                )
-                solutions.store_late_solution(i, unsolved)
-                return
+        has_failed = code == CODE["tried"]
         if has_failed:
             own = Deadline(deadline.get_remaining_seconds(MIN_TIME_LIMIT)) if deadline.is_set else None
             counts = solutions._get_counts(problem, i)
@@ -415,7 +408,7 @@ def solve_many(
             # Even the choice between start and zero impulse would take time from later worlds.
             solution = keep_unjudged_start(solve(problem, solver, impulse=start, time_limit=left, **more))
         is_judged = solution.status is not Status.TIME_LIMIT or "residual" in vars(solution)
-        store = solutions.store_solution if is_judged else solutions.store_late_solution
+        store = solutions.store_solution if is_judged else solutions.store_late_world
         store(i, solution if "callback" in options else raise_if_interrupted(solution))
 
     begin = perf_counter()
