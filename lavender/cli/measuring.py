@@ -5,9 +5,9 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from lavender.report import Event, Item, Plan, Records
     from lavender.report.summary_page import SummaryPage
 
-    P = TypeVar("P", bound=Plan)
 
 PROGRESS_INTERVAL = 10.0  # [s] Time between two lines of progress if the output is not a terminal.
 REDRAW_INTERVAL = 0.25  # [s] Time between two updates of the line on a terminal.
@@ -65,18 +64,6 @@ def check_named_problems_load(items: Sequence[Item]) -> None:
             item.release_problem()
 
 
-def make_plan(options: Mapping[str, Any], kind: type[P], **more: Any) -> P:
-    """Make a plan of class `kind` from the values of `PLAN_OPTIONS`; options that are None keep the plan's default.
-
-    Raises
-    ------
-    InputError
-        A tolerance, budget or limit is invalid.
-    """
-    names = ("tolerances", "budgets", "orders")
-    return kind(**{name: options[name] for name in names if options[name] is not None}, **more)
-
-
 def is_campaign(context: click.Context) -> bool:
     """Return whether the options ask for a campaign: workers that measure errors and robustness but no times."""
     return is_option_set(context, "workers") or is_option_set(context, "backend")
@@ -99,14 +86,7 @@ def measure_files(
     limit_to_one_thread()
     options = context.params
     report.select_solver_names(options["solvers"])  # Reject unknown names before a problem is loaded.
-    more: dict[str, Any] = {}
-    plan: Plan
-    if is_campaign(context):
-        workers = options["workers"] if is_option_set(context, "workers") else -1
-        more = {"workers": workers, "backend": options["backend"]}
-        plan = make_plan({**options, "orders": options["orders"] or ()}, report.CampaignPlan)
-    else:
-        plan = _make_timed_plan(options, files)
+    plan, workers = _make_plan(context, files)
     reused = 0
     with report.Store(path) as store:
         items = report.resolve_sources(list(files), options["sequence"])
@@ -123,11 +103,9 @@ def measure_files(
 
         stopped = False
         try:
-            memory = convert_gigabytes_to_bytes(options["memory"])
-            reuse = not options["no_reuse"]
             report.run(
-                items, options["solvers"], plan, store, watch=count_event, memory=memory, into=measured,
-                reuse=reuse, **more,
+                items, options["solvers"], plan, store, watch=count_event, into=measured,
+                memory=convert_gigabytes_to_bytes(options["memory"]), reuse=not options["no_reuse"], **workers,
             )  # fmt: skip
         except KeyboardInterrupt:
             if not measured:
@@ -140,22 +118,23 @@ def measure_files(
     return Measured(measured[0], stopped, note)
 
 
-def _make_timed_plan(options: Mapping[str, Any], files: Sequence[str]) -> Plan:
-    """Make the plan of a report that measures times."""
-    from lavender.report import Plan
+def _make_plan(context: click.Context, files: Sequence[str]) -> tuple[Plan, dict[str, Any]]:
+    """Return the plan of a report, and the workers of a campaign as arguments of `lavender.report.run`."""
+    from lavender.report import CampaignPlan, Plan
 
+    options = context.params
+    names = ("tolerances", "budgets", "orders")
+    values = {name: options[name] for name in names if options[name] is not None}
+    if is_campaign(context):
+        workers = options["workers"] if is_option_set(context, "workers") else -1
+        return CampaignPlan(**{"orders": (), **values}), {"workers": workers, "backend": options["backend"]}
     if options["sequence"] and not files:
         raise InputError("--sequence needs a folder of problem files, one for each step")
-    limits = (
-        {"sequence_time_limit": options["sequence_time_limit"]}
-        if options["sequence_time_limit"] is not None
-        else {}
-    )
+    if options["sequence_time_limit"] is not None:
+        values["sequence_time_limit"] = options["sequence_time_limit"]
     # Without files, the built-in suite runs; with the shorter time limit it takes about a minute.
-    limits["time_limit"] = (
-        (1.0 if files else 0.25) if options["time_limit"] is None else options["time_limit"]
-    )
-    return make_plan(options, Plan, repeats=options["repeats"], **limits)
+    limit = (1.0 if files else 0.25) if options["time_limit"] is None else options["time_limit"]
+    return Plan(**values, repeats=options["repeats"], time_limit=limit), {}
 
 
 def show_page(page: SummaryPage, folder: Path) -> None:
