@@ -15,30 +15,8 @@ Multiplication by the time step dt gives the same problem in impulses and veloci
 
 The problem holds J and M unchanged (`Problem.generalized`), and R as its compliance. With `integrator="discrete"`, M
 is MuJoCo's matrix M + h D + h^2 K of dampings D and stiffnesses K (`lavender.io.mujoco_discrete`). Rows keep MuJoCo's
-order. The constraints become these blocks:
-
-| MuJoCo | block |
-|---|---|
-| equality | one ROW block of its 1 to 6 rows, unbounded; for a flex, one block for each edge |
-| friction loss of a joint or tendon | ROW, abs(lambda) <= dt frictionloss |
-| limit of a joint or tendon; `condim="1"` | ROW, or a contact with only a normal row: lambda >= 0 |
-| elliptic cone, `condim="3"` | CONTACT: normal (from geom 1 to geom 2), two tangents, mu = friction[0] |
-| elliptic cone, `condim="4"`, `"6"` | ROUND: normal, two tangents, torsion, then two rolling rows, in one cone |
-| pyramidal cone, any condim | its edges as ROWs with lambda >= 0: MuJoCo's own linear complementarity problem |
-
-If the friction coefficients of a contact differ, its cone is an ellipsoid. Rows of tangents are then scaled by
-friction[j] / friction[0], which makes the cone round without changing the problem. `scaling(model, data)` returns the
-factors; `impulse` uses them.
-
-Differences from rigid contact with Coulomb friction:
-
-- MuJoCo's constraints are soft: R is compliance, and no row is rigid. `solref` and `solimp` are contained in R and
-  aref.
-- MuJoCo's friction is the convex relaxation, so the law is "cone". `problem.relaxed("coulomb")` returns the problem
-  with Coulomb's law if no contact has more than two tangents.
-- MuJoCo evaluates accelerations at the start of the step: v + dt a is the velocity after the step only for the
-  integrators "discrete" and, without implicit damping, "Euler". The pass of `noslip_iterations` follows the solve and
-  is not part of the problem.
+order; tangents of a contact with different coefficients are scaled by friction[j] / friction[0], so that its cone is
+round. `docs/mujoco.md` lists the block of each constraint and the differences from rigid contact.
 
 The data are checked for consistency: every index before it is used; M a0 must equal the smooth force and 1 / R must
 equal efc_D; J must reproduce efc_vel, efc_b and qfrc_constraint. Data of a problem with another matrix are rejected.
@@ -405,46 +383,45 @@ def _make_block_names(
     `joined` rows has a block for each row.
     """
     types, ids, contacts = ints[:m].tolist(), ints[m : 2 * m].tolist(), (len(ints) - 2 * m) // 3
-    dim = ints[2 * m : 2 * m + contacts]
-    geom = ints[2 * m + contacts : 2 * m + 3 * contacts].reshape(-1, 2)
+    dim, geom = ints[2 * m : 2 * m + contacts], ints[2 * m + contacts :].reshape(-1, 2)
     kinds = mj.mjtConstraint
+    single_rows = {
+        int(kinds.mjCNSTR_FRICTION_TENDON): ("friction", "tendon"),
+        int(kinds.mjCNSTR_LIMIT_JOINT): ("limit", "joint"),
+        int(kinds.mjCNSTR_LIMIT_TENDON): ("limit", "tendon"),
+    }
+
+    def get_name(kind: str, i: int) -> str:
+        own_name = mj.mj_id2name(model, getattr(mj.mjtObj, f"mjOBJ_{kind.upper()}"), i)
+        return f"{kind} {own_name or i}"
+
     names: list[str] = []
     i = 0
-    while i < len(types):
+    while i < m:
         row_type, which = types[i], ids[i]
-        size = 1
+        size, has_edges = 1, False
         if row_type == kinds.mjCNSTR_EQUALITY:
-            while i + size < len(types) and types[i + size] == row_type and ids[i + size] == which:
+            while i + size < m and types[i + size] == row_type and ids[i + size] == which:
                 size += 1
-            name = _get_object_name(mj, model, "EQUALITY", which, "equality")
-            names += [name] if size <= joined else [f"{name}, edge {edge}" for edge in range(size)]
+            name, has_edges = get_name("equality", which), size > joined
         elif row_type == kinds.mjCNSTR_FRICTION_DOF:
             joint = int(model.dof_jntid[which])
             axis = which - int(model.jnt_dofadr[joint])
             is_rotational = int(model.jnt_type[joint]) < int(mj.mjtJoint.mjJNT_SLIDE)
-            suffix = f", axis {axis}" if is_rotational else ""
-            names.append(f"friction of {_get_object_name(mj, model, 'JOINT', joint, 'joint')}{suffix}")
-        elif row_type == kinds.mjCNSTR_FRICTION_TENDON:
-            names.append(f"friction of {_get_object_name(mj, model, 'TENDON', which, 'tendon')}")
-        elif row_type in (kinds.mjCNSTR_LIMIT_JOINT, kinds.mjCNSTR_LIMIT_TENDON):
-            word = "joint" if row_type == kinds.mjCNSTR_LIMIT_JOINT else "tendon"
-            names.append(f"limit of {_get_object_name(mj, model, word.upper(), which, word)}")
+            name = f"friction of {get_name('joint', joint)}" + (f", axis {axis}" if is_rotational else "")
+        elif row_type in single_rows:
+            word, kind = single_rows[row_type]
+            name = f"{word} of {get_name(kind, which)}"
         else:
             sides = [
-                _get_object_name(mj, model, "GEOM", g, "geom") if g >= 0 else "flex"
-                for g in geom[which].tolist()
+                get_name("geom", g).removeprefix("geom ") if g >= 0 else "flex" for g in geom[which].tolist()
             ]
-            name = f"contact {which} ({', '.join(side.removeprefix('geom ') for side in sides)})"
-            if row_type == kinds.mjCNSTR_CONTACT_PYRAMIDAL:
-                size = 2 * (int(dim[which]) - 1)
-                names += [f"{name}, edge {edge}" for edge in range(size)]
-            else:
-                size = int(dim[which]) if row_type == kinds.mjCNSTR_CONTACT_ELLIPTIC else 1
-                names.append(name)
+            name, has_edges = (
+                f"contact {which} ({', '.join(sides)})",
+                row_type == kinds.mjCNSTR_CONTACT_PYRAMIDAL,
+            )
+            if row_type != kinds.mjCNSTR_CONTACT_FRICTIONLESS:
+                size = 2 * (int(dim[which]) - 1) if has_edges else int(dim[which])
+        names += [f"{name}, edge {edge}" for edge in range(size)] if has_edges else [name]
         i += size
     return names
-
-
-def _get_object_name(mj: Any, model: Any, kind: str, which: int, word: str) -> str:
-    own_name = mj.mj_id2name(model, getattr(mj.mjtObj, f"mjOBJ_{kind}"), which)
-    return f"{word} {own_name or which}"
