@@ -26,6 +26,7 @@ from lavender.io.engine_step import EngineStep
 from lavender.io.recorder import Recorder, read_recorded_state
 from lavender.io.stored import STATES_FOLDER, write_arrays
 from lavender.judge.residuals import AT_FLOOR, DEFAULT_THRESHOLD
+from lavender.report.records import format_tolerance
 from lavender.report.runner import Event
 from lavender.report.summary_page import PageSection, SummaryPage
 from lavender.report.table import Table
@@ -178,33 +179,24 @@ class ClaimComparison:
         for mass, claimed in self.masses:
             decades.setdefault(int(np.floor(np.log10(mass))), []).append(claimed)
         rows = [
-            [f"{10.0**k:g} to {10.0 ** (k + 1):g}", str(len(claims)), str(sum(claims))]
+            [
+                f"{format_tolerance(10.0**k)} to {format_tolerance(10.0 ** (k + 1))}",
+                str(len(claims)),
+                str(sum(claims)),
+            ]
             for k, claims in sorted(decades.items())
         ]
         return Table(["effective mass [kg]", "wrong answers", "of these claimed"], rows)
-
-    @property
-    def table_of_worlds(self) -> Table:
-        """Worlds with the most wrong answers."""
-        wrong = np.isin(self.outcome, WRONG_OUTCOMES)
-        counts = wrong.sum(axis=0)
-        order = np.argsort(-counts, kind="stable")[:N_KEPT_PROBLEMS]
-        rows = []
-        for w in order[counts[order] > 0].tolist():
-            first = int(np.flatnonzero(wrong[:, w])[0])
-            rows.append(
-                [str(w), str(counts[w]), str(first), format_size(float(np.nanmax(self.velocity[:, w])))]
-            )
-        return Table(["world", "wrong answers", "first step", "worst [m/s]"], rows)
 
     @property
     def summary_page(self) -> SummaryPage:
         """Page with all tables."""
         sections = [
             PageSection("Claims and verdicts", [self.table_of_claims], note=CLAIMS_NOTE, short=len(OUTCOMES)),
-            PageSection("Worst rows", [self.table_of_rows], note=WORST_ROWS_NOTE, short=5),
+            PageSection(
+                "Worst rows", [self.table_of_rows], note=f"{WORST_ROWS_NOTE} {WORST_FILES_NOTE}", short=5
+            ),
             PageSection("Effective mass", [self.table_of_masses], note=MASS_NOTE),
-            PageSection("Worlds", [self.table_of_worlds], note=WORST_FILES_NOTE),
         ]
         numbers = {"engine": self.engine, "threshold": self.threshold, **self.counts}
         return SummaryPage(f"Claims of {self.engine}", self.head, sections, numbers, stopped=self.stopped)

@@ -129,7 +129,12 @@ def report(
         shown = Report(measured.records, old, options["time_budgets"], engines)
         # Write the files before printing, as a closed pipe can end the command while it prints. After Ctrl-C, the page
         # has no figures, so that the prompt is back soon.
-        index = write(shown, out, figures=not (options["no_figures"] or measured.stopped), watch=watch)
+        try:
+            index = write(shown, out, figures=not (options["no_figures"] or measured.stopped), watch=watch)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(
+                f"the page is not complete; {path} has all runs, and the same command shows them"
+            ) from None
     print_report(shown, make_console(), complete=options["tables"])
     print_escaped(f"\n{format_count(len(measured.records), 'run')}; page: {index}")
     if measured.reuse_note:

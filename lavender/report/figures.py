@@ -77,7 +77,7 @@ def build_figures(report: Report) -> list[Figure]:
     """Build the figures of a report that have a curve; none for a campaign, which has no times."""
     if report.is_campaign or not len(report.frame):
         return []
-    figures = [build_overall_figure(report), build_cost_figure(report), build_profile_figure(report)]
+    figures = [build_overall_figure(report), build_cost_figure(report)]
     sequences = [name for name in report.frame["sequence"].unique() if name][:MAX_SEQUENCES]
     figures += [build_sequence_figure(report, name) for name in sequences]
     return [figure for figure in figures if figure.curves]
@@ -169,29 +169,6 @@ def build_cost_figure(report: Report) -> Figure:
     note = "Each point is a case; a line is the power of the number of rows that fits a solver's points best."
     return Figure("cost-against-rows", f"Time to {target} against the number of rows", "rows", "time of a call [s]",
                   tuple(curves), note=note)  # fmt: skip
-
-
-def build_profile_figure(report: Report) -> Figure:
-    """Plot a Dolan-More performance profile: share of cases solved within a multiple of the fastest solver's time.
-
-    A case that a solver misses or does not accept counts with an infinite multiple.
-    """
-    from lavender.report.ranking import get_times
-
-    times = get_times(report.frame, report.tolerance)
-    n, target = len(times.columns), format_tolerance(report.tolerance)
-    title = f"Performance profile to {target}, {format_count(n, 'case')}"
-    ratios = times / times.min()
-    curves = []
-    for solver in select_drawn_solvers(report, report.frame) if n > 1 else ():
-        own = np.sort(ratios.loc[solver].dropna().to_numpy(float))
-        if len(own):
-            steps = [(1.0, 100.0 * np.sum(own <= 1.0) / n)]
-            steps += [(r, 100.0 * np.sum(own <= r) / n) for r in np.unique(own) if r > 1.0]
-            curves.append(Curve.from_points(solver, solver, steps, steps=True, unmarked=True))
-    note = "Left: the share of cases on which a solver is the fastest. Right: the share that it solves in any time."
-    return Figure("performance-profile", title, "time / fastest time", "cases solved [%]", tuple(curves),
-                  y_log=False, note=note)  # fmt: skip
 
 
 def build_sequence_figure(report: Report, name: str) -> Figure:

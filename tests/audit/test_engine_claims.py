@@ -46,8 +46,8 @@ def test_every_outcome_is_counted(tmp_path):
 def test_light_bodies_are_listed_by_effective_mass():
     result = compare_claims([step_of([0.01], [1], mass=2e-3), step_of([0.01], [0], mass=30.0)], threshold=1e-4)
     assert [[str(cell) for cell in row] for row in result.table_of_masses.rows] == [
-        ["0.001 to 0.01", "1", "1"],
-        ["10 to 100", "1", "0"],
+        ["1e-3 to 1e-2", "1", "1"],
+        ["1e1 to 1e2", "1", "0"],
     ]
 
 
