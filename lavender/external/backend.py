@@ -188,9 +188,9 @@ def _call_through_qpsolvers(
     settings.update(extra)
     # Split the rows: the first `n_zero` are equalities, the others inequalities.
     z = qp.n_zero
-    # In rows: pyqpmad factors a P in columns in place, and qpsolvers then computes multipliers from its factor.
-    p = np.ascontiguousarray(qp.P.toarray()) if dense else qp.P
-    rows = qp.A.toarray() if dense else qp.A
+    # In rows: pyqpmad factors a P in columns in place, and qpsolvers then computes multipliers from its factor; qpoases
+    # reads the numbers of columns as those of rows.
+    p, rows = (np.ascontiguousarray(x.toarray()) if dense else x for x in (qp.P, qp.A))
     lb, ub = (None, None) if backend.finite else (qp.lb, qp.ub)
     inequality, rhs = rows[z:], qp.b[z:]
     n_rows, has_bound_rows = len(rhs), backend.finite and qp.lb is not None

@@ -55,6 +55,8 @@ QTQP = {
 PYQPMAD = {"tolerance": "eps", "max_iter": "max_iter"}
 QPAX = {"solver_tol": "eps"}
 JAXOPT = {"tol": "eps", "maxiter": "max_iter"}
+QPSWIFT = {"ABSTOL": "eps", "RELTOL": "eps", "MAXITER": "max_iter"}
+QPOASES = {"max_wsr": "max_iter", "time_limit": "time_limit", "terminationTolerance": "eps"}
 SIP = {"eps_abs": "eps", "eps_rel": 0.0, "max_iterations": "max_iter", "time_limit": "time_limit"}
 
 CVXOPT_BEHAVIOUR = Behaviour(
@@ -95,6 +97,8 @@ BACKENDS: tuple[Backend, ...] = (
             call=native.call_daqp, dense=True, stoppable=True,
             behaviour=Behaviour("0.11.0", "all", "x", contradictory="wrong", convex_on_rows="not found",
                 linear_term=0.03, second_solve="same", time_limit="without set-up", notes={
+                "slice": "A P that is a slice of a larger array is read as if it was contiguous, and a wrong point is "
+                    "reported as optimal.",
                 "flag": "Contradictory equalities end with its exit flag -6, which qpsolvers reports as solved."})),
     Backend("highs", ("highspy",), "highspy", "null-space active set", "Huangfu, Hall 2018, HiGHS",
             call=native.call_highs, max_iter=100_000, stoppable=True,
@@ -155,10 +159,12 @@ BACKENDS: tuple[Backend, ...] = (
     Backend("pdhcg", ("qpsolvers", "pdhcg"), "pdhcg", "primal-dual hybrid conjugate gradient",
             "Huang et al. 2024, PDHCG", noisy=True),
     Backend("qpoases", ("qpsolvers", "qpoases"), "qpoases", "online active set",
-            "Ferreau et al. 2014, qpOASES", dense=True,
-            behaviour=Behaviour("3.2", "all", saddle="wrong", infeasible_x="0.021276596")),
+            "Ferreau et al. 2014, qpOASES", settings=QPOASES, dense=True, stoppable=True,
+            behaviour=Behaviour("3.2", "all", saddle="wrong", infeasible_x="0.021276596", notes={
+                "columns": "Dense rows that are stored by columns are read as rows, and a wrong point is reported as "
+                    "solved."})),
     Backend("qpswift", ("qpsolvers", "qpSWIFT"), "qpSWIFT", "interior point",
-            "Pandala, Ding, Park 2019, qpSWIFT", dense=True, finite=True,
+            "Pandala, Ding, Park 2019, qpSWIFT", settings=QPSWIFT, max_iter=100, dense=True, finite=True,
             behaviour=Behaviour("1.0.0", "all", repeated="raises", contradictory="raises", saddle="right",
                 infeasible_x="0", far_bound=1e16)),
     Backend("sip", ("qpsolvers", "sip_qp_python"), "sip-qp-python", "interior point", "SIP manual",

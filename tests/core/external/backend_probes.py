@@ -237,6 +237,25 @@ def daqp_flags_what_qpsolvers_finds():
     return flag == -6 and run_alone("daqp", np.eye(2), [0, 0], A=A, b=b).found
 
 
+def daqp_reads_a_slice_as_contiguous():
+    import daqp
+
+    whole, bound = np.zeros((3, 3)), np.full(2, 9.0)
+    whole[:2, :2] = [[2.0, 1.0], [1.0, 2.0]]
+    arguments = -np.ones(2), np.zeros((0, 2)), bound, -bound, np.zeros(2, np.int32)
+    found, right = (daqp.solve(P, *arguments) for P in (whole[:2, :2], whole[:2, :2].copy()))
+    return found[2] == right[2] == 1 and is_near(right[0], np.full(2, 1 / 3)) and not is_near(found[0], right[0])
+
+
+def qpoases_reads_columns_as_rows():
+    import qpsolvers
+
+    G, h = np.array([[1.0, 0.0], [5.0, 1.0], [0.0, 1.0]]), np.array([-1.0, 9.0, 2.0])
+    found = [qpsolvers.solve_problem(qpsolvers.Problem(np.eye(2), np.zeros(2), M, h), "qpoases")
+             for M in (G, np.asfortranarray(G))]  # fmt: skip
+    return give_verdict(found[0], [-1, 0]) == "right" and give_verdict(found[1], [-1, 0]) == "wrong"
+
+
 def cvxopt_ends_at_1e10(name):
     found = run_alone(name, np.diag([1, 0]), [0, -1], lb=[0, 0], ub=[np.inf, np.inf])
     return found.found and is_near(np.ravel(found.x)[1:], np.array([1e10]))
@@ -271,6 +290,8 @@ NOTE_PROBES = {
     ("proxqp", "crossed_bounds"): proxqp_accepts_crossed_bounds,
     ("highs", "free_row"): highs_returns_zeros,
     ("daqp", "flag"): daqp_flags_what_qpsolvers_finds,
+    ("daqp", "slice"): daqp_reads_a_slice_as_contiguous,
+    ("qpoases", "columns"): qpoases_reads_columns_as_rows,
     ("cvxopt", "infinite"): lambda: cvxopt_ends_at_1e10("cvxopt"),
     ("kvxopt", "infinite"): lambda: cvxopt_ends_at_1e10("kvxopt"),
     ("pyqpmad", "in_place"): pyqpmad_overwrites_columns,
