@@ -381,11 +381,13 @@ has the arrays of a start that the backend uses. The program *contradictory* has
 minimum, and *saddle* is not convex: *wrong* means that a saddle point is reported as solved."""
 BACKENDS_NUMBERS = """\
 *Linear term* is x2, and 1 is right. *Small part* is x3, and 0.5 is right. *Smallest* is the largest e of 0.1, 0.01,
-..., 1e-9 that is not returned within 1 %, or 0. *Far bound* is the smallest B of 1e3, 1e4, ..., 1e19 that prevents a
+..., 1e-10 that is not returned within 1 %, or 0. *Far bound* is the smallest B of 1e3, 1e4, ..., 1e19 that prevents a
 solution. *Fixed multiplier* is the multiplier of x1, and -1 is right. *Infeasible x* is the first entry of x after the
-program. In all columns, *none* means that nothing was returned. *Second solve* is "other" if a second solve of one
-object, without a start, gives other bits: the object keeps its step size or its last answer. *Time limit* is the time
-that the backend's own limit counts. Both were observed if the backend has an object with a set-up before the solve."""
+program. *Conflict* is the largest d of 1, 0.1, ..., 1e-10 with which the program is reported as solved, or 0. *Offset*
+is x1 - 1e8, and 0.3 is right. *Second solve* is "other" if a second solve of one object, without a start, gives other
+bits: the object keeps its step size or its last answer. *Time limit* is the time that the backend's own limit counts.
+Both were observed if the backend has an object with a set-up before the solve. In the other columns, *none* means that
+nothing was returned."""
 BACKENDS_REPEATED = """\
 The bits of every backend in the tables are the same after programs of other sizes in the same process, and in four
 threads that solve different programs at the same time."""
@@ -404,6 +406,7 @@ def backends_page():
     verdicts = ["version", "triangle", "start", "repeated", "contradictory", "unbounded", "singular"]
     verdicts += ["convex_on_rows", "saddle"]
     numbers = ["linear_term", "small_part", "smallest", "far_bound", "fixed_multiplier", "infeasible_x"]
+    numbers += ["conflict", "offset"]
     numbers += ["second_solve", "time_limit"]
 
     def cell(value):

@@ -67,6 +67,10 @@ class Behaviour:
         Largest tested size of a solution that is not returned within 1 %; 0 without one.
     far_bound : float
         Size of inactive bounds at which it first fails; inf if it does not fail.
+    conflict : float
+        Largest tested d with which x1 + x2 = 1 and x1 + x2 = 1 + d are reported as solved; 0 without one.
+    offset : float or None
+        x1 - 1e8 of a program between the bounds 1e8 and 1e8 + 1; 0.3 is right, None if it is not found.
     second_solve : str
         Bits of x of a second solve of one object without a start: "same", "other", or "" without such an object.
     time_limit : str
@@ -90,6 +94,8 @@ class Behaviour:
     fixed_multiplier: float = -1.0
     smallest: float = 0.0
     far_bound: float = math.inf
+    conflict: float = 0.0
+    offset: float | None = 0.3
     second_solve: str = ""
     time_limit: str = ""
     notes: Mapping[str, str] = field(default_factory=dict)

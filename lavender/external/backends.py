@@ -60,7 +60,8 @@ QPOASES = {"max_wsr": "max_iter", "time_limit": "time_limit", "terminationTolera
 SIP = {"eps_abs": "eps", "eps_rel": 0.0, "max_iterations": "max_iter", "time_limit": "time_limit"}
 
 CVXOPT_BEHAVIOUR = Behaviour(
-    "1.3.3", "lower", repeated="raises", contradictory="wrong", convex_on_rows="raises", saddle="right",
+    "1.3.3", "lower", conflict=1.0, offset=0.4, repeated="raises", contradictory="wrong", convex_on_rows="raises",
+    saddle="right",
     unbounded="wrong", infeasible_x="raises", far_bound=1e16, small_part=0.9, notes={
     "infinite": "qpsolvers passes infinite bounds as 1e10. An unbounded program ends there as solved."},
 )  # fmt: skip
@@ -68,22 +69,25 @@ ADMM = "Stellato et al. 2020, OSQP: an operator splitting solver for quadratic p
 BACKENDS: tuple[Backend, ...] = (
     Backend("osqp", ("osqp",), "osqp", "operator splitting with polishing", ADMM,
             call=native.call_osqp, max_iter=100_000, stoppable=True, interrupts=True,
-            behaviour=Behaviour("1.1.3", start="x and y", saddle="raises", infeasible_x="2143289344",
+            behaviour=Behaviour("1.1.3", conflict=1e-4, start="x and y", saddle="raises", infeasible_x="2143289344",
                 linear_term=4e-5, second_solve="other", time_limit="with set-up", notes={
                 "memory": "An object keeps its step size of earlier solves, also with warm_starting=False.",
                 "kept_y": "A start x without y keeps y of the last solve."})),
     Backend("clarabel", ("clarabel",), "clarabel", "interior point, homogeneous embedding",
             "Goulart, Chen 2024, Clarabel", call=native.call_clarabel, max_iter=200, stoppable=True,
-            behaviour=Behaviour("0.11.1", saddle="right", infeasible_x="0", far_bound=1e10, small_part=40.0,
+            behaviour=Behaviour("0.11.1", conflict=1e-8, offset=0.5, saddle="right", infeasible_x="0", far_bound=1e10,
+                small_part=40.0,
                 second_solve="same", time_limit="without set-up")),
     Backend("piqp", ("qpsolvers", "piqp"), "piqp", "proximal interior point",
             "Schwan, Jiang, Kuhn, Jones 2023, PIQP", settings=PROXIMAL, max_iter=250,
-            behaviour=Behaviour("0.7.0", saddle="right", infeasible_x="0", far_bound=1e9, small_part=2.0,
+            behaviour=Behaviour("0.7.0", conflict=1e-8, offset=0.01, saddle="right", infeasible_x="0", far_bound=1e9,
+                small_part=2.0,
                 second_solve="same", notes={
                 "unsorted": "If the indices of a sparse P are not sorted, a solvable program is not solved."})),
     Backend("proxqp", ("qpsolvers", "proxsuite"), "proxsuite", "proximal augmented Lagrangian",
             "Bambade et al. 2022, ProxQP", settings=PROXIMAL | {"rho": PROXQP_PROXIMAL_WEIGHT},
-            behaviour=Behaviour("0.8.0", start="x, y and z", singular="wrong", saddle="wrong", infeasible_x="0",
+            behaviour=Behaviour("0.8.0", conflict=1e-5, start="x, y and z", singular="wrong", saddle="wrong",
+                infeasible_x="0",
                 linear_term=0.1, second_solve="other", notes={
                 "false_infeasible": "A solvable program with a singular P can be reported as primal infeasible. With "
                     "rho=0.1 it is not.",
@@ -91,24 +95,27 @@ BACKENDS: tuple[Backend, ...] = (
                 "crossed_bounds": "Bounds of a variable that exclude each other (lb > ub) are reported as solved."})),
     Backend("qpalm", ("qpalm",), "qpalm", "proximal augmented Lagrangian, semismooth Newton",
             "Hermans, Themelis, Patrinos 2022, QPALM", call=native.call_qpalm, stoppable=True,
-            behaviour=Behaviour("1.3.0", start="x and y", saddle="wrong", infeasible_x="0", linear_term=0.0,
+            behaviour=Behaviour("1.3.0", conflict=1e-4, offset=0.003, start="x and y", saddle="wrong",
+                infeasible_x="0", linear_term=0.0,
                 smallest=1e-5, second_solve="other")),
     Backend("daqp", ("daqp",), "daqp", "dual active set", "Arnström, Bemporad, Axehill 2022, DAQP",
             call=native.call_daqp, dense=True, stoppable=True,
-            behaviour=Behaviour("0.11.0", "all", "x", contradictory="wrong", convex_on_rows="not found",
+            behaviour=Behaviour("0.11.0", "all", "x", conflict=1.0, contradictory="wrong", convex_on_rows="not found",
                 linear_term=0.03, second_solve="same", time_limit="without set-up", notes={
                 "slice": "A P that is a slice of a larger array is read as if it was contiguous, and a wrong point is "
                     "reported as optimal.",
                 "flag": "Contradictory equalities end with its exit flag -6, which qpsolvers reports as solved."})),
     Backend("highs", ("highspy",), "highspy", "null-space active set", "Huangfu, Hall 2018, HiGHS",
             call=native.call_highs, max_iter=100_000, stoppable=True,
-            behaviour=Behaviour("1.16.0", "lower", convex_on_rows="not found", infeasible_x="0", smallest=1e-4,
+            behaviour=Behaviour("1.16.0", "lower", conflict=1e-8, offset=0.0, convex_on_rows="not found",
+                infeasible_x="0", smallest=1e-4,
                 far_bound=1e15, second_solve="same", notes={
                 "free_row": "A free row does not avoid the zeros below 1e-4; q and bounds multiplied by 1024 do."})),
     Backend("scs", ("scs",), "scs", "operator splitting, homogeneous embedding",
             "O'Donoghue 2021, SCS 3", call=native.call_scs, max_iter=100_000, stoppable=True,
             interrupts=True,
-            behaviour=Behaviour("3.3.1", start="x, y and s", saddle="raises", infeasible_x="nan", linear_term=3e-5,
+            behaviour=Behaviour("3.3.1", conflict=1e-4, offset=10.0, start="x, y and s", saddle="raises",
+                infeasible_x="nan", linear_term=3e-5,
                 small_part=0.8, second_solve="other", time_limit="without set-up", notes={
                 "start": "A solution as start ends the solve at once if x, y and s are given, not with fewer of them.",
                 "memory": "An object keeps its scale of earlier solves, also with warm_start=False."})),
@@ -125,19 +132,22 @@ BACKENDS: tuple[Backend, ...] = (
     Backend("ecos", ("qpsolvers", "ecos"), "ecos", "interior point for second-order cones",
             "Domahidi, Chu, Boyd 2013, ECOS", settings=ECOS, max_iter=100,
             dense=True, finite=True, interrupts=True,
-            behaviour=Behaviour("2.0.14", "lower", singular="raises", convex_on_rows="raises", saddle="raises",
+            behaviour=Behaviour("2.0.14", "lower", conflict=1e-8, offset=1.0, singular="raises",
+                convex_on_rows="raises", saddle="raises",
                 unbounded="raises", infeasible_x="0", linear_term=None, far_bound=1e4, small_part=None)),
     Backend("gurobi", ("qpsolvers", "gurobipy"), "gurobipy", "interior point and simplex", "Gurobi manual",
             settings=GUROBI, min_tolerance=1e-9, stoppable=True, noisy=True,
-            behaviour=Behaviour("13.0.3", "mean", saddle="right", linear_term=0.0, far_bound=1e12)),
+            behaviour=Behaviour("13.0.3", "mean", conflict=1e-6, offset=0.0, saddle="right", linear_term=0.0,
+                far_bound=1e12)),
     Backend("copt", ("qpsolvers", "coptpy"), "coptpy", "interior point", "COPT manual",
             settings=COPT, min_tolerance=1e-9, stoppable=True, noisy=True,
-            behaviour=Behaviour("8.0.7", "mean", convex_on_rows="not found", unbounded="wrong")),
+            behaviour=Behaviour("8.0.7", "mean", conflict=1e-6, convex_on_rows="not found", unbounded="wrong")),
     Backend("mosek", ("qpsolvers", "cvxopt", "mosek"), "cvxopt mosek", "interior point", "MOSEK manual", noisy=True,
             finite=True),
     Backend("qtqp", ("qpsolvers", "qtqp"), "qtqp", "primal-dual interior point", "QTQP manual",
             settings=QTQP, max_iter=200, finite=True,
-            behaviour=Behaviour("0.0.7", "none", repeated="not found", convex_on_rows="raises", saddle="raises",
+            behaviour=Behaviour("0.0.7", "none", offset=0.5, repeated="not found", convex_on_rows="raises",
+                saddle="raises",
                 infeasible_x="nan", far_bound=1e12, small_part=30.0)),
     Backend("pyqpmad", ("qpsolvers", "pyqpmad"), "pyqpmad", "dual active set, positive definite A",
             "Goldfarb, Idnani 1983", settings=PYQPMAD, min_tolerance=1e-12, dense=True, finite=True,
@@ -146,12 +156,14 @@ BACKENDS: tuple[Backend, ...] = (
     Backend("qpax", ("qpsolvers", "qpax"), "qpax", "interior point in JAX", "Tracy, Manchester 2024, qpax",
             settings=QPAX, min_tolerance=1e-12, max_iter=30, dense=True, noisy=True, jax=True,
             finite=True,
-            behaviour=Behaviour("0.1.4", "mean", repeated="wrong", contradictory="wrong", convex_on_rows="not found",
+            behaviour=Behaviour("0.1.4", "mean", conflict=1.0, repeated="wrong", contradictory="wrong",
+                convex_on_rows="not found",
                 saddle="right", infeasible_x="0", linear_term=0.5, far_bound=1e3, small_part=None, notes={
                 "nan": "With two equal equality rows, NaN is reported as solved."})),
     Backend("jaxopt_osqp", ("qpsolvers", "jaxopt"), "jaxopt", "operator splitting in JAX", ADMM,
             settings=JAXOPT, dense=True, noisy=True, jax=True, finite=True,
-            behaviour=Behaviour("0.8.5", "all", convex_on_rows="not found", saddle="wrong", infeasible_x="0",
+            behaviour=Behaviour("0.8.5", "all", conflict=1e-3, offset=None, convex_on_rows="not found",
+                saddle="wrong", infeasible_x="0",
                 linear_term=8e-7, smallest=1e-2)),
     Backend("hpipm", ("qpsolvers", "hpipm_python"), "hpipm_python (github.com/giaf/hpipm)", "interior point",
             "Frison, Diehl 2020, HPIPM", dense=True),
@@ -160,7 +172,7 @@ BACKENDS: tuple[Backend, ...] = (
             "Huang et al. 2024, PDHCG", noisy=True),
     Backend("qpoases", ("qpsolvers", "qpoases"), "qpoases", "online active set",
             "Ferreau et al. 2014, qpOASES", settings=QPOASES, dense=True, stoppable=True,
-            behaviour=Behaviour("3.2", "all", saddle="wrong", infeasible_x="0.021276596", notes={
+            behaviour=Behaviour("3.2", "all", conflict=1e-10, saddle="wrong", infeasible_x="0.021276596", notes={
                 "columns": "Dense rows that are stored by columns are read as rows, and a wrong point is reported as "
                     "solved."})),
     Backend("qpswift", ("qpsolvers", "qpSWIFT"), "qpSWIFT", "interior point",
@@ -169,7 +181,7 @@ BACKENDS: tuple[Backend, ...] = (
                 infeasible_x="0", far_bound=1e16)),
     Backend("sip", ("qpsolvers", "sip_qp_python"), "sip-qp-python", "interior point", "SIP manual",
             settings=SIP, max_iter=500, stoppable=True,
-            behaviour=Behaviour("0.0.2", "none", saddle="right", infeasible_x="0")),
+            behaviour=Behaviour("0.0.2", "none", conflict=1e-8, saddle="right", infeasible_x="0")),
     Backend("clarabel_cone", ("clarabel",), "clarabel",
             "interior point on the convex relaxation of friction, second-order cones",
             "Goulart, Chen 2024, Clarabel; Tasora, Anitescu 2011 for the relaxation",
@@ -192,6 +204,8 @@ PROBE_PROGRAMS = {
     "far_bound": "min x1² + x1 x2/2 + x2²/2 - x1 - x2 with x1 + x2 <= 1 and |x| <= B",
     "fixed_multiplier": "min |x|²/2 with 1 <= x1 <= 1 and -2 <= x2 <= -2",
     "infeasible_x": "min |x|²/2 with x1 <= -1 and x1 >= 1",
+    "conflict": "min |x|²/2 with x1 + x2 = 1 and x1 + x2 = 1 + d, which contradict each other",
+    "offset": "min |x|²/2 - (1e8 + 0.3) (x1 + x2) with 1e8 <= x <= 1e8 + 1",
     "second_solve": "min x.P x/2 + q.x with |A x| <= 1, with drawn P (30, 30), q (30) and A (20, 30)",
 }
 VERDICT_PHRASES = {
@@ -218,6 +232,8 @@ ADAPTER_REMEDIES = {
     "far_bound": "Far bounds are left out, and are checked at the solution.",
     "fixed_multiplier": "Bounds are passed as rows.",
     "infeasible_x": "A claim of infeasibility returns the start, and counts only with a certificate.",
+    "conflict": "The judge contradicts such a claim at smaller tolerances than d.",
+    "offset": "Calls with smaller tolerances follow until the judge accepts the answer.",
     "second_solve": "Each call makes a new object.",
     "contradictory": "The judge contradicts a wrong claim about contradictory rows.",
     "unbounded": "The judge contradicts a wrong claim about an unbounded program.",
@@ -233,7 +249,8 @@ def describe_behaviour(behaviour: Behaviour) -> dict[str, str]:
     }
     for name in ("repeated", "contradictory", "unbounded", "singular", "convex_on_rows", "saddle"):
         sentences[name] = f"The program {PROBE_PROGRAMS[name]} {VERDICT_PHRASES[getattr(b, name)]}."
-    for name, symbol, right in (("linear_term", "x2", 1.0), ("small_part", "x3", 0.5)):
+    values = ("linear_term", "x2", 1.0), ("small_part", "x3", 0.5), ("offset", "x1 - 1e8", 0.3)
+    for name, symbol, right in values:
         value = getattr(b, name)
         result = "is not solved" if value is None else f"gives {symbol} = {value:g}; {right:g} is right"
         sentences[name] = f"The program {PROBE_PROGRAMS[name]} {result}."
@@ -241,7 +258,7 @@ def describe_behaviour(behaviour: Behaviour) -> dict[str, str]:
     sentences["smallest"] = (
         f"Solutions of about {size:g} and below are wrong."
         if size
-        else "Solutions down to 1e-9 are returned within 1 %."
+        else "Solutions down to 1e-10 are returned within 1 %."
     )
     sentences["far_bound"] = (
         f"Inactive bounds of {far:g} and above prevent a solution."
@@ -252,6 +269,9 @@ def describe_behaviour(behaviour: Behaviour) -> dict[str, str]:
     sentences["infeasible_x"] = (
         f"After the program {PROBE_PROGRAMS['infeasible_x']}, x {found.get(b.infeasible_x, 'holds ' + b.infeasible_x)}."
     )
+    if b.conflict:
+        result = f"is reported as solved up to d = {b.conflict:g}"
+        sentences["conflict"] = f"The program {PROBE_PROGRAMS['conflict']}, {result}."
     if b.second_solve:
         sentences["second_solve"] = (
             f"A second solve of one object without a start gives {SECOND_SOLVE_PHRASES[b.second_solve]}."

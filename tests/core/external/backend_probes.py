@@ -18,7 +18,7 @@ import scipy.sparse as sp
 
 TOLERANCE = 1e-2  # Default tolerances of backends are 1e-3 to 1e-8.
 FAR_BOUNDS = [10.0**k for k in range(3, 20)]
-SMALL_SIZES = [10.0**-k for k in range(1, 10)]
+SMALL_SIZES = [10.0**-k for k in range(1, 11)]
 DENSE_ONLY = ("daqp", "ecos", "quadprog", "jaxopt_osqp", "qpax", "pyqpmad", "hpipm", "nppro", "qpoases", "qpswift")
 
 
@@ -123,6 +123,20 @@ def find_fixed_multiplier(name):
     return float(np.round(np.ravel(found.z_box)[0], 1))
 
 
+def find_conflict(name):
+    for d in [1.0, *SMALL_SIZES]:
+        found = run_alone(name, np.eye(2), [0, 0], A=[[1, 1], [1, 1]], b=[1, 1 + d])
+        if not isinstance(found, Exception) and found.found:
+            return d
+    return 0.0
+
+
+def find_offset(name):
+    far = 1e8
+    found = run_alone(name, np.eye(2), [-far - 0.3] * 2, lb=[far] * 2, ub=[far + 1] * 2)
+    return None if isinstance(found, Exception) or not found.found else float(f"{np.ravel(found.x)[0] - far:.1g}")
+
+
 SADDLE = np.diag([1, -1])
 #: Field of `Behaviour` -> function of a backend's name.
 BEHAVIOUR_PROBES = {
@@ -141,6 +155,8 @@ BEHAVIOUR_PROBES = {
     "linear_term": find_linear_term,
     "small_part": find_small_part,
     "fixed_multiplier": find_fixed_multiplier,
+    "conflict": find_conflict,
+    "offset": find_offset,
     "smallest": find_smallest,
     "far_bound": find_far_bound,
 }
