@@ -10,12 +10,9 @@ into stretches of `horizon` steps. Each setting steps from the start of every st
 
 from __future__ import annotations
 
-import contextlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from statistics import fmean
-from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -29,8 +26,6 @@ ERROR_QUANTILE = 0.99  # Settings are compared by this quantile of the error ove
 # After the first round, a setting is no longer timed if it takes more than this multiple of the present setting's
 # time.
 MAX_TIME_RATIO = 2.0
-#: Kinds of measurements: the error of a setting, and the times of its steps.
-MEASUREMENTS: tuple[str, ...] = ("judging", "timing")
 
 
 @dataclass(eq=False)
@@ -72,8 +67,8 @@ class Measured:
         return float(np.quantile(self.motion, ERROR_QUANTILE, method="higher"))
 
 
-class Schedule:
-    """Measurements that are done and expected, for the progress and the remaining time.
+class Progress:
+    """Number of measurements that are done and, estimated, to come.
 
     Parameters
     ----------
@@ -83,48 +78,17 @@ class Schedule:
 
     def __init__(self, watch: Callable[[Event], None] | None) -> None:
         self.watch = watch
-        self.done = 0
+        self.done = self.expected = 0
         self.loads: list[float | None] = []  # Number of runnable processes at each timing.
-        self._expected = dict.fromkeys(MEASUREMENTS, 0)
-        self._reserved = dict.fromkeys(MEASUREMENTS, 0)
-        self._durations: dict[str, list[float]] = {kind: [] for kind in MEASUREMENTS}
 
-    def reserve_measurements(self, kind: str, count: int) -> None:
-        """Set the estimated number of measurements of `kind` that will be announced later."""
-        self._reserved[kind] = count
-
-    def announce_measurements(self, kind: str, count: int) -> None:
-        """Announce `count` measurements of `kind`; they are subtracted from the reserved number."""
-        self._expected[kind] += count
-        self._reserved[kind] = max(0, self._reserved[kind] - count)
-
-    def skip_measurement(self, kind: str) -> None:
-        """Count an announced measurement as unnecessary."""
-        self._expected[kind] -= 1
-
-    @property
-    def remaining(self) -> float | None:
-        """Estimate of the remaining time [s], from the mean duration of each kind so far; None before the first."""
-        total = 0.0
-        every = [t for durations in self._durations.values() for t in durations]
-        for kind in MEASUREMENTS:
-            mean = fmean(self._durations[kind] or every or [0.0])
-            total += mean * (self._expected[kind] + self._reserved[kind])
-        return total if every else None
-
-    @contextlib.contextmanager
-    def time_measurement(self, kind: str, text: str) -> Iterator[None]:
-        """Show the progress, then run and time the block, which is one measurement."""
+    def begin_measurement(self, kind: str, text: str) -> None:
+        """Show the progress before a measurement, "judging" or "timing", which then counts as done."""
         if self.watch is not None:
-            count = sum(self._expected.values()) + sum(self._reserved.values())
-            self.watch(Event(self.done, self.done + count, f"{kind}: {text}", "", remaining=self.remaining))
+            self.watch(Event(self.done, self.done + max(1, self.expected), f"{kind}: {text}", ""))
         if kind == "timing":
             self.loads.append(machine.count_runnable_processes())
-        begin = perf_counter()
-        yield
-        self._durations[kind].append(perf_counter() - begin)
-        self._expected[kind] -= 1
         self.done += 1
+        self.expected -= 1
 
 
 class Stage(ABC):
@@ -151,24 +115,22 @@ class Stage(ABC):
     def prepare_timing(self, setting: Setting) -> Callable[[], FloatArray]:
         """Return a function that runs all stretches with a setting and returns the times of the steps [s]."""
 
-    def time_settings(self, settings: list[Measured], repeats: int, schedule: Schedule) -> None:
+    def time_settings(self, settings: list[Measured], repeats: int, progress: Progress) -> None:
         """Time the steps of all settings, which alternate in `repeats` rounds; the first is the present setting.
 
         A setting with which a world diverges is not timed.
         """
         settings = [m for m in settings if np.isfinite(m.error).all()]
         runs = [self.prepare_timing(m.setting) for m in settings]
-        schedule.announce_measurements("timing", len(settings) * repeats)
         for round_index in range(repeats):
             for m, run in zip(settings, runs, strict=True):
                 # Compare medians over the steps, so that an interrupted step does not exclude a setting.
                 if round_index and np.median(m.times) > MAX_TIME_RATIO * np.median(settings[0].times):
-                    schedule.skip_measurement("timing")
                     continue
-                with schedule.time_measurement(
+                progress.begin_measurement(
                     "timing", f"round {round_index + 1} of {repeats}, {m.setting.name}"
-                ):
-                    m.times = np.minimum(m.times, run())
+                )
+                m.times = np.minimum(m.times, run())
 
 
 def make_unmeasured(setting: Setting, solver: str) -> Measured:

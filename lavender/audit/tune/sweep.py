@@ -21,7 +21,7 @@ import numpy as np
 from lavender.audit.settings import Setting
 from lavender.audit.simulated_worlds import SPREADS, Runs, can_any_geoms_collide, count_engine_warnings
 from lavender.audit.step_sizes import StepSizes
-from lavender.audit.tune.measured import Measured, Schedule, Stage
+from lavender.audit.tune.measured import Measured, Progress, Stage
 from lavender.audit.tune.mujoco_settings import MujocoStage
 from lavender.audit.tune.recommendation import Tuning
 from lavender.audit.tune.world_settings import make_kamino_stages, make_warp_stages
@@ -189,7 +189,7 @@ def run_tuning(
     first_phase : str
         Shown until the first measurement.
     """
-    schedule = Schedule(watch)
+    progress = Progress(watch)
     held_errors: dict[Setting, float] = {}
     measured: list[Measured] = []
     held: list[Measured] = []
@@ -199,7 +199,7 @@ def run_tuning(
     def make_result(stopped: bool) -> Tuning:
         """Build the result so far."""
         timed = [m for m in measured if np.isfinite(m.mean_step_time)] or early
-        busy = machine.make_busy_warning(schedule.loads, os.cpu_count() or 1, TUNE_BUSY_CONSEQUENCE)
+        busy = machine.make_busy_warning(progress.loads, os.cpu_count() or 1, TUNE_BUSY_CONSEQUENCE)
         return Tuning(
             model, horizon, timed, held, threshold=threshold, stopped=stopped, sizes=sizes, busy=busy,
             n_held_worlds=n_held_worlds, error_limit=error_limit, held_errors=dict(held_errors),
@@ -208,17 +208,16 @@ def run_tuning(
     def judge(stage: Stage, settings: list[Setting]) -> list[Measured]:
         """Return the judged results of settings on a stage."""
         results = []
-        schedule.announce_measurements("judging", len(settings))
         for setting in settings:
-            with schedule.time_measurement("judging", setting.name):
-                results.append(stage.judge_setting(setting))
+            progress.begin_measurement("judging", setting.name)
+            results.append(stage.judge_setting(setting))
         return results
 
     def measure_early(stage: Stage, judged: Measured) -> None:
         """Time the present setting once, if no world diverges, as the result so far."""
         nonlocal sizes
         timed = replace(judged)
-        stage.time_settings([timed], 1, Schedule(None))
+        stage.time_settings([timed], 1, Progress(None))
         if np.isfinite(timed.mean_step_time):
             early[:] = [timed]
             sizes = StepSizes(timed.rows, timed.contacts, can_touch)
@@ -233,11 +232,9 @@ def run_tuning(
         own, first_settings = stage.own_setting, stage.list_first_settings()
         n_variants = len(stage.list_variants(own)) * EXPECTED_VARIED_SETTINGS
         n_first, n_trial = len(first_settings), min(N_TRIAL_ROUNDS, repeats)
-        # Three settings on the worlds held back.
-        schedule.reserve_measurements("judging", n_first + 3 + n_variants)
-        schedule.reserve_measurements(
-            "timing", n_first * n_trial + (n_first + n_variants) * repeats + 3 * 2 * repeats
-        )
+        # Three settings on the worlds held back, each timed in twice as many rounds.
+        n_held = 3 * (1 + 2 * repeats)
+        progress.expected = n_first * (1 + n_trial + repeats) + n_variants * (1 + repeats) + n_held
         measured += judge(stage, [own])
         if not np.isfinite(measured[0].error).all():
             raise InputError(
@@ -250,12 +247,11 @@ def run_tuning(
         rows, contacts = (np.concatenate([getattr(m, name) for m in both]) for name in ("rows", "contacts"))
         sizes = StepSizes(rows, contacts, can_touch)
         if not sizes.has_enough_contact:
-            schedule.reserve_measurements("judging", 0)
-            schedule.reserve_measurements("timing", 0)
-            stage.time_settings(measured, repeats, schedule)
+            progress.expected = repeats
+            stage.time_settings(measured, repeats, progress)
             return make_result(False)
         measured += judge(stage, first_settings[1:])
-        stage.time_settings(measured, n_trial, schedule)
+        stage.time_settings(measured, n_trial, progress)
         near = [
             m.setting
             for m in make_result(False).pareto_front
@@ -263,10 +259,9 @@ def run_tuning(
         ]
         known = {m.setting for m in measured}
         more = dict.fromkeys(x for s in [own, *near] for x in stage.list_variants(s) if x not in known)
-        schedule.reserve_measurements("judging", len(more) + 2)
-        schedule.reserve_measurements("timing", (len(measured) + len(more)) * repeats + 3 * 2 * repeats)
+        progress.expected = len(more) + (len(measured) + len(more)) * repeats + n_held
         measured += judge(stage, list(more))
-        stage.time_settings(measured, repeats, schedule)
+        stage.time_settings(measured, repeats, progress)
         chosen = make_result(False)
         other = dict.fromkeys(m.setting for m in (chosen.faster, chosen.closer) if m is not None)
         last += judge(held_back, list(other))
@@ -278,9 +273,8 @@ def run_tuning(
             held_errors[setting] = float(tested[setting].error.max())
         if error_limit is not None and all(m.setting != setting for m in last):
             last.append(tested[setting])
-        schedule.reserve_measurements("judging", 0)
-        schedule.reserve_measurements("timing", 0)
-        held_back.time_settings(last, 2 * repeats, schedule)
+        progress.expected = 2 * repeats * len(last)
+        held_back.time_settings(last, 2 * repeats, progress)
         held += last if np.isfinite(last[0].mean_step_time) else []
     except KeyboardInterrupt:
         if not early:
