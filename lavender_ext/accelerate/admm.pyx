@@ -416,7 +416,7 @@ cdef class BodySolve:
 
     @property
     def iterations(self):
-        """Number of iterations of all solves, including its predecessors."""
+        """Sum of the iterations of all solves, including its predecessors."""
         return int(self.f.iterations)
 
 

@@ -135,7 +135,7 @@ cdef inline int32_t run_newton_within_cost(task_t* j, const view_t* v, const opt
 
 
 cdef inline bint set_impulse_of_empty_rows(const task_t* j, double tol) noexcept nogil:
-    """Set empty rows of J to the bound that b requires, like `decide_empty_rows` of lavender/solving/outcome.py.
+    """Set empty rows of J to the bound that b requires, like `decide_empty_rows` of lavender/solving/finish.py.
 
     Returns False if that bound is infinite and b alone is above tol, or if A_ii is 0 only by underflow.
     """

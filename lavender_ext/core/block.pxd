@@ -50,29 +50,6 @@ cdef inline double project_normal_update(double lam, double w, double step) noex
     return 0.0 if y < 0.0 else y
 
 
-cdef inline void project_tangent_update(double* lam, const double* w, double step, double radius,
-                                int32_t n) noexcept nogil:
-    """Update the impulses lam of n tangent rows with slacks w by (3); both rows have the same scalar step.
-
-    Squares are compared, so that a sticking contact needs no square root.
-    """
-    cdef double x, y, s, r
-    if n == 1:
-        lam[0] = clip(lam[0] - w[0] * step, -radius, radius)
-        return
-    # unconstrained step
-    x = lam[0] - w[0] * step
-    y = lam[1] - w[1] * step
-    # radial projection onto the friction disk
-    s = x * x + y * y
-    if s > radius * radius:
-        r = radius / sqrt(s)
-        x = x * r
-        y = y * r
-    lam[0] = x
-    lam[1] = y
-
-
 cdef inline double compute_row_error(double lam, double w, double d, double low, double high) noexcept nogil:
     """Return the error (5) of one row, computed as clip(w / d, lam - high, lam - low).
 

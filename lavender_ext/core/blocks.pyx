@@ -133,18 +133,12 @@ def concatenate_blocks(list each):
         return None
     cdef Blocks blocks = allocate_blocks(k, m)
     (<int32_t*>blocks.at.ptr)[0] = 0
-    blocks.is_free = blocks.is_bounded_rows = blocks.single_rows = True
     k = m = 0
     for one in each:
         copy_blocks(blocks, k, m, &one.at)
         k += one.at.n_blocks
         m += one.at.n_rows
-        blocks.is_free &= one.is_free
-        blocks.is_bounded_rows &= one.is_bounded_rows
-        blocks.single_rows &= one.single_rows
-        blocks.has_round |= one.has_round
-        blocks.has_rolling |= one.has_rolling
-        blocks.has_ellipse |= one.has_ellipse
+    blocks.validate()
     return blocks
 
 

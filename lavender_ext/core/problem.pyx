@@ -309,22 +309,17 @@ cdef class Data:
     """
 
     def __init__(self, Blocks blocks, b_, int law, csr=None, rows=None):
-        # The arrays are kept as passed, because converting a view back to an object costs more than creating the view.
-        cdef const double[::1] b = b_
         cdef int32_t m = blocks.at.n_rows, n_empty, i
         numbers_ = new(3 * m + 3)
         cdef double* numbers = as_double_pointer(numbers_, 3 * m + 3)
         cdef arena_t arena = make_arena(NULL, NULL)
         cdef Workspace marks = allocate_bytes((<Py_ssize_t>m + 1) * sizeof(int32_t))
         cdef int32_t* empty = <int32_t*>marks.at
-        cdef const int32_t[::1] indptr, indices
-        cdef const double[::1] data
         self.keep = [blocks, b_, numbers_, csr, rows]
         self.blocks = blocks.at
         self.blocks.law = law
         self.blocks.d, self.blocks.nu, self.blocks.step = numbers, numbers + m + 1, numbers + 2 * (m + 1)
-        if m > 0:
-            self.blocks.b = &b[0]
+        self.blocks.b = as_double_pointer(b_, m)
         self.reference_energy = self.reference_velocity = self.relative_at_zero = -1.0
         self.ready = True
         self.factored = rows is not None
@@ -339,10 +334,8 @@ cdef class Data:
             n_empty = lav_compute_body_diagonal(&self.blocks, &self.rows, empty)
         else:
             indptr, indices, data = csr
-            self.csr.indptr = &indptr[0]
-            if data.shape[0] > 0:
-                self.csr.indices = &indices[0]
-                self.csr.data = &data[0]
+            self.csr.indptr, self.csr.indices = as_int_pointer(indptr, m + 1), as_int_pointer(indices, len(indices))
+            self.csr.data = as_double_pointer(data, len(data))
             n_empty = lav_compute_csr_diagonal(&self.blocks, &self.csr, empty)
         self._numbers, self._arrays = numbers_, [None, None, None]
         self.empty = _NONE
@@ -441,7 +434,7 @@ cdef class Data:
 
     @property
     def step(self):
-        """Steps of a sweep (m,) [kg]."""
+        """Array (m,) of the steps of a sweep [kg]."""
         return self.get_derived_array(2)
 
     @property

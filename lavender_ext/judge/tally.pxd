@@ -328,13 +328,14 @@ cdef inline void score_all_blocks(const blocks_t* p, const double* lam, const do
     sizes (m) is an upper bound of |A| |lam|, from which the floors are computed. If it is NULL, the floor entries are not changed.
     """
     cdef int32_t island, a, i, end, n = begin_island_scores(p, out)
+    cdef const int32_t* order = p.islands.order if p.islands != NULL else NULL
     cdef tally_t own, s = make_empty_tally()
     cdef floor_t floor, f = make_empty_floor()
     for island in range(n):
         own, floor = make_empty_tally(), make_empty_floor()
         end = index_of_island_end(p, island)
         for a in range(index_of_island_begin(p, island), end):
-            i = get_island_block(p, a)
+            i = get_block_in_order(order, a)
             compute_block_error(p, i, lam, w, e)
             add_block_error(p, i, e, &own)
             if sizes != NULL:
