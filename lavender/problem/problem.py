@@ -114,8 +114,8 @@ class Problem(Builders):
         Raises
         ------
         InputError
-            `previous` is not a solution; `keys` does not have k entries; or a problem has no keys, and the blocks of
-            both differ or `keys` is given.
+            `previous` is not a solution; `keys` does not have k entries; a key names several blocks of one problem; or
+            a problem has no keys, and the blocks of both differ or `keys` is given.
 
         Examples
         --------
@@ -141,6 +141,13 @@ class Problem(Builders):
             if before.key is None:
                 raise InputError("the problem of the previous step has no keys: build it with key=")
             return replace(self, key=keys, copy=False).carry((before, impulse))
+        for name, problem in (("this problem", self), ("the previous one", before)):
+            if problem.key is not None and len(set(problem.key.tolist())) < len(problem.key):
+                values, counts = np.unique(problem.key, return_counts=True)
+                raise InputError(
+                    f"key {values[counts.argmax()]} of {name} names {counts.max()} blocks, so that impulses cannot be "
+                    "assigned: give each block a key of its own"
+                )
         start = self._carry(before, impulse)
         if start is None:
             keyless = " and ".join(

@@ -141,6 +141,11 @@ def test_impulses_are_carried_by_key_and_new_blocks_start_from_nothing():
         four.carry((three, np.ones(3)))
     with pytest.raises(lv.InputError, match=r"no keys in the previous one, "):
         dataclasses.replace(four, key=np.arange(4)).carry((three, np.ones(3)))
+    twice = dataclasses.replace(three, key=[7, 8, 7])
+    with pytest.raises(lv.InputError, match="key 7 of the previous one names 2 blocks"):
+        dataclasses.replace(four, key=np.arange(4)).carry((twice, np.ones(3)))
+    with pytest.raises(lv.InputError, match="key 7 of this problem names 2 blocks"):
+        twice.carry((dataclasses.replace(three, key=[7, 8, 9]), np.ones(3)))
     assert not lv.report.carry_impulses(three, np.ones(3), four).any()  # a report starts such a step from zero
     assert np.array_equal(dataclasses.replace(before, key=None).carry(solution), solution.impulse)
     for bad, keys, words in (
