@@ -7,22 +7,55 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 SUFFIXES = {".py", ".pyx", ".pxd", ".c", ".h", ".js", ".html", ".css", ".j2"}
 GENERATED = {ROOT / "lavender" / "export" / "c" / "lavender.c"}
-#: Lines that a package may have. A package joins the table when it has come below its budget; budgets only shrink.
+#: Budget in lines of each package, or of two together. A package may exceed its budget by 5 %. One that has not come
+#: down to its budget yet has a second number, which it may not exceed. Lower both numbers, never raise them.
 BUDGETS = {
-    "lavender/contract": 350,
-    "lavender/export": 2900,
-    "lavender/gradient": 1600,
-    "lavender/suite": 1900,
-    "lavender_ext/engine": 2650,
+    "lavender/audit": (3700, 4500),
+    "lavender/base": (1300, 0),
+    "lavender/batch": (1250, 1450),
+    "lavender/cli": (1900, 2200),
+    "lavender/contract": (350, 0),
+    "lavender/diagnostics": (1000, 1400),
+    "lavender/export": (2900, 0),
+    "lavender/external": (2000, 2800),
+    "lavender/gradient": (1600, 0),
+    "lavender/io": (4500, 5700),
+    "lavender/judge": (1750, 0),
+    "lavender/problem": (4800, 5500),
+    "lavender/programs": (300, 0),
+    "lavender/report": (5200, 6000),
+    "lavender/sim": (6800, 0),
+    "lavender/solvers": (3900, 5400),
+    "lavender/solving": (2300, 3150),
+    "lavender/suite": (1900, 0),
+    "lavender_ext/accelerate lavender_ext/sweep": (2150, 2500),
+    "lavender_ext/batch lavender_ext/small": (1800, 2350),
+    "lavender_ext/core": (5300, 6500),
+    "lavender_ext/derivative": (750, 850),
+    "lavender_ext/driver lavender_ext/host": (250, 0),
+    "lavender_ext/engine": (2650, 0),
+    "lavender_ext/factor": (2600, 3300),
+    "lavender_ext/io": (480, 850),
+    "lavender_ext/judge": (2300, 2800),
+    "lavender_ext/local": (950, 1150),
+    "lavender_ext/newton lavender_ext/velocity_newton": (4700, 7800),
+    "lavender_ext/pivot": (1450, 1750),
 }
 
 
-def count_lines(package):
-    """Count the lines of the sources of a package."""
-    files = (path for path in (ROOT / package).rglob("*") if path.suffix in SUFFIXES and path not in GENERATED)
-    return sum(path.read_bytes().count(b"\n") for path in files)
+def list_sources(folder):
+    return [path for path in folder.rglob("*") if path.suffix in SUFFIXES and path not in GENERATED]
 
 
-@pytest.mark.parametrize("package", BUDGETS)
-def test_package_has_at_most_five_percent_more_lines_than_its_budget(package):
-    assert 0 < count_lines(package) <= 1.05 * BUDGETS[package]
+@pytest.mark.parametrize("packages", BUDGETS)
+def test_package_has_at_most_five_percent_more_lines_than_its_budget(packages):
+    budget, present = BUDGETS[packages]
+    sources = [path for package in packages.split() for path in list_sources(ROOT / package)]
+    lines = sum(path.read_bytes().count(b"\n") for path in sources)
+    assert 0 < lines <= max(1.05 * budget, present)
+
+
+def test_every_package_has_a_budget():
+    folders = [path for name in ("lavender", "lavender_ext") for path in (ROOT / name).iterdir() if path.is_dir()]
+    packages = {path.relative_to(ROOT).as_posix() for path in folders if list_sources(path)}
+    assert packages == set(" ".join(BUDGETS).split())
