@@ -122,7 +122,9 @@ cdef class Step:
                                  offset[2 * (N_ARRAYS + i)], offset[2 * (N_ARRAYS + i) + 1])
         p.dt = (<const double*>(self.model_address + offset[2 * TIMESTEP]))[0]
         for i in range(4):
-            (&p.dim)[i] = NULL if contact == NULL else contact + offset[2 * (DIM + i)]
+            (&p.dim)[i] = contact
+            if contact != NULL:
+                (&p.dim)[i] += offset[2 * (DIM + i)]
         p.stride = offset[2 * CONTACT_SIZE]
 
     cdef void read_attributes(self, data) except *:
