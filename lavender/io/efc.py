@@ -259,7 +259,7 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
             f"each state has {size} numbers; one of {sorted(kinds)} is needed, the sizes of "
             "mjSTATE_PHYSICS, mjSTATE_FULLPHYSICS and mjSTATE_INTEGRATION of the model"
         )
-    n, nv = len(values), model.nv
+    n, nv, dt = len(values), model.nv, float(model.opt.timestep)
     free, smooth = np.full((n, nv), np.nan), np.zeros((n, nv))
     mass = np.zeros((n, len(model.M_colind)))
     mass[:, model.M_rowadr + model.M_rownnz - 1] = 1.0  # States that are not finite keep the identity as M.
@@ -310,18 +310,36 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
     rows_of_states.clear()
     triangles = (mass, *triangle) if not matrices else _merge_lower_triangles(matrices, mass, triangle)
     contacts[:, 0] += np.where(contacts[:, 0] < 0, 0, np.repeat(ptr[:-1], np.diff(contact_ptr)))
-    elliptic = contacts[:, 0], contacts[:, 1], friction
-    imported = _import_states(model, jac, numbers.T, ints[:, 0], ptr, elliptic, triangles, free, smooth)
+    row_type, (inv_compliance, aref, force, loss, velocity) = ints[:, 0], numbers.T
+    elliptic = (np.zeros(len(contacts), int), contacts[:, 0], contacts[:, 1], friction)
+    used_rows = np.ones((1, len(row_type)), bool)
+    has_elliptic = (row_type == ELLIPTIC).any()
+    cones, scale = _make_blocks(row_type[None], loss[None], used_rows, elliptic if has_elliptic else None, dt)
+    target, compliance, lam = dt * aref + velocity, 1.0 / inv_compliance, dt * force
+    if scale is not None:
+        s = scale[0]
+        jac *= s[:, None]
+        target, compliance, lam = target * s, compliance * s * s, lam / s
+    batch = Batch(
+        jac,
+        triangles,
+        free + dt * smooth,
+        target=target,
+        cones=cones,
+        compliance=compliance,
+        friction="cone",
+        row_ptr=ptr,
+    )
 
     def name_blocks_of_world(i: int) -> Any:
         row_ints, contact_ints = ints[ptr[i] : ptr[i + 1]], contacts[contact_ptr[i] : contact_ptr[i + 1]]
         whole = [*row_ints.T, contact_ints[:, 1], contact_ints[:, 2:].ravel()]
         return single._make_block_names(mj, model, np.concatenate(whole), len(row_ints), 1)
 
-    imported.batch.names_of = name_blocks_of_world
+    batch.names_of = name_blocks_of_world
     world = np.repeat(np.arange(n), np.diff(contact_ptr))
-    imported.batch.contact_counts = np.bincount(world[contacts[:, 0] >= 0], minlength=n)
-    return imported
+    batch.contact_counts = np.bincount(world[contacts[:, 0] >= 0], minlength=n)
+    return Imported(batch, lam)
 
 
 def _merge_lower_triangles(matrices: dict[int, Compressed], mass: FloatArray, triangle: Any) -> Any:
@@ -345,40 +363,6 @@ def _merge_lower_triangles(matrices: dict[int, Compressed], mass: FloatArray, tr
         values[i, np.searchsorted(union, place)] = matrices[i][2]
     rows, columns = np.divmod(union, nv)
     return values, columns, np.searchsorted(rows, np.arange(nv + 1))
-
-
-def _import_states(
-    model: Any,
-    jac: Any,
-    numbers: Any,
-    row_type: Any,
-    ptr: Any,
-    contacts: Any,
-    mass: Any,
-    before: Any,
-    smooth: Any,
-) -> Imported:
-    """Build the batch and the impulses from the rows and contacts of all states, one state after the other."""
-    dt, (inv_compliance, aref, force, loss, velocity) = float(model.opt.timestep), numbers
-    world = np.zeros(len(contacts[0]), int)
-    contacts = (world, *contacts) if (row_type == ELLIPTIC).any() else None
-    cones, scale = _make_blocks(row_type[None], loss[None], np.ones((1, len(row_type)), bool), contacts, dt)
-    target, compliance, lam = dt * aref + velocity, 1.0 / inv_compliance, dt * force
-    if scale is not None:
-        s = scale[0]
-        jac *= s[:, None]
-        target, compliance, lam = target * s, compliance * s * s, lam / s
-    batch = Batch(
-        jac,
-        mass,
-        before + dt * smooth,
-        target=target,
-        cones=cones,
-        compliance=compliance,
-        friction="cone",
-        row_ptr=ptr,
-    )
-    return Imported(batch, lam)
 
 
 def _broadcast_numbers_to_rows(name: str, values: Any, n: int, m: int) -> FloatArray:
