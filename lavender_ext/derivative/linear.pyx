@@ -8,8 +8,6 @@ with C the compliance, and for a matrix
 
     G^T q = D^-1/2 (c + A^T x),   s = D^-1/2 P^T q - x                                                      (2)
 """
-from cpython.buffer cimport (PyBUF_C_CONTIGUOUS, PyBUF_FORMAT, PyBUF_WRITABLE, PyBuffer_Release,
-                             PyObject_GetBuffer)
 from libc.math cimport fabs
 from libc.stdint cimport int8_t, int32_t, int64_t
 from libc.string cimport memcpy, memset
@@ -17,7 +15,7 @@ from libc.string cimport memcpy, memset
 import numpy as np
 
 from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles, take_integers
-from lavender_ext.core.arrays cimport ndarray as Array
+from lavender_ext.core.arrays cimport C_CONTIGUOUS, DOUBLE, as_double_pointer, has_element_type, ndarray
 from lavender_ext.core.validate cimport all_finite, find_invalid_number
 from lavender_ext.core.generalized cimport multiply_jacobian_transpose, whitened_row_dot
 from lavender_ext.core.block_types cimport blocks_t, has_independent_rows
@@ -36,7 +34,7 @@ from lavender_ext.judge.measure cimport (
 )
 from lavender_ext.judge.score cimport make_empty_score, score_t
 
-cdef object empty = np.empty, ndarray = np.ndarray
+cdef object empty = np.empty
 cdef object F8 = np.dtype(np.float64), I4 = np.dtype(np.int32), I1 = np.dtype(np.int8)
 
 # G counts as singular if the ratio of its smallest to its largest pivot is at most this.
@@ -122,24 +120,22 @@ cdef public void lav_adjoint(const linearised_t* a, const double* y, const doubl
         f[i] = (y[i] if y != NULL else 0.0) - f[i]
 
 
-cdef bint get_array_data(array, Py_ssize_t n, Py_buffer* view, const double** to):
+cdef bint get_array_data(array, Py_ssize_t n, const double** to):
     """Write the address of a contiguous float64 array (n,) to `to`, or NULL if it is None; return whether the array is valid.
 
-    The caller must release its buffer `view`.
+    The caller must keep the array alive.
     """
+    cdef ndarray x
     to[0] = NULL
     if array is None:
         return True
     if type(array) is not ndarray:
         return False
-    try:
-        PyObject_GetBuffer(array, view, PyBUF_FORMAT | PyBUF_C_CONTIGUOUS)
-    except ValueError:                                  # Arrays of datetime have no buffer.
-        return False
-    if view.format[0] != 100 or view.format[1] != 0 or view.ndim != 1 or view.shape[0] != n:    # "d"
+    x = <ndarray>array
+    if x.nd != 1 or x.dimensions[0] != n or not (x.flags & C_CONTIGUOUS and has_element_type(x, DOUBLE)):
         return False
     if n:
-        to[0] = <const double*>view.buf
+        to[0] = <const double*>x.data
     return True
 
 
@@ -240,38 +236,31 @@ cdef bint prepare_problem_data(Data p):
 
 cdef bint write_adjoint(const linearised_t* a, velocity, impulse, slack, double* out):
     """Write `Linear.adjoint` to out (3 m + n); return False if an argument is invalid or all are None."""
-    cdef int32_t m = a.v.p.n_rows, i
+    cdef int32_t m = a.v.p.n_rows
     cdef const double* y
     cdef const double* c
     cdef const double* x
-    cdef Py_buffer views[3]
     if velocity is None and impulse is None and slack is None:
         return False
-    memset(&views[0], 0, 3 * sizeof(Py_buffer))         # Releasing an empty buffer does nothing.
-    try:
-        if not (get_array_data(velocity, a.n, &views[0], &y) and get_array_data(impulse, m, &views[1], &c)
-                and get_array_data(slack, m, &views[2], &x)):
-            return False
-        if not (all_finite(y, 0 if y == NULL else a.n) and all_finite(c, 0 if c == NULL else m)
-                and all_finite(x, 0 if x == NULL else m)):
-            return False
-        with nogil:
-            lav_adjoint(a, y, c, x, out, out + m, out + 2 * m)
-            if c != NULL:
-                memcpy(out + 2 * m + a.n, c, m * sizeof(double))
-            else:
-                memset(out + 2 * m + a.n, 0, m * sizeof(double))
-        return True
-    finally:
-        for i in range(3):
-            PyBuffer_Release(&views[i])
+    if not (get_array_data(velocity, a.n, &y) and get_array_data(impulse, m, &c) and get_array_data(slack, m, &x)):
+        return False
+    if not (all_finite(y, 0 if y == NULL else a.n) and all_finite(c, 0 if c == NULL else m)
+            and all_finite(x, 0 if x == NULL else m)):
+        return False
+    with nogil:
+        lav_adjoint(a, y, c, x, out, out + m, out + 2 * m)
+        if c != NULL:
+            memcpy(out + 2 * m + a.n, c, m * sizeof(double))
+        else:
+            memset(out + 2 * m + a.n, 0, m * sizeof(double))
+    return True
 
 
 cdef object copy_to_array(const void* x, Py_ssize_t n, dtype):
     """Return a new array (n,) with the numbers at x."""
     array = empty(n, dtype)
     if n:
-        memcpy((<Array>array).data, x, n * (<Array>array).strides[0])
+        memcpy((<ndarray>array).data, x, n * (<ndarray>array).strides[0])
     return array
 
 
@@ -309,13 +298,9 @@ cdef class Linear:
         not finite; the caller
         then validates in detail.
         """
-        cdef Py_buffer view
-        cdef bint is_valid
-        out = empty(3 * self.at.v.p.n_rows + self.at.n)
-        PyObject_GetBuffer(out, &view, PyBUF_WRITABLE)
-        is_valid = write_adjoint(&self.at, velocity, impulse, slack, <double*>view.buf)
-        PyBuffer_Release(&view)
-        return out if is_valid else None
+        cdef Py_ssize_t n = 3 * self.at.v.p.n_rows + self.at.n
+        out = empty(n)
+        return out if write_adjoint(&self.at, velocity, impulse, slack, as_double_pointer(out, n)) else None
 
     @property
     def has_sliding_contact(self):
@@ -416,7 +401,6 @@ cdef class Linears:
         cdef Data p
         cdef linearised_t* a
         cdef const double* lam
-        cdef Py_buffer view
         cdef Workspace spare
         cdef list each = impulses if type(impulses) is list else None
         cdef const double[::1] flat
@@ -444,19 +428,16 @@ cdef class Linears:
                 continue
             p = data[i]
             bind_linearised_arrays(a, &arena)
-            memset(&view, 0, sizeof(Py_buffer))
-            try:
-                if each is None:
-                    a.valid = sizes[i] == a.v.p.n_rows
-                    lam = &flat[0] + first[i] if a.v.p.n_rows else NULL
-                else:
-                    a.valid = each[i] is not None and get_array_data(each[i], a.v.p.n_rows, &view, &lam)
-                if not a.valid:
-                    continue
-                with nogil:
-                    judge_and_linearise(a, lam, p.reference_energy, p.reference_velocity, <double*>spare.at)
-            finally:
-                PyBuffer_Release(&view)
+            if each is None:
+                a.valid = sizes[i] == a.v.p.n_rows
+                lam = &flat[0] + first[i] if a.v.p.n_rows else NULL
+            else:
+                impulse = each[i]
+                a.valid = impulse is not None and get_array_data(impulse, a.v.p.n_rows, &lam)
+            if not a.valid:
+                continue
+            with nogil:
+                judge_and_linearise(a, lam, p.reference_energy, p.reference_velocity, <double*>spare.at)
         arena = make_arena(NULL, NULL)
         for i in range(n):
             a = self.at + i
@@ -503,15 +484,12 @@ cdef class Linears:
     def adjoint(self, list velocities, list impulses, list slacks):
         """Return the concatenated `Linear.adjoint` of all items that are not skipped, and the indices of items that failed."""
         cdef Py_ssize_t i
-        cdef Py_buffer view
         cdef list failed = []
         numbers = empty(self.size)
-        PyObject_GetBuffer(numbers, &view, PyBUF_WRITABLE)
+        cdef double* out = as_double_pointer(numbers, self.size)
         for i in range(self.n):
-            if self.at[i].valid and not write_adjoint(self.at + i, velocities[i], impulses[i], slacks[i],
-                                                     <double*>view.buf + self.at[i].first):
+            if self.at[i].valid and not write_adjoint(self.at + i, velocities[i], impulses[i], slacks[i], out + self.at[i].first):
                 failed.append(i)
-        PyBuffer_Release(&view)
         return numbers, failed
 
     def result_slice(self, Py_ssize_t i):

@@ -31,7 +31,7 @@ BUDGETS = {
     "lavender_ext/accelerate lavender_ext/sweep": (2150, 2500),
     "lavender_ext/batch lavender_ext/small": (1800, 2350),
     "lavender_ext/core": (5300, 6500),
-    "lavender_ext/derivative": (750, 850),
+    "lavender_ext/derivative": (750, 0),
     "lavender_ext/driver lavender_ext/host": (250, 0),
     "lavender_ext/engine": (2650, 0),
     "lavender_ext/factor": (2600, 3300),
