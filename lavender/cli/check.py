@@ -72,6 +72,7 @@ def check(
     from lavender.report.check import cross_check
     from lavender.report.records import format_tolerance
     from lavender.report.terminal import print_table
+    from lavender.report.text import format_residual
     from lavender.solving.limits import check_time_limit
 
     limit_to_one_thread()
@@ -106,7 +107,8 @@ def check(
                 solutions += 1
                 above += stored.verdict != AT_FLOOR
                 unmet += stored.verdict not in (AT_FLOOR, CLOSE)
-                print_escaped(f"stored solution: {stored.verdict_in_words} of {stored.precision}; {stored}")
+                print_escaped(f"stored solution ({stored.precision}): {stored.verdict_in_words}")
+                print_escaped(f"    worst row {stored.worst_name or 'none'}: {format_residual(stored.velocity)} m/s")
             contradicted += len(comparison.contradicted)
             unaccepted += len(comparison.refused) == len(comparison.rows)
             if solvers or len(comparison.unsolved) + len(comparison.refused) == len(comparison.rows):

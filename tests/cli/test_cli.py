@@ -453,9 +453,9 @@ def test_check_judges_a_stored_answer_for_the_precision_it_was_made_in(lavender,
     told = ("--solvers", "pgs", "--precision", "float32")
     code, out, err = lavender("check", tmp_path / "done.npz", *told)
     assert code == 0, out + err
-    assert "stored solution: at its floor of float32" in " ".join(out.split())
+    assert "stored solution (float32): at its floor" in " ".join(out.split())
     code, out, _ = lavender("check", tmp_path / "early.npz", *told)
-    assert code == 1 and "stored solution: stopped before convergence, " in out
+    assert code == 1 and "stored solution (float32): stopped before convergence, " in out
     # Without the option the precision is the problem's, and the exit code that of the claims.
     assert lavender("check", tmp_path / "early.npz", *told[:2])[0] == 0
     code, _, err = lavender("check", tmp_path / "none.npz", *told)
