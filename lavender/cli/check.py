@@ -108,7 +108,9 @@ def check(
                 above += stored.verdict != AT_FLOOR
                 unmet += stored.verdict not in (AT_FLOOR, CLOSE)
                 print_escaped(f"stored solution ({stored.precision}): {stored.verdict_in_words}")
-                print_escaped(f"    worst row {stored.worst_name or 'none'}: {format_residual(stored.velocity)} m/s")
+                print_escaped(
+                    f"    worst row {stored.worst_name or 'none'}: {format_residual(stored.velocity)} m/s"
+                )
             contradicted += len(comparison.contradicted)
             unaccepted += len(comparison.refused) == len(comparison.rows)
             if solvers or len(comparison.unsolved) + len(comparison.refused) == len(comparison.rows):

@@ -110,7 +110,6 @@ def run(
     workers: int = 1,
     backend: str = "loky",
     watch: Watch | None = None,
-    isolate: bool = True,
     memory: int | None = None,
     into: list[Records] | None = None,
     reuse: bool = True,
@@ -135,11 +134,9 @@ def run(
         Backend of joblib: "loky" (processes here), "dask" (of the current dask.distributed client, or of
         DASK_SCHEDULER_ADDRESS); "dask=ADDRESS" connects to a cluster.
     watch : callable (Event), optional
-    isolate : bool
-        Run third-party solvers in another process; workers always do.
     memory : int, bytes, optional
-        Memory limit of that process. Default: half of the machine's memory, shared by the workers here or by the cores
-        of a machine of a cluster.
+        Memory limit of the process in which third-party solvers run. Default: half of the machine's memory, shared by
+        the workers here or by the cores of a machine of a cluster.
     into : list, optional
         Receives the records before the first is made, so that they are available if the run is interrupted.
     reuse : bool
@@ -175,7 +172,7 @@ def run(
     backend, cluster = connect_backend(backend) if spread else ("", contextlib.nullcontext())
     # The limit of threads covers the description of cases, which uses BLAS.
     with cluster, open_store(store) as kept, Worker(memory) as worker, limit_to_one_thread():
-        runner = Runner(this, plan, names, kept, watch, worker if isolate else None, reuse)
+        runner = Runner(this, plan, names, worker, kept, watch, reuse)
         if into is not None:
             into.append(runner.out)
         return runner.measure_items(items, workers, backend, memory)
@@ -189,9 +186,9 @@ class Runner:
         this: Run,
         plan: Plan,
         names: list[str],
+        worker: Worker,
         store: Store | None = None,
         watch: Watch | None = None,
-        worker: Worker | None = None,
         reuse: bool = True,
     ) -> None:
         self.this, self.plan, self.names = this, plan, names
@@ -490,7 +487,7 @@ class Runner:
         if self.plan.campaign and not is_third_party_solver(spec):
             # In a campaign, a time limit may only end processes of third-party solvers.
             task = replace(task, time_limit=math.inf)
-        if self.worker is not None and is_third_party_solver(spec):
+        if is_third_party_solver(spec):
             record, found = self.worker.measure_task(replace(problem, copy=False), task, impulse)
         else:
             record, found = measure_task(problem, task, impulse)
@@ -579,7 +576,7 @@ def measure_in_worker(pair: Pair, order: Order) -> tuple[int, list[Entry]]:
     global _last_case
     shared = machine.get_memory_per_process(os.cpu_count() or 1) if order.memory is None else order.memory
     with _register_solvers(order.local), limit_to_one_thread(pair.solver):
-        runner = Runner(order.run, order.plan, [pair.solver], worker=_get_isolated_worker(shared))
+        runner = Runner(order.run, order.plan, [pair.solver], _get_isolated_worker(shared))
         runner.known = {record.key: record for record in pair.known}
         runner.described = {} if pair.info is None else {pair.case: pair.info}
         key, item, info = None, None, None
