@@ -2,7 +2,7 @@
 
 A contestant solves a problem with increasingly tight settings of its own. Each run gives a CPU time and an impulse; the
 time to an error is the smallest time of a run that reaches it by the judge, whatever its setting. A contestant gets a
-problem in its better form (impulse or velocity form of `lavender.external.as_qp`, scaled, in its own data layout).
+problem in its better form (impulse or velocity form of `lavender.external.forms`, scaled, in its own data layout).
 Only the call of its interface is timed, not conversion and judging.
 """
 
@@ -26,9 +26,10 @@ from benchmarks.peers.backend_time import measure_backend_time
 from lavender import registry
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
-from lavender.external.as_qp import PROGRAM_FORMS, QP, ConicRows, build_program
+from lavender.external.as_qp import QP, ConicRows
 from lavender.external.backend import Backend
 from lavender.external.backends import BACKENDS
+from lavender.external.forms import PROGRAM_FORMS, build_program
 from lavender.external.qp_solver import QPSolver, explain_refusal
 from lavender.external.running import Limits
 from lavender.judge.residuals import get_zero_impulse_reference

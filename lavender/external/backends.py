@@ -1,6 +1,6 @@
 """Specs of all QP backends, for linear problems and boxed LCPs with symmetric A.
 
-    min 1/2 l.A l - b.l,  lower <= l <= upper        (impulse form), or the velocity form of `as_qp`
+    min 1/2 l.A l - b.l,  lower <= l <= upper        (impulse form), or the velocity form of `forms`
 
 `clarabel_cone` also supports the convex relaxation of friction. Disk and spin are second-order cones; a round cone is
 one cone:

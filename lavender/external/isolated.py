@@ -18,8 +18,9 @@ from lavender.base import subprocesses
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.base.subprocesses import InvalidAnswer, ProcessBackend, ProcessEnded, RemoteError
-from lavender.external.as_qp import QP, build_program
+from lavender.external.as_qp import QP
 from lavender.external.backend import Backend
+from lavender.external.forms import build_program
 from lavender.external.running import Answer, BackendFailed, Limits, capture_backend_output
 from lavender.judge.solution import Status
 from lavender.problem import Problem

@@ -12,8 +12,9 @@ from lavender.base.arrays import FloatArray, check_bool
 from lavender.base.deadline import Deadline
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.lazy_import import import_numerical_modules
-from lavender.external.as_qp import QP, build_program, choose_program_form, shift_to_definite
+from lavender.external.as_qp import QP, shift_to_definite
 from lavender.external.backend import Backend
+from lavender.external.forms import build_program, choose_program_form
 from lavender.external.isolated import ENTRY_SIZE, TRANSFER_RATE, IsolatedBackend, start_process
 from lavender.external.running import call_backend_until_accepted
 from lavender.judge.residuals import compute_stopping_residual

@@ -12,7 +12,7 @@ from worked import python
 
 import lavender as lv
 from lavender.external import backends
-from lavender.external.as_qp import build_program, choose_program_form
+from lavender.external.forms import build_program, choose_program_form
 from lavender.external.running import Limits
 
 

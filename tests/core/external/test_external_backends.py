@@ -16,7 +16,7 @@ from worked import python
 
 import lavender as lv
 from lavender import registry
-from lavender.external import as_qp, backends, qp_solver
+from lavender.external import backends, forms, qp_solver
 from lavender.external.running import Answer
 from lavender.judge.certificates import check_certificate
 
@@ -163,7 +163,7 @@ def test_rows_that_are_assumed_to_stay_at_their_bound_are_looked_at(name, form, 
     """With a threshold of 1e-3 nearly every row that b pushes to a bound is taken out, and many of them act."""
     if form == "velocity" and name in DEFINITE:
         pytest.skip("its velocity form has a definite P without bounds of joints alone")
-    monkeypatch.setattr(as_qp, "MAX_SCALED_RHS", share)
+    monkeypatch.setattr(forms, "MAX_SCALED_RHS", share)
     for seed in range(4):
         problem = random_contact_problem(seed, tangents=0, spin=False, bodies=4, contacts=8)
         problem = replace(problem, compliance=np.full(problem.m, 1e-3))
