@@ -39,7 +39,6 @@ MAX_SINGULAR_PIVOT = 1e-10
 # [-] Added to the unit diagonal of a singular P for backends for a definite P. With a smaller shift, rounding errors of
 # the inverse of P exceed the change of the answer, which is about the shift.
 DEFINITE_SHIFT = 1e-8
-# Power of two, larger than the differences of scale that matter to a backend.
 #: A friction component in scaled unknowns, |x_t / a_t| <= x_n: the row of x_n, the rows of x_t, and a_t of each.
 FrictionComponent = tuple[int, tuple[int, ...], tuple[float, ...]]
 

@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.base.lazy_import import sparse as sp
-from lavender.external.as_qp import QP, make_bound_rows, merge_bound_multipliers
+from lavender.external.as_qp import QP, ConicRows
 from lavender.external.running import (
     Answer,
     Call,
@@ -192,46 +191,34 @@ def _call_through_qpsolvers(
         dense = limit.attempt > 0 and qp.n * max(qp.n, len(qp.b)) <= MAX_PROXQP_ENTRIES
         settings.update(_make_proxqp_start(qp, impulse) if limit.attempt == 0 else {})
     settings.update(extra)
-    # Split the rows: the first `n_zero` are equalities, the others inequalities.
-    z = qp.n_zero
+    conic = ConicRows.from_program(qp) if backend.finite else None
+    matrix, rhs = (qp.A, qp.b) if conic is None else (conic.A, conic.b)
+    lb, ub = (qp.lb, qp.ub) if conic is None else (None, None)
     # In rows: pyqpmad factors a P in columns in place, and qpsolvers then computes multipliers from its factor; qpoases
     # reads the numbers of columns as those of rows.
-    p, rows = (np.ascontiguousarray(x.toarray()) if dense else x for x in (qp.P, qp.A))
-    lb, ub = (None, None) if backend.finite else (qp.lb, qp.ub)
-    inequality, rhs = rows[z:], qp.b[z:]
-    n_rows, has_bound_rows = len(rhs), backend.finite and qp.lb is not None
-    if has_bound_rows:
-        bounds, bound_rhs = make_bound_rows(qp)
-        bounds = bounds.toarray() if dense else bounds
-        stack = np.vstack if dense else sp.vstack
-        inequality, rhs = stack([inequality, bounds]) if n_rows else bounds, np.concatenate([rhs, bound_rhs])
-        inequality = inequality if dense else sp.csc_matrix(inequality)
-    g, h = (inequality, rhs) if len(rhs) else (None, None)
-    a, b = (rows[:z], qp.b[:z]) if z else (None, None)
+    p, rows = (np.ascontiguousarray(x.toarray()) if dense else x for x in (qp.P, matrix))
+    z = qp.n_zero  # The first rows are equalities, the others inequalities.
+    a, b = (rows[:z], rhs[:z]) if z else (None, None)
+    g, h = (rows[z:], rhs[z:]) if len(rhs) > z else (None, None)
     problem = qpsolvers.Problem(p, qp.q, g, h, a, b, lb, ub)
     x0 = settings.pop("initvals", None)
     with capture_backend_output(False) as warnings:
         solution = qpsolvers.solve_problem(problem, backend.name, initvals=x0, **settings)
-    warning = "; ".join(warnings)
     # Collect the status, the iterate and the multipliers.
     extras = solution.extras or {}
     status, status_text = _get_status(solution, extras)
-    zeta = np.zeros(len(qp.b))
     x = None if solution.x is None else np.asarray(solution.x, float).ravel()
-    if z and _has_size(solution.y, z):
-        zeta[:z] = solution.y
-    elif z:
-        x = x if qp.form == "impulse" else None
-    if len(qp.b) > z and _has_size(solution.z, len(rhs)):
-        zeta[z:] = np.asarray(solution.z)[: len(qp.b) - z]
-    elif len(qp.b) > z:
+    sizes = {"y": z, "z": len(rhs) - z, "z_box": qp.n}
+    values = {k: np.ravel([] if getattr(solution, k) is None else getattr(solution, k)) for k in sizes}
+    found = {k: v for k, v in values.items() if len(v) == sizes[k]}
+    if ("y" not in found and z and qp.form != "impulse") or ("z" not in found and len(qp.b) > z):
         x = None  # In the velocity form, impulses are computed from the multipliers alone.
-    xi = np.asarray(solution.z_box, float) if _has_size(solution.z_box, qp.n) else None
-    if has_bound_rows and _has_size(solution.z, len(rhs)):
-        xi = merge_bound_multipliers(qp, np.asarray(solution.z)[len(qp.b) - z :])
+    zeta, xi = np.concatenate([found.get(k, np.zeros(sizes[k])) for k in "yz"]), found.get("z_box")
+    if conic is not None:
+        zeta, xi = conic.split_multipliers(zeta)
     iterations = _get_iterations(extras)
     work = {} if iterations is None else {"iterations": iterations}
-    message = status_text or warning or _describe_result(solution.found, x)
+    message = status_text or "; ".join(warnings) or _describe_result(solution.found, x)
     if backend.settings is None:
         message += ", at its own tolerance"
     if backend.jax and not sys.modules["jax"].config.jax_enable_x64:
@@ -241,20 +228,7 @@ def _call_through_qpsolvers(
     direction, contradiction = (
         keep_if_infeasibility_certificate(qp, x, zeta) if status is Status.INFEASIBLE else (None, None)
     )
-    return Answer(
-        status=status,
-        message=message,
-        x=x,
-        zeta=zeta,
-        xi=xi,
-        work=work,
-        direction=direction,
-        contradiction=contradiction,
-    )
-
-
-def _has_size(y: Any, size: int) -> bool:
-    return y is not None and np.size(y) == size
+    return Answer(status, message, x, zeta, xi, work, direction, contradiction)
 
 
 def _describe_result(is_solved: bool | None, x: Any) -> str:
