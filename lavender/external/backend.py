@@ -228,7 +228,16 @@ def _call_through_qpsolvers(
     direction, contradiction = (
         keep_if_infeasibility_certificate(qp, x, zeta) if status is Status.INFEASIBLE else (None, None)
     )
-    return Answer(status, message, x, zeta, xi, work, direction, contradiction)
+    return Answer(
+        status=status,
+        message=message,
+        x=x,
+        zeta=zeta,
+        xi=xi,
+        work=work,
+        direction=direction,
+        contradiction=contradiction,
+    )
 
 
 def _describe_result(is_solved: bool | None, x: Any) -> str:
