@@ -41,8 +41,8 @@ class Behaviour:
     """Results of a backend alone, at its default settings, on small programs with solutions that are known.
 
     A verdict is "right" (found, within 1 %), "wrong" (found, but not right), "not found" or "raises". The programs are
-    in `PROBE_PROGRAMS` of `backends`, and `tests/core/external/backend_probes.py` runs them. Defaults are the results
-    of a backend that accepts every convex program.
+    in `PROBE_PROGRAMS` of `backends`, by the name of the field, and `tests/core/external/backend_probes.py` runs them.
+    Defaults are the results of a backend that accepts every convex program.
 
     Parameters
     ----------
@@ -56,20 +56,14 @@ class Behaviour:
         Verdicts.
     infeasible_x : str
         First entry of x after an infeasible program; "none" if no x is returned, "raises" after an exception.
-    linear_term : float or None
-        x2 with a small linear term and a singular P; None if a singular P is rejected.
-    small_part : float or None
-        x3 of two independent parts with linear terms of 3e6 and 1; 0.5 is right, None if it is not found.
+    linear_term, small_part, offset : float or None
+        x2, x3 and x1 - 1e8, for which 1, 0.5 and 0.3 are right; None if it is not found.
     fixed_multiplier : float
         Multiplier of a variable with equal bounds; -1 is right.
-    smallest : float
-        Largest tested size of a solution that is not returned within 1 %; 0 without one.
+    smallest, conflict : float
+        Largest e that is not returned within 1 %, and largest d that is reported as solved; 0 without one.
     far_bound : float
         Size of inactive bounds at which it first fails; inf if it does not fail.
-    conflict : float
-        Largest tested d with which x1 + x2 = 1 and x1 + x2 = 1 + d are reported as solved; 0 without one.
-    offset : float or None
-        x1 - 1e8 of a program between the bounds 1e8 and 1e8 + 1; 0.3 is right, None if it is not found.
     second_solve : str
         Bits of x of a second solve of one object without a start: "same", "other", or "" without such an object.
     time_limit : str
@@ -244,37 +238,38 @@ def _describe_result(is_solved: bool | None, x: Any) -> str:
     return "solved" if is_solved else "not solved" if x is not None else "not solved, nothing returned"
 
 
+def _find_value(extras: Mapping[str, Any], *names: str) -> Any:
+    """Return the first of the named values in the additional data of a backend; None without one."""
+    for source in (extras.get("info", extras.get("sip_output", extras)), extras):
+        for name in names:
+            value = source.get(name) if isinstance(source, Mapping) else getattr(source, name, None)
+            if value is not None:
+                return value
+    return None
+
+
 def _get_iterations(extras: Mapping[str, Any]) -> int | None:
     """Return the number of iterations from the additional data of a backend, or None if they do not contain it."""
-    info = extras.get("info", extras.get("sip_output", extras))
-    for source in (info, extras):
-        for name in ("iter", "iterations", "num_iterations", "nbIter", "num_iter", "iter_num"):
-            value = source.get(name) if isinstance(source, Mapping) else getattr(source, name, None)
-            if isinstance(value, (int, np.integer)):
-                return int(value)
-            if isinstance(value, (tuple, list, np.ndarray)) and len(value):
-                return int(value[0])  # quadprog returns two counts, of added and of dropped constraints.
-    stats = extras.get("stats")
-    return len(stats) if isinstance(stats, list) else None
+    value = _find_value(
+        extras, "iter", "iterations", "num_iterations", "nbIter", "num_iter", "iter_num", "nWSR", "stats"
+    )
+    if isinstance(value, list) and value and isinstance(value[0], Mapping):
+        return len(value)  # qtqp returns the statistics of each iteration.
+    # quadprog returns two counts, of added and of dropped constraints.
+    value = value[0] if isinstance(value, (tuple, list, np.ndarray)) and len(value) else value
+    return int(value) if isinstance(value, (int, np.integer)) else None
 
 
 def _get_status(solution: Any, extras: Mapping[str, Any]) -> tuple[Status, str]:
     """Return the status, and the backend's text for it if qpsolvers returns one."""
-    info = extras.get("info", extras.get("sip_output", extras))
-    text = ""
-    for name in ("status", "exitFlag", "exit_status"):
-        value = info.get(name) if isinstance(info, Mapping) else getattr(info, name, None)
-        if value is None:
-            value = extras.get(name)
-        if value is not None:
-            text = str(getattr(value, "name", value))
-            text = f"status {text}" if text.lstrip("-").isdigit() else text
-            break
+    value, flag = _find_value(extras, "status", "exitFlag", "exit_status"), _find_value(extras, "exitFlag")
+    text = "" if value is None else str(getattr(value, "name", value))
+    text = f"status {text}" if text.lstrip("-").isdigit() else text
     if solution.found:
         return Status.CONVERGED, text
-    if "exitFlag" in (info if isinstance(info, Mapping) else ()):
+    if flag is not None:
         ecos = {1: Status.INFEASIBLE, 2: Status.INFEASIBLE, 10: Status.STALLED, -1: Status.MAX_ITERATIONS}
-        return ecos.get(int(info["exitFlag"]), Status.NUMERICAL_ERROR), text
+        return ecos.get(int(flag), Status.NUMERICAL_ERROR), text
     status = classify_status(text)
     return Status.NUMERICAL_ERROR if status is Status.CONVERGED else status, text
 

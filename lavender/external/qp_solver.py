@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -92,21 +93,19 @@ class QPSolver(Solver):
             return Claim(Status.NUMERICAL_ERROR, 0, no_work, message, qp.form)
         isolated = IsolatedBackend(b) if self.isolate and time_limit is not None else None
         deadline, start = Deadline(time_limit), impulse.copy()
-        claim = call_backend_until_accepted(
-            qp, impulse, isolated or b.run, max_iter, tol, time_limit, self.settings, b.noisy
+        call = partial(
+            call_backend_until_accepted,
+            call=isolated or b.run,
+            tol=tol,
+            settings=self.settings,
+            noisy=b.noisy,
         )
-        if (
-            len(qp.assumed)
-            and not deadline.has_passed()
-            and _violates_inactive_row_assumption(qp, impulse, claim)
-        ):
+        claim = call(qp, impulse, max_iter=max_iter, time_limit=time_limit)
+        has_assumed = len(qp.assumed) and not deadline.has_passed()
+        if has_assumed and _violates_inactive_row_assumption(qp, impulse, claim):
             first_claim, impulse[:] = claim, start
-            remaining = max(1, max_iter - first_claim.iterations)
-            qp = self._build_program(qp.problem, False)
-            call = isolated or b.run
-            claim = call_backend_until_accepted(
-                qp, impulse, call, remaining, tol, deadline.get_remaining_seconds(), self.settings, b.noisy
-            )
+            qp, remaining = self._build_program(qp.problem, False), max(1, max_iter - claim.iterations)
+            claim = call(qp, impulse, max_iter=remaining, time_limit=deadline.get_remaining_seconds())
             work = sum_work_counts((first_claim.work, claim.work))
             claim = replace(claim, work=work, iterations=first_claim.iterations + claim.iterations)
         if time_limit is None or b.stoppable:
