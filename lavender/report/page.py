@@ -57,7 +57,7 @@ def render_page(report: Report, figures: bool = True, folder: Path | None = None
     drawn = draw_figures(built, assign_styles(list_solvers(built)), folder)
     return str(
         create_environment().get_template("index.html.j2").render(
-            report=report, drawn=drawn,
+            title="lavender report", report=report, drawn=drawn,
             left_out=list_cases_not_loaded(report.records), diagnostics=list_diagnostics(report.records),
             n_failures=len(select_failures(report)) if len(report.frame) else 0,
         )

@@ -77,7 +77,7 @@ class SummaryPage:
             if part.is_shown
         ]
         template = create_environment().get_template("summary_page.html.j2")
-        return str(template.render(page=self, sections=sections))
+        return str(template.render(title=self.title, page=self, sections=sections))
 
     def write(self, folder: str | os.PathLike[str]) -> Path:
         """Write `index.html`, `numbers.json` and `figures/*.svg`; return the path of the page."""
