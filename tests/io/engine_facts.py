@@ -7,7 +7,7 @@ import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 
-PROBE_MODULES = "engine_probes", "engine_newton_probes", "engine_file_probes"
+PROBE_MODULES = "engine_probes", "engine_drake_probes", "engine_newton_probes", "engine_file_probes"
 
 
 @dataclass(frozen=True)

@@ -3,12 +3,14 @@
 import contextlib
 import io
 import tempfile
+import warnings
 from pathlib import Path
 
 import numpy as np
+from engine_drake_probes import DRAKE
 from engine_facts import fact
 from engine_newton_probes import NEWTON
-from engine_probes import DRAKE, GENESIS, MUJOCO, PINOCCHIO, PYBULLET, SAPIEN, make_genesis, make_mujoco, make_pybullet
+from engine_probes import GENESIS, MUJOCO, PINOCCHIO, PYBULLET, SAPIEN, make_genesis, make_mujoco, make_pybullet
 
 # -- one URDF in several engines -----------------------------------------------------------------------
 
@@ -292,3 +294,26 @@ def newton_drops_static_friction():
     with contextlib.redirect_stdout(io.StringIO()):
         builder.add_usd(stage)
     return np.allclose(builder.shape_material_mu, [0.2])
+
+
+@fact(
+    *NEWTON,
+    "`save_to_mjcf` of SolverMuJoCo",
+    "`solreflimit` is not written: joint limits have MuJoCo's default of 0.02 s in the file, and the stiffness and "
+    "damping of `limit_ke` and `limit_kd` in the solver. The time step of the file is 2 ms.",
+    "`from_mujoco` has the limits of the file, and `from_newton_mujoco` those of the solver.",
+)
+def newton_drops_limit_stiffness_in_mjcf():
+    import mujoco
+    import newton
+
+    builder = newton.ModelBuilder()
+    newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
+    builder.add_urdf(write_urdf("revolute"))
+    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # newton 1.8 warns of newer versions of MuJoCo.
+        path = str(Path(folder, "model.xml"))
+        solver = newton.solvers.SolverMuJoCo(builder.finalize(device="cpu"), save_to_mjcf=path)
+        model = mujoco.MjModel.from_xml_path(path)
+    used = solver.mjw_model.jnt_solref.numpy().reshape(-1, 2)[0]
+    return np.allclose(model.jnt_solref[0], [0.02, 1.0]) and not np.allclose(used, [0.02, 1.0], rtol=0.1)

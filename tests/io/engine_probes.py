@@ -284,6 +284,30 @@ def pybullet_divides_forces_by_substeps():
     return np.allclose(sums, [10.0, 2.5], rtol=1e-3)
 
 
+@fact(
+    *PYBULLET,
+    "friction of two shapes",
+    "The product of both coefficients acts: 0.2 and 0.8 give 0.16, and 0.5 and 0.5 give 0.25.",
+)
+def pybullet_multiplies_friction():
+    ratios = []
+    for pair in ((0.2, 0.8), (0.5, 0.5)):
+        bullet = make_pybullet(fixedTimeStep=0.005)
+        bullet.setGravity(9.0, 0.0, -10.0)
+        shapes = (
+            bullet.createCollisionShape(bullet.GEOM_PLANE),
+            bullet.createCollisionShape(bullet.GEOM_SPHERE, radius=0.1),
+        )
+        bodies = bullet.createMultiBody(0, shapes[0]), bullet.createMultiBody(1, shapes[1], basePosition=[0, 0, 0.1])
+        for body, friction in zip(bodies, pair, strict=True):
+            bullet.changeDynamics(body, -1, lateralFriction=friction)
+        for _ in range(60):
+            bullet.stepSimulation()
+        (point,) = bullet.getContactPoints(bodies[1])
+        ratios.append(np.hypot(point[10], point[12]) / point[9])
+    return np.allclose(ratios, [0.16, 0.25], rtol=1e-2)
+
+
 SAPIEN = "SAPIEN", "sapien", "3.0.3"
 
 
@@ -373,53 +397,6 @@ def warp_applies_noslip():
         option = f'cone="elliptic" noslip_iterations="{n}" gravity="3 0 -9.81">'
         speeds.append(abs(float(run_warp(option, 200, nconmax=64, njmax=64)[2].qvel.numpy()[0, 0])))
     return speeds[1] < 1e-6 < 5e-4 < speeds[0]
-
-
-# -- Drake ---------------------------------------------------------------------------------------------
-
-DRAKE = "Drake", "pydrake", "1.51.1"
-
-
-@fact(
-    *DRAKE,
-    "rest depth",
-    "A resting body penetrates more with kSap, in proportion to the time step, than with kLagged, kSimilar and kTamsi: "
-    "a box of 1 kg on four small spheres by 0.28 mm with steps of 10 ms, and by 0.005 mm with the others.",
-    "The problem is rigid: its `correction` is 0 by default, so this depth is not pushed out.",
-)
-def drake_rests_deeper_with_sap():
-    from pydrake.all import (
-        AddMultibodyPlantSceneGraph,
-        CoulombFriction,
-        DiagramBuilder,
-        DiscreteContactApproximation,
-        HalfSpace,
-        RigidTransform,
-        Simulator,
-        SpatialInertia,
-        Sphere,
-    )
-
-    depths = {}
-    for name in ("kSap", "kLagged", "kSimilar", "kTamsi"):
-        for dt in (0.01, 0.001):
-            builder = DiagramBuilder()
-            plant, _ = AddMultibodyPlantSceneGraph(builder, dt)
-            plant.set_discrete_contact_approximation(getattr(DiscreteContactApproximation, name))
-            friction = CoulombFriction(0.5, 0.5)
-            plant.RegisterCollisionGeometry(plant.world_body(), RigidTransform(), HalfSpace(), "ground", friction)
-            body = plant.AddRigidBody("box", SpatialInertia.SolidBoxWithMass(1.0, 0.2, 0.2, 0.2))
-            for k, corner in enumerate(np.array([(x, y, -0.08) for x in (-0.08, 0.08) for y in (-0.08, 0.08)])):
-                plant.RegisterCollisionGeometry(body, RigidTransform(corner), Sphere(0.02), f"foot {k}", friction)
-            plant.SetDefaultFloatingBaseBodyPose(body, RigidTransform([0.0, 0.0, 0.1]))
-            plant.Finalize()
-            simulator = Simulator(builder.Build())
-            simulator.AdvanceTo(2.0)
-            context = plant.GetMyContextFromRoot(simulator.get_context())
-            depths[name, dt] = 0.1 - plant.EvalBodyPoseInWorld(context, body).translation()[2]
-    others = [depth for (name, _), depth in depths.items() if name != "kSap"]
-    sap = depths["kSap", 0.01], depths["kSap", 0.001]
-    return max(others) < 1e-5 < 2e-5 < sap[1] < sap[0] / 8.0 and sap[0] < 1e-3
 
 
 # -- Pinocchio -----------------------------------------------------------------------------------------
