@@ -30,7 +30,9 @@ from lavender.external.running import (
 )
 from lavender.judge.solution import Status
 
-MAX_PROXQP_ENTRIES = 10**6  # Larger programs are passed to proxqp as sparse matrices in repeated calls, too.
+# Larger programs are passed as sparse matrices. Of 398 programs, PIQP did not solve 1 if sparse, none if dense.
+MAX_PIQP_ENTRIES = 10**4
+MAX_PROXQP_ENTRIES = 10**6  # The same, of repeated calls of proxqp.
 # A backend that replaces the handler of Ctrl-C puts the previous one back. Two of them at the same time would leave the
 # handler of one, with which Ctrl-C no longer raises KeyboardInterrupt.
 _HANDLER_LOCK = threading.Lock()
@@ -179,10 +181,11 @@ def _call_through_qpsolvers(
     limits = {**vars(limit), "eps": eps}
     options = {name: limits[x] if isinstance(x, str) else x for name, x in (backend.settings or {}).items()}
     settings = {name: x for name, x in options.items() if x is not None}  # Leave out a time limit of None.
-    dense = backend.dense
+    size = qp.n * max(qp.n, len(qp.b))
+    dense = backend.dense or (backend.name == "piqp" and size <= MAX_PIQP_ENTRIES)
     if backend.name == "proxqp":
         # Its sparse code calls a few feasible programs infeasible; its dense code is slower and does so less often.
-        dense = limit.attempt > 0 and qp.n * max(qp.n, len(qp.b)) <= MAX_PROXQP_ENTRIES
+        dense = limit.attempt > 0 and size <= MAX_PROXQP_ENTRIES
         settings.update(_make_proxqp_start(qp, impulse) if limit.attempt == 0 else {})
     settings.update(extra)
     conic = ConicRows.from_program(qp) if backend.finite else None

@@ -87,6 +87,7 @@ BACKENDS: tuple[Backend, ...] = (
             behaviour=Behaviour("0.7.0", conflict=1e-8, offset=0.01, saddle="right", infeasible_x="0", far_bound=1e9,
                 small_part=2.0,
                 second_solve="same", notes={
+                "sparse": "With sparse arrays, a linear program is not solved that it solves with dense arrays.",
                 "unsorted": "If the indices of a sparse P are not sorted, a solvable program is not solved."})),
     Backend("proxqp", ("qpsolvers", "proxsuite"), "proxsuite", "proximal augmented Lagrangian",
             "Bambade et al. 2022, ProxQP", settings=PROXIMAL | {"rho": PROXQP_PROXIMAL_WEIGHT},

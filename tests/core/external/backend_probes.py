@@ -229,6 +229,15 @@ def piqp_fails_with_unsorted_indices():
     return not found[0].found and give_verdict(found[1], [1 / 3, 1 / 3]) == "right"
 
 
+def piqp_solves_dense_arrays_only():
+    from backend_truth import draw_program
+
+    program, tight = draw_program(285), {"eps_abs": 1e-6, "eps_rel": 0.0, "check_duality_gap": True}
+    tight |= {"eps_duality_gap_abs": 1e-6, "eps_duality_gap_rel": 0.0}
+    sparse, dense = (run_alone("piqp", sparse=x, settings=tight, **program) for x in (True, False))
+    return dense.found and not sparse.found
+
+
 def proxqp_finds_a_program_infeasible():
     program = {"P": np.diag([1, 0]), "q": [2, -1], "G": [[0, 1]], "h": [1], "A": [[1, 0]], "b": [0]}
     program |= {"lb": [-5, -5], "ub": [5, 5]}
@@ -300,6 +309,7 @@ NOTE_PROBES = {
     ("osqp", "kept_y"): osqp_keeps_y,
     ("scs", "start"): scs_needs_x_y_and_s,
     ("scs", "memory"): scs_keeps_its_scale,
+    ("piqp", "sparse"): piqp_solves_dense_arrays_only,
     ("piqp", "unsorted"): piqp_fails_with_unsorted_indices,
     ("proxqp", "false_infeasible"): proxqp_finds_a_program_infeasible,
     ("proxqp", "dense_triangle"): lambda: find_triangle("proxqp", False) == "lower",
