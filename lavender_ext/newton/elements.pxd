@@ -91,6 +91,19 @@ cdef inline void invert_small_matrix(double* a, double* inv, int32_t n) noexcept
                         inv[i * n + j] -= x * inv[k * n + j]
 
 
+cdef inline void invert_and_multiply(double* a, const double* p, double* inv, double* v, int32_t n) noexcept nogil:
+    """Write the inverse of a (n, n) to inv and inv p to v; a is overwritten."""
+    cdef int32_t i, j, k
+    cdef double x
+    invert_small_matrix(a, inv, n)
+    for i in range(n):
+        for j in range(n):
+            x = 0.0
+            for k in range(n):
+                x += inv[i * n + k] * p[k * n + j]
+            v[i * n + j] = x
+
+
 cdef inline void multiply_by_element_matrices(const elements_t* e, const double* w, const double* x, double* out,
                                const bint turned) noexcept nogil:
     """Compute out = W x, or W^T x, with one small matrix for each element."""

@@ -14,7 +14,7 @@ from libc.stdint cimport int32_t
 from lavender_ext.core.block cimport euclidean_norm
 from lavender_ext.core.block_projection cimport classify_active_bound, evaluate_natural_map
 from lavender_ext.core.block_types cimport CONE, friction_components_t
-from lavender_ext.newton.elements cimport load_components, elements_t, invert_small_matrix, is_row
+from lavender_ext.newton.elements cimport load_components, elements_t, invert_and_multiply, is_row
 
 
 cdef inline void evaluate_contact_natural_map(const elements_t* e, int32_t i, int32_t law, const double* z, const double* s,
@@ -33,7 +33,7 @@ cdef inline double evaluate_all_natural_maps(const elements_t* e, const double* 
 
     law is CONE or COULOMB. If v is NULL, only F and P are computed.
     """
-    cdef int32_t i, j, k, l, q, nr, side, c
+    cdef int32_t i, j, k, l, q, nr, side
     cdef double total = 0.0
     cdef double x
     cdef double a[36]
@@ -59,13 +59,7 @@ cdef inline double evaluate_all_natural_maps(const elements_t* e, const double* 
                     x = p[q + k * nr + l]
                     a[k * nr + l] = x * (e.theta[j + l] + eps) - x
                 a[k * nr + k] += 1.0
-            invert_small_matrix(a, einv + q, nr)
-            for k in range(nr):
-                for l in range(nr):
-                    x = 0.0
-                    for c in range(nr):
-                        x += einv[q + k * nr + c] * p[q + c * nr + l]
-                    v[q + k * nr + l] = x
+            invert_and_multiply(a, p + q, einv + q, v + q, nr)
     return sqrt(total)
 
 

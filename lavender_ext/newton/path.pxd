@@ -43,7 +43,7 @@ from libc.string cimport memset
 from lavender_ext.core.validate cimport all_finite
 from lavender_ext.core.block_types cimport COULOMB
 from lavender_ext.newton.cones cimport has_lower_bound, has_upper_bound
-from lavender_ext.newton.elements cimport elements_t, invert_small_matrix, is_row
+from lavender_ext.newton.elements cimport elements_t, invert_and_multiply, is_row
 from lavender_ext.newton.phases cimport begin_damped_newton, push_damped_newton
 from lavender_ext.newton.run cimport (N_PATH, PATH, compute_slack, copy_vector, is_finished, newton_t, path_t,
                                       pop_phase, push_phase, judge_and_keep_best_point)
@@ -226,8 +226,7 @@ cdef inline void evaluate_smoothed_map(newton_t* n, const double* z, double tau,
     """Compute F of z into n.f and y into n.t1; with `derived` also the small matrices and dF / d log tau (n.c)."""
     cdef const elements_t* e = n.s.e
     cdef double eps = n.path.eps
-    cdef int32_t i, j, k, l, t, q, nr
-    cdef double x
+    cdef int32_t i, j, k, l, q, nr
     cdef smooth_t own
     compute_slack(n, z, n.slack)
     for j in range(e.m):
@@ -250,13 +249,7 @@ cdef inline void evaluate_smoothed_map(newton_t* n, const double* z, double tau,
             for l in range(nr):
                 n.s.p[q + k * nr + l] = own.p[k * nr + l]
                 own.rest[k * nr + l] += own.p[k * nr + l] * (e.theta[j + l] + eps)
-        invert_small_matrix(own.rest, n.s.einv + q, nr)
-        for k in range(nr):
-            for l in range(nr):
-                x = 0.0
-                for t in range(nr):
-                    x += n.s.einv[q + k * nr + t] * own.p[t * nr + l]
-                n.s.v[q + k * nr + l] = x
+        invert_and_multiply(own.rest, own.p, n.s.einv + q, n.s.v + q, nr)
 
 
 cdef inline void compute_change_of_y(newton_t* n, const double* dz, double* dy) noexcept nogil:
@@ -338,11 +331,9 @@ cdef inline double find_largest_coordinate_change(const newton_t* n, const doubl
 
 
 cdef inline void begin_path(newton_t* n) noexcept nogil:
-    """Begin the next path from z = 0. It uses the memory of interior points and exchanges, which have ended."""
+    """Begin the next path from z = 0."""
     cdef path_t* x = &n.path
     cdef int32_t j, m = n.s.e.m
-    x.z, x.t, x.b = n.ip.z, n.ip.u1, n.ip.hz
-    x.saved_z[0], x.saved_t[0], x.saved_z[1], x.saved_t[1] = n.active.z, n.active.hz, n.active.best_z, n.ip.unbounded_z
     memset(x.z, 0, m * sizeof(double))
     x.size = 0.0
     for j in range(m):

@@ -24,6 +24,7 @@ from lavender_ext.core.block_types cimport CONE
 from lavender_ext.judge.score cimport relative_residual
 from lavender_ext.newton.cones cimport cone_gap, cone_size, has_lower_bound, has_upper_bound, load_cone_variable
 from lavender_ext.newton.elements cimport elements_t, is_row
+from lavender_ext.newton.line_search cimport is_reduction_sufficient
 from lavender_ext.newton.run cimport (ACTIVE_SET, AUGMENTED_NEWTON, DAMPED_NEWTON, DAMPED_STRETCHES, INTERIOR_POINT,
                                       INTERIOR_WITH_NEWTON, MAX_INNER_STEPS, N_ACTIVE_SET, N_AUGMENTED_DE_SAXCE,
                                       N_AUGMENTED_INTERIOR, N_AUGMENTED_NEWTON, N_DE_SAXCE, N_INTERIOR, N_PROXIMAL, PLAN_COULOMB,
@@ -459,7 +460,7 @@ cdef inline bint take_inner_newton_step(newton_t* n, damped_newton_t* x) noexcep
         value = compute_trial_residual_norm(n, x, t)
         if value < best:
             best, at = value, t
-        if value <= (1.0 - 1e-4 * t) * bound:
+        if is_reduction_sufficient(value, t, bound):
             break
         t *= 0.5
     for j in range(m):

@@ -8,7 +8,7 @@ from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy, memset
 
 from lavender_ext.core.arena cimport arena_t, has_memory, take_doubles, take_integers
-from lavender_ext.core.block_types cimport blocks_t
+from lavender_ext.core.block_types cimport COULOMB, blocks_t
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.factor.linear cimport linear_t
 from lavender_ext.judge.best cimport (
@@ -140,7 +140,7 @@ cdef struct de_saxce_t:
     int32_t augmented
 
 
-cdef struct path_t:             # a path of smoothed problems; its vectors belong to phases that have ended
+cdef struct path_t:             # a path of smoothed problems
     double* z                   # the last point
     double l                    # log tau of the last point
     double* t                   # z part of the tangent
@@ -174,7 +174,7 @@ cdef struct path_t:             # a path of smoothed problems; its vectors belon
     int32_t last                # factorisations at which the path ends
 
 
-cdef struct shifted_t:          # convex problems with a fixed shift; its vectors belong to phases that have ended
+cdef struct shifted_t:          # convex problems with a fixed shift
     double* z                   # the point of (1)
     double* hz                  # H z
     double* centre              # c
@@ -294,10 +294,22 @@ cdef inline void bind_vectors(newton_t* n, int64_t m, arena_t* a) noexcept nogil
         at[i][0] = take_doubles(a, m)
 
 
-cdef inline void bind_values(newton_t* n, int64_t small, arena_t* a) noexcept nogil:
-    """Take the judge's arrays, and in zeros the elements, the vectors, and small matrices of `small` entries in all.
+cdef inline void bind_coulomb_vectors(newton_t* n, int64_t m, arena_t* a) noexcept nogil:
+    """Take the vectors (m) of paths and of shifted Newton, which set them before they read them."""
+    cdef path_t* p = &n.path
+    cdef shifted_t* s = &n.shifted
+    p.z, p.t, p.b = take_doubles(a, m), take_doubles(a, m), take_doubles(a, m)
+    p.saved_z[0], p.saved_z[1] = take_doubles(a, m), take_doubles(a, m)
+    p.saved_t[0], p.saved_t[1] = take_doubles(a, m), take_doubles(a, m)
+    s.z, s.hz, s.centre, s.shift = take_doubles(a, m), take_doubles(a, m), take_doubles(a, m), take_doubles(a, m)
+    s.step, s.centre_step, s.next = take_doubles(a, m), take_doubles(a, m), take_doubles(a, m)
 
-    The caller then calls `scale_problem` and sets `form`, `symmetric` and the fields of the form.
+
+cdef inline void bind_values(newton_t* n, int64_t small, bint clear, arena_t* a) noexcept nogil:
+    """Take the judge's arrays, the elements, the vectors, and small matrices of `small` entries in all.
+
+    With `clear` those that must begin with zeros are set to 0. The caller then calls `scale_problem` and sets `form`,
+    `symmetric` and the fields of the form.
     """
     cdef int64_t m = n.problem.p.n_rows, first
     bind_judge_arrays(n, a)
@@ -306,8 +318,10 @@ cdef inline void bind_values(newton_t* n, int64_t small, arena_t* a) noexcept no
     bind_vectors(n, m, a)
     n.s.v, n.s.einv, n.s.p, n.s.pair, n.s.bt = (take_doubles(a, small), take_doubles(a, small), take_doubles(a, small),
                                                 take_doubles(a, small), take_doubles(a, small))
-    if has_memory(a):
+    if clear:
         memset(a.real + first, 0, (a.n_real - first) * sizeof(double))
+    if n.problem.p.law == COULOMB:
+        bind_coulomb_vectors(n, m, a)
 
 
 cdef inline void scale_problem(newton_t* n, const view_t* v) noexcept nogil:

@@ -16,14 +16,15 @@ and phi by the last update,
 (Cadoux 2009). At a fixed point of (3), c solves Coulomb's law for every eps. Updates that keep their direction and fall
 slowly, as when bodies slide to another contact state, are extrapolated by heavy-ball momentum.
 """
-from libc.math cimport fabs, sqrt
+from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 from libc.string cimport memset
 
 from lavender_ext.core.block_types cimport CONE, COULOMB
 from lavender_ext.core.dot cimport dot
 from lavender_ext.core.validate cimport all_finite
-from lavender_ext.newton.elements cimport elements_t, invert_small_matrix
+from lavender_ext.newton.elements cimport elements_t, invert_and_multiply
+from lavender_ext.newton.line_search cimport begin_line_search, line_t, narrow_line_search
 from lavender_ext.newton.natural_map cimport evaluate_all_natural_maps
 from lavender_ext.newton.phases cimport begin_damped_newton, push_damped_newton
 from lavender_ext.newton.run cimport (N_SHIFTED, SHIFTED_NEWTON, convex_residual, copy_vector, is_finished,
@@ -36,7 +37,6 @@ cdef enum:
     MAX_SHIFTED_STEPS = 20      # Newton steps (2) of one problem (1).
     MANY_SHIFTED_STEPS = 12     # eps doubles if (1) takes this many steps.
     TRIAL_FACTORISATIONS = 4    # Budget of damped Newton under Coulomb's law, at each decade of the residual.
-    MAX_BISECTIONS = 16         # Evaluations of one line search after its first two.
     MAX_FREE_UPDATES = 50       # The phase ends after this many updates (3) in a row without a factorisation.
     SHIFTED_PATIENCE = 200      # The phase ends if so many factorisations do not halve the change (3).
     SLOW_UPDATES = 5            # Momentum begins if this many updates lower the change of phi by less than `slow_ratio`.
@@ -64,8 +64,6 @@ cdef inline void begin_shifted_newton(newton_t* n, const double* z, int32_t limi
     """
     cdef shifted_t* x = &n.shifted
     cdef int32_t j, m = n.s.e.m
-    x.centre, x.shift, x.step, x.centre_step, x.next = n.ip.z, n.ip.u1, n.ip.u2, n.ip.hz, n.ip.unbounded_z
-    x.z, x.hz = n.active.z, n.active.hz
     copy_vector(n, x.z, z)
     copy_vector(n, x.centre, z)
     multiply_system_matrix(&n.s, x.z, x.hz)
@@ -89,9 +87,8 @@ cdef inline void evaluate_shifted_map(newton_t* n, double t, bint derived) noexc
     """Compute F of (1) at z + t dz into n.r and Pi_K(.) into n.t1; with `derived` also the matrices of (2), P / eps, in n.s."""
     cdef shifted_t* x = &n.shifted
     cdef const elements_t* e = n.s.e
-    cdef int32_t i, j, k, l, c, q, nr
+    cdef int32_t i, j, k, l, q, nr
     cdef double a[36]
-    cdef double y
     for j in range(e.m):
         n.trial[j] = x.centre[j] - (x.hz[j] + (t * n.hdz[j] if t != 0.0 else 0.0) - e.g[j] + x.shift[j]) / x.eps
     memset(n.slack, 0, e.m * sizeof(double))
@@ -110,13 +107,7 @@ cdef inline void evaluate_shifted_map(newton_t* n, double t, bint derived) noexc
                 n.s.p[q + k * nr + l] /= x.eps
                 a[k * nr + l] = n.s.p[q + k * nr + l] * e.theta[j + l]
             a[k * nr + k] += 1.0
-        invert_small_matrix(a, n.s.einv + q, nr)
-        for k in range(nr):
-            for l in range(nr):
-                y = 0.0
-                for c in range(nr):
-                    y += n.s.einv[q + k * nr + c] * n.s.p[q + c * nr + l]
-                n.s.v[q + k * nr + l] = y
+        invert_and_multiply(a, n.s.p + q, n.s.einv + q, n.s.v + q, nr)
 
 
 cdef inline bint update_shift(newton_t* n) noexcept nogil:
@@ -178,23 +169,12 @@ cdef inline bint update_shift(newton_t* n) noexcept nogil:
 
 cdef inline double find_line_minimum(newton_t* n, double slope) noexcept nogil:
     """Return t of (2) to a tenth of the slope at t = 0."""
-    cdef double low = 0.0, high = 1.0, t = 1.0, now
-    cdef int32_t _
-    for _ in range(MAX_BISECTIONS):
-        evaluate_shifted_map(n, t, False)
-        now = dot(n.hdz, n.r, n.s.e.m)
-        if fabs(now) <= 0.1 * fabs(slope):
-            return t
-        if now < 0.0:
-            low = t
-            if high == t and high < 16.0:
-                high *= 2.0
-                t = high
-                continue
-        else:
-            high = t
-        t = 0.5 * (low + high)
-    return t
+    cdef line_t line
+    begin_line_search(&line, slope)
+    while True:
+        evaluate_shifted_map(n, line.t, False)
+        if narrow_line_search(&line, dot(n.hdz, n.r, n.s.e.m)):
+            return line.t
 
 
 cdef inline void step_shifted_newton(newton_t* n) noexcept nogil:

@@ -126,7 +126,7 @@ cdef int32_t rows_workspace_size(const view_t* v, const options_t* o, workspace_
     take_integers(&a, head())
     bind_indices(&n, &a)
     if m <= MAX_ALWAYS_DENSE_ROWS:
-        bind_values(&n, 6 * m, &a)                      # No row is fixed, and all contacts have six rows with friction.
+        bind_values(&n, 6 * m, False, &a)               # No row is fixed, and all contacts have six rows with friction.
         bind_row_values(&n, m, True, &a)
     elif not has_dense_rows(entries, m, v.p.law == CONE):
         take_integers(&a, 60 * m + 11 * entries)
@@ -166,11 +166,11 @@ cdef int32_t start_newton_over_rows(const view_t* v, const options_t* o, workspa
     if how != MORE:
         return how
     set_problem(n, &v.p, v.a, NULL, NULL)
-    bind_values(n, n.sc.small, &counted)
+    bind_values(n, n.sc.small, False, &counted)
     bind_row_values(n, n.sc.e.m, n.s.form == DENSE, &counted)
     if not require_workspace(r, r.n_index, counted.n_real):
         return NEEDS_WORKSPACE
-    bind_values(n, n.sc.small, &a)
+    bind_values(n, n.sc.small, True, &a)
     scale_problem(n, v)
     bind_row_values(n, n.sc.e.m, n.s.form == DENSE, &a)
     form_row_system(n, v.a, o.wide)
@@ -198,7 +198,7 @@ cdef int32_t bodies_workspace_size(const view_t* v, const options_t* o, workspac
 cdef inline void bind_body_values(newton_t* n, const view_t* v, int32_t wide, double** panel, double** y, double** root,
                                   arena_t* a) noexcept nogil:
     """Take all values after the analysis: the panel (rows, 12), y (6 n_bodies) and root (10 n_bodies), and the factor."""
-    bind_values(n, n.sc.small, a)
+    bind_values(n, n.sc.small, a.real != NULL, a)
     panel[0], root[0] = take_doubles(a, 12 * <int64_t>v.p.n_rows), take_doubles(a, 10 * <int64_t>v.r.n_bodies)
     y[0] = take_doubles(a, 6 * <int64_t>v.r.n_bodies)
     bind_block_factor_values(&n.linear.blocks, needs_lu(n, &v.p), wide, a)
@@ -398,10 +398,10 @@ cdef class Solve(Method):
         a = make_arena(NULL, <int32_t*>get_data_pointer(self.index))
         bind_indices(n, &a)
         index_unfixed_elements(&n.sc, &v)
-        bind_values(n, n.sc.small, &a)
+        bind_values(n, n.sc.small, False, &a)
         self.held, self.real = [matrix], allocate_zeros(a.n_real)
         a = make_arena(<double*>get_data_pointer(self.real), NULL)
-        bind_values(n, n.sc.small, &a)
+        bind_values(n, n.sc.small, False, &a)
         scale_problem(n, &v)
         m = self.m = n.sc.e.m
         k = n.sc.e.n

@@ -30,7 +30,7 @@ The stopping test uses the judge's error of lambda itself: w = Y (Y^T lambda) - 
 block. N and its factor are reused if no block has changed its V, and in the first step after the centre has moved:
 lambda changes there along the law that it has settled on, and so does V.
 """
-from libc.math cimport fabs, sqrt
+from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport euclidean_norm
@@ -38,6 +38,7 @@ from lavender_ext.core.dot cimport dot
 from lavender_ext.core.method cimport BROKEN, LOST, MORE, REACHED, STUCK
 from lavender_ext.core.block_types cimport CONE, COULOMB, get_friction_components, friction_components_t
 from lavender_ext.core.start cimport is_zero_impulse, clip_zero_to_row_bounds
+from lavender_ext.newton.line_search cimport begin_line_search, is_reduction_sufficient, line_t, narrow_line_search
 from lavender_ext.velocity_newton.flow cimport (UNFORMED, multiply_y_transpose, end_block_of_run, first_block_of_run, clear_rows,
                                                 compute_island_impulses, copy_rows, descent_t, flow_t, measure_impulse_errors,
                                                 paused_t, recompute_slack, end_row_of_run, first_row_of_run)
@@ -52,7 +53,6 @@ cdef enum:                      # stages of a round of Coulomb friction
 
 cdef enum:
     MAX_IDLE_STEPS = 30         # An island is stuck if this many consecutive steps do not lower its lowest error by a tenth.
-    MAX_LINE_EVALUATIONS = 24   # Largest number of evaluations in one line search.
     MAX_COULOMB_ROUNDS = 12     # Problems that need more rounds are solved faster by other methods.
 
 
@@ -94,10 +94,10 @@ cdef inline double directional_derivative(flow_t* f, int32_t island, double py, 
 
 
 cdef inline double search_line(flow_t* f, int32_t island) noexcept nogil:
-    """Find t with a derivative along p of at most a tenth of its start; return 0 if p is not a descent direction."""
-    cdef int32_t a, c, n
-    cdef double py = 0.0, pp = 0.0, pg = 0.0, low = 0.0, high, at_low, at_high, t, x, enough
-    cdef int32_t side = 0
+    """Return t of line_search.pxd (1); 0 if p is not a descent direction."""
+    cdef int32_t a, c
+    cdef double py = 0.0, pp = 0.0, pg = 0.0
+    cdef line_t line
     cdef const int32_t* own = f.unknowns
     cdef const double* y = f.y
     cdef const double* grad = f.grad
@@ -110,41 +110,10 @@ cdef inline double search_line(flow_t* f, int32_t island) noexcept nogil:
         pg += step[c] * grad[c]
     if not pg < 0.0:
         return 0.0
-    enough = -0.1 * pg
-    at_low = pg
-    high = 1.0
-    at_high = directional_derivative(f, island, py, pp, high)
-    n = 1
-    while at_high < -enough and n < MAX_LINE_EVALUATIONS // 2:      # The minimum is at a larger t.
-        low = high
-        at_low = at_high
-        high = 2.0 * high
-        at_high = directional_derivative(f, island, py, pp, high)
-        n += 1
-    if fabs(at_high) <= enough or at_high < 0.0 or at_high != at_high:
-        return high if at_high == at_high else 0.0
-    t = high
-    while n < MAX_LINE_EVALUATIONS:                                 # Illinois variant of regula falsi (Dowell, Jarratt 1971).
-        t = low - at_low * (high - low) / (at_high - at_low)
-        if not low < t < high:
-            t = 0.5 * (low + high)
-        x = directional_derivative(f, island, py, pp, t)
-        n += 1
-        if fabs(x) <= enough:
-            return t
-        if x < 0.0:
-            low = t
-            at_low = x
-            if side < 0:
-                at_high *= 0.5
-            side = -1
-        else:
-            high = t
-            at_high = x
-            if side > 0:
-                at_low *= 0.5
-            side = 1
-    return t
+    begin_line_search(&line, pg)
+    while not narrow_line_search(&line, directional_derivative(f, island, py, pp, line.t)):
+        pass
+    return line.t
 
 
 cdef inline double halve_step_until_residual_falls(flow_t* f, int32_t island, double bound) noexcept nogil:
@@ -159,7 +128,7 @@ cdef inline double halve_step_until_residual_falls(flow_t* f, int32_t island, do
         for a in range(f.cptr[island], f.cptr[island + 1]):
             c = f.icols[a]
             size += (f.y[c] + t * f.step[c] - f.u[c]) * (f.y[c] + t * f.step[c] - f.u[c])
-        if sqrt(size) <= (1.0 - 1e-4 * t) * bound:
+        if is_reduction_sufficient(sqrt(size), t, bound):
             return t
         t *= 0.5
     return 0.0

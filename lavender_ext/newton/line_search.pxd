@@ -1,0 +1,70 @@
+"""The length t of a Newton step, for both of Newton's methods; interior points limit theirs in `interior.pxd`.
+
+    convex function       |f'(t)| <= |f'(0)| / 10                      doubling, then regula falsi               (1)
+    any other system      |F(t)| <= (1 - 1e-4 t) max |F| of the last steps      halving                          (2)
+
+(1) is used where a step descends on a convex function f: shifted Newton (`shifted.pxd`), and convex laws over velocities
+(`velocity_newton/newton.pxd`). (2), a non-monotone line search (Grippo, Lampariello, Lucidi 1986), is used by damped Newton
+(`phases.pxd`) and over velocities under Coulomb's law. The caller evaluates f' or |F| at each t:
+
+    begin_line_search(&x, slope)
+    while not narrow_line_search(&x, f'(x.t)): pass             x.t is the length, 0 if f' is not a number
+"""
+from libc.math cimport fabs
+from libc.stdint cimport int32_t
+
+
+cdef enum:
+    MAX_LINE_EVALUATIONS = 24   # Largest number of evaluations in one line search (1).
+
+
+cdef struct line_t:
+    double t                    # the length to evaluate next, or the result
+    double enough               # a slope of at most this size ends the search
+    double low                  # bracket of the minimum, if `is_bracketed`
+    double high
+    double at_low               # slopes at its ends
+    double at_high
+    int32_t side                # end that the last evaluation replaced: -1 low, 1 high
+    int32_t is_bracketed
+    int32_t evaluations
+
+
+cdef inline void begin_line_search(line_t* x, double slope) noexcept nogil:
+    """Begin (1) at t = 1; slope < 0 is f'(0)."""
+    x.t, x.enough, x.low, x.at_low = 1.0, -0.1 * slope, 0.0, slope
+    x.side = x.is_bracketed = x.evaluations = 0
+
+
+cdef inline bint narrow_line_search(line_t* x, double slope) noexcept nogil:
+    """Use f' at x.t; return whether x.t is the result, else it is the next length to evaluate."""
+    x.evaluations += 1
+    if not x.is_bracketed:
+        if slope < -x.enough and x.evaluations < MAX_LINE_EVALUATIONS // 2:     # The minimum is at a larger t.
+            x.low, x.at_low, x.t = x.t, slope, 2.0 * x.t
+            return False
+        if fabs(slope) <= x.enough or slope < 0.0 or slope != slope:
+            x.t = x.t if slope == slope else 0.0
+            return True
+        x.is_bracketed, x.high, x.at_high = 1, x.t, slope
+    elif fabs(slope) <= x.enough:
+        return True
+    elif slope < 0.0:
+        x.low, x.at_low = x.t, slope
+        x.at_high *= 0.5 if x.side < 0 else 1.0
+        x.side = -1
+    else:
+        x.high, x.at_high = x.t, slope
+        x.at_low *= 0.5 if x.side > 0 else 1.0
+        x.side = 1
+    if x.evaluations >= MAX_LINE_EVALUATIONS:
+        return True
+    x.t = x.low - x.at_low * (x.high - x.low) / (x.at_high - x.at_low)     # Illinois variant (Dowell, Jarratt 1971)
+    if not x.low < x.t < x.high:
+        x.t = 0.5 * (x.low + x.high)
+    return False
+
+
+cdef inline bint is_reduction_sufficient(double size, double t, double bound) noexcept nogil:
+    """Return whether |F| = `size` at t satisfies (2); `bound` is the largest |F| of the last steps."""
+    return size <= (1.0 - 1e-4 * t) * bound
