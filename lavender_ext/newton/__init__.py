@@ -1,1 +1,1 @@
-"""Newton's method over rows and bodies, in phases: linear systems, interior points, exchanges; warm starts."""
+"""Newton's method over rows and bodies: plan of the phases, one file for each phase, linear systems; warm starts."""

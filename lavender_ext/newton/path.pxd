@@ -44,7 +44,7 @@ from lavender_ext.core.validate cimport all_finite
 from lavender_ext.core.block_types cimport COULOMB
 from lavender_ext.newton.cones cimport has_lower_bound, has_upper_bound
 from lavender_ext.newton.elements cimport elements_t, invert_and_multiply, is_row
-from lavender_ext.newton.phases cimport begin_damped_newton, push_damped_newton
+from lavender_ext.newton.damped_newton cimport begin_damped_newton, push_damped_newton
 from lavender_ext.newton.run cimport (N_PATH, PATH, compute_slack, copy_vector, is_finished, newton_t, path_t,
                                       pop_phase, push_phase, judge_and_keep_best_point)
 from lavender_ext.newton.system cimport (NATURAL, solve_natural_map_system, factor_newton_system, determinant_sign,

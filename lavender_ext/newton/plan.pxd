@@ -43,13 +43,14 @@ from lavender_ext.judge.score cimport relative_residual
 from lavender_ext.newton.cones cimport has_lower_bound, has_upper_bound
 from lavender_ext.newton.shifted cimport begin_shifted_newton, step_shifted_newton
 from lavender_ext.newton.path cimport N_PATHS, begin_path, step_path
-from lavender_ext.newton.phases cimport (STRETCH_FACTORISATIONS, UNLIMITED, augmented_shift, begin_active_set,
-                                         begin_damped_newton, begin_interior_steps, begin_interior_with_newton,
-                                         begin_damped_newton_stretches, push_damped_newton, step_active_set, step_augmented_newton,
-                                         step_damped_newton, step_interior_point, step_interior_with_newton,
-                                         compute_sliding_fraction, continue_damped_newton_stretches)
+from lavender_ext.newton.active_set cimport begin_active_set, step_active_set
+from lavender_ext.newton.damped_newton cimport (STRETCH_FACTORISATIONS, begin_damped_newton, begin_damped_newton_stretches,
+                                                continue_damped_newton_stretches, push_damped_newton, step_damped_newton)
+from lavender_ext.newton.interior_phases cimport (augmented_shift, begin_interior_steps, begin_interior_with_newton,
+                                                  compute_sliding_fraction, step_augmented_newton, step_interior_point,
+                                                  step_interior_with_newton)
 from lavender_ext.newton.run cimport (ACTIVE_SET, AUGMENTED_NEWTON, DAMPED_NEWTON, DAMPED_STRETCHES, DE_SAXCE,
-                                      INTERIOR_POINT, INTERIOR_WITH_NEWTON, MAX_INNER_STEPS, N_COUNTED, N_REFINEMENTS,
+                                      INTERIOR_POINT, INTERIOR_WITH_NEWTON, MAX_INNER_STEPS, N_COUNTED, N_REFINEMENTS, UNLIMITED,
                                       PLAN_CONVEX, PLAN_COULOMB, SHIFTED_NEWTON, begin_separate_best, convex_residual,
                                       compute_slack, copy_vector, de_saxce_t, end_separate_best, is_at_roundoff,
                                       is_budget_spent, is_finished, is_over, newton_t, pop_phase, push_phase, restore_best_of_all,

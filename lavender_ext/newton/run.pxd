@@ -27,11 +27,11 @@ cdef enum:                      # phases
     PLAN_CONVEX = 0             # plan.pxd
     PLAN_COULOMB = 1
     DE_SAXCE = 2
-    ACTIVE_SET = 3              # phases.pxd
-    INTERIOR_POINT = 4
+    ACTIVE_SET = 3              # active_set.pxd
+    INTERIOR_POINT = 4          # interior_phases.pxd
     INTERIOR_WITH_NEWTON = 5
     AUGMENTED_NEWTON = 6
-    DAMPED_NEWTON = 7
+    DAMPED_NEWTON = 7           # damped_newton.pxd
     DAMPED_STRETCHES = 8
     PATH = 9                    # path.pxd
     SHIFTED_NEWTON = 10         # shifted.pxd
@@ -52,6 +52,7 @@ cdef enum:                      # counters
 cdef enum:
     MAX_PHASE_DEPTH = 8         # Phases nest at most four deep.
     N_VECTORS = 30              # vectors (m) of `bind_vectors`
+    UNLIMITED = 2147483647      # limit of factorisations that no phase reaches
     MAX_INNER_STEPS = 20        # Newton steps of one proximal iteration; more rarely end it.
 
 

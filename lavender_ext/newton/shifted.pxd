@@ -24,9 +24,9 @@ from lavender_ext.core.block_types cimport CONE, COULOMB
 from lavender_ext.core.dot cimport dot
 from lavender_ext.core.validate cimport all_finite
 from lavender_ext.newton.elements cimport elements_t, invert_and_multiply
-from lavender_ext.newton.line_search cimport begin_line_search, line_t, narrow_line_search
+from lavender_ext.core.line_search cimport begin_line_search, line_t, narrow_line_search
 from lavender_ext.newton.natural_map cimport evaluate_all_natural_maps
-from lavender_ext.newton.phases cimport begin_damped_newton, push_damped_newton
+from lavender_ext.newton.damped_newton cimport begin_damped_newton, push_damped_newton
 from lavender_ext.newton.run cimport (N_SHIFTED, SHIFTED_NEWTON, convex_residual, copy_vector, is_finished,
                                       judge_and_keep_best_point, newton_t, pop_phase, push_phase, shifted_t)
 from lavender_ext.newton.steps cimport compute_all_normal_shifts

@@ -24,12 +24,12 @@ from lavender_ext.core.view cimport rows_t, view_t
 from lavender_ext.factor.factors cimport block_matrix_t, has_wide
 from lavender_ext.factor.linear cimport (FALLBACK, PythonCalls, analyse_blocks, bind_block_factor_indices,
                                          bind_block_factor_values, fallback_t)
+from lavender_ext.newton.active_set cimport begin_active_set, count_active_bound_changes, exchange_rows
 from lavender_ext.newton.bodies cimport (bind_pattern, form_panel, form_velocity_panel, needs_lu, order_bodies, order_elements,
                                          pattern_t, use_panel)
 from lavender_ext.newton.elements cimport elements_t
 from lavender_ext.newton.interior cimport compute_scaling
 from lavender_ext.newton.path cimport path_compliance
-from lavender_ext.newton.phases cimport begin_active_set, count_active_bound_changes, exchange_rows
 from lavender_ext.newton.plan cimport start_newton_solve, step_newton_solve
 from lavender_ext.newton.run cimport (N_COUNTED, bind_indices, bind_values, convex_residual, newton_t, scale_problem,
                                       set_problem, set_reference, write_certificate, write_impulse)

@@ -7,6 +7,10 @@
 Over bodies the matrix is I + K^T V K (elements.pxd). Over rows it is M = L H R^T + o L + I, or H + W for bounded rows
 alone, dense or in compressed rows (coupled.pxd); a dense (3) has the rows with P != 0 only. All three are one `linear_t`
 (factor/linear.pxd). The augmented system of the bodies, [I -R K^T; L K I], is factored by the caller (`external_t`).
+
+If a pivot fails, L U replaces a dense L L^T, and the host's factorisation a sparse factor, or L U if there is none. If that
+fails too, `factor_newton_system` returns 0, and the phases use the step only if it is finite: else an interior point, exchanges
+and shifted Newton end, an inner problem of damped Newton fails, and a path halves its step.
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t

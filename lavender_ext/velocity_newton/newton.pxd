@@ -38,7 +38,7 @@ from lavender_ext.core.dot cimport dot
 from lavender_ext.core.method cimport BROKEN, LOST, MORE, REACHED, STUCK
 from lavender_ext.core.block_types cimport CONE, COULOMB, get_friction_components, friction_components_t
 from lavender_ext.core.start cimport is_zero_impulse, clip_zero_to_row_bounds
-from lavender_ext.newton.line_search cimport begin_line_search, is_reduction_sufficient, line_t, narrow_line_search
+from lavender_ext.core.line_search cimport begin_line_search, is_reduction_sufficient, line_t, narrow_line_search
 from lavender_ext.velocity_newton.flow cimport (UNFORMED, multiply_y_transpose, end_block_of_run, first_block_of_run, clear_rows,
                                                 compute_island_impulses, copy_rows, descent_t, flow_t, measure_impulse_errors,
                                                 paused_t, recompute_slack, end_row_of_run, first_row_of_run)

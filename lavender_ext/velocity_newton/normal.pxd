@@ -1,8 +1,11 @@
 """The linear system of a step of one island (`newton.pxd`): N = I + Y^T V Y, or over few rows a part of A = Y Y^T.
 
-N has the pattern of L; under Coulomb's law it is a full matrix, since it is not symmetric. If an island has few rows,
-its steps are taken over these: y = Y^T mu and p = Y^T pi. A column of A is formed when its row first becomes free
-(V != 0). By the matrix inversion lemma, with a the free rows, if all rows are bounded rows:
+N has the pattern of L; under Coulomb's law it is a full matrix, since it is not symmetric. `form_normal_matrix` forms it and
+`factor_normal_matrix` factors it. A lost pivot ends the island with BROKEN (`descend_island`), and the host continues over
+bodies or over the rows of A.
+
+If an island has few rows, its steps are taken over these: y = Y^T mu and p = Y^T pi. A column of A is formed when its row first
+becomes free (V != 0). By the matrix inversion lemma, with a the free rows, if all rows are bounded rows:
 
     h = A (mu - lambda) = s + b - A lambda,    S = Theta_a + A_aa,    z = S^-1 h_a                        (1)
     pi = lambda - mu + E_a z,    q = A pi = A E_a z - h,    q_a = -Theta_a z                              (2)
