@@ -160,7 +160,7 @@ def load_pybullet(bullet, urdf, **options):
     *PYBULLET,
     "URDF: motors and inertias",
     "Each joint has a velocity motor that holds it until its force is set to 0. Inertias of the file are replaced by "
-    "those of the collision shapes unless `URDF_USE_INERTIA_FROM_FILE` is passed.",
+    "inertias of the collision shapes unless `URDF_USE_INERTIA_FROM_FILE` is passed.",
 )
 def pybullet_holds_joints():
     bullet, angles = make_pybullet(), []
@@ -240,6 +240,24 @@ def sapien_drops_mimic_effort_and_friction():
     return robot.dof == 2 and first.force_limit > 1e30 and np.isclose(first.friction, 0.05) and first.damping == 2.0
 
 
+def make_kamino(urdf, has_drive=False):
+    """Return newton's model of one world, and its SolverKamino."""
+    import newton
+    import warp
+
+    warp.config.quiet = True
+    builder, world = newton.ModelBuilder(), newton.ModelBuilder()
+    with contextlib.redirect_stdout(io.StringIO()):
+        for item in (builder, world):
+            newton.solvers.SolverKamino.register_custom_attributes(item)
+        world.add_urdf(urdf)
+        if not has_drive:
+            world.joint_target_mode = [int(newton.JointTargetMode.NONE)] * len(world.joint_target_mode)
+        builder.add_world(world)
+        model = builder.finalize(device="cpu")
+        return model, newton.solvers.SolverKamino(model)
+
+
 @fact(
     *NEWTON,
     "URDF: joints without a drive",
@@ -248,27 +266,34 @@ def sapien_drops_mimic_effort_and_friction():
     "`from_kamino` reads such models after this change.",
 )
 def kamino_rejects_urdf_joints_without_a_drive():
-    import newton
-    import warp
-
-    def make_solver(has_drive):
-        builder, world = newton.ModelBuilder(), newton.ModelBuilder()
-        for item in (builder, world):
-            newton.solvers.SolverKamino.register_custom_attributes(item)
-        world.add_urdf(write_urdf("revolute"))
-        if not has_drive:
-            world.joint_target_mode = [int(newton.JointTargetMode.NONE)] * len(world.joint_target_mode)
-        builder.add_world(world)
-        return newton.solvers.SolverKamino(builder.finalize(device="cpu"))
-
-    warp.config.quiet = True
-    with contextlib.redirect_stdout(io.StringIO()):
-        make_solver(has_drive=False)
-        try:
-            make_solver(has_drive=True)
-        except ValueError as error:
-            return "POSITION" in str(error)
+    make_kamino(write_urdf("revolute"))
+    try:
+        make_kamino(write_urdf("revolute"), has_drive=True)
+    except ValueError as error:
+        return "POSITION" in str(error)
     return False
+
+
+@fact(
+    *NEWTON,
+    "URDF: `mimic`",
+    "SolverKamino has no row for a mimic joint, without a warning. SolverMuJoCo, XPBD, Featherstone, Steel and VBD "
+    "couple the joints.",
+    "The problem of `from_kamino` does not couple them either.",
+)
+def kamino_drops_mimic():
+    import newton
+
+    model, solver = make_kamino(write_urdf("revolute", mimic=True))
+    before, after, control = model.state(), model.state(), model.control()
+    newton.eval_fk(model, model.joint_q, model.joint_qd, before)
+    for _ in range(20):
+        solver.step(before, after, control, None, 0.01)
+        before, after = after, before
+    # The rotations about y of both links; the pendulums move, and the second angle is not 2 q + 0.1.
+    quaternions = before.body_q.numpy()[-2:, 3:]
+    first, second = 2.0 * np.arctan2(quaternions[:, 1], quaternions[:, 3])
+    return model.joint_dof_count == 2 and first > 0.01 and abs(second - first - (2.0 * first + 0.1)) > 0.05
 
 
 @fact(
@@ -301,7 +326,7 @@ def newton_drops_static_friction():
     "`save_to_mjcf` of SolverMuJoCo",
     "`solreflimit` is not written: joint limits have MuJoCo's default of 0.02 s in the file, and the stiffness and "
     "damping of `limit_ke` and `limit_kd` in the solver. The time step of the file is 2 ms.",
-    "`from_mujoco` has the limits of the file, and `from_newton_mujoco` those of the solver.",
+    "`from_mujoco` reads the limits of the file, and `from_newton_mujoco` reads the limits of the solver.",
 )
 def newton_drops_limit_stiffness_in_mjcf():
     import mujoco

@@ -59,7 +59,7 @@ def run_newton(name, n=60, gravity=(0.0, 0.0, -9.81), friction=(0.5, 0.5), heigh
     *NEWTON,
     "friction of two shapes",
     "SolverXPBD and SolverKamino use the mean of both coefficients, and SolverMuJoCo the larger one.",
-    "The coefficients of the rows are those of the solver that was run.",
+    "The rows have the coefficients of the solver that was run.",
 )
 def newton_solvers_combine_friction_differently():
     found = []

@@ -172,6 +172,38 @@ def iterations_limit_the_smooth_acceleration():
     return np.abs(early - exact).max() > 1e-5 * np.abs(exact).max()
 
 
+@fact(
+    *MUJOCO,
+    "meshes that touch at a point",
+    "Two cones of 16 sides with touching tips have four contacts at one point with a common normal that is tilted by "
+    "45 degrees, although the scene is symmetric. At a distance of 1 mm, they have one contact with a vertical normal.",
+    "Rows of such contacts repeat each other: impulses are not unique, velocities are.",
+)
+def tips_have_tilted_repeated_contacts():
+    import mujoco
+
+    angle = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
+    ring = np.stack([0.1 * np.cos(angle), 0.1 * np.sin(angle), 0.0 * angle], axis=1)
+    up, down = (" ".join(f"{x:.6f}" for x in np.vstack([ring, [[0.0, 0.0, tip]]]).ravel()) for tip in (0.1, -0.1))
+    found = []
+    for gap in (0.001, 0.0):
+        model, data = make_mujoco(
+            f"""<mujoco><asset><mesh name="u" vertex="{up}"/><mesh name="d" vertex="{down}"/></asset><worldbody>
+            <geom type="mesh" mesh="u" margin="0.002"/><body pos="0 0 {0.2 + gap}"><freejoint/>
+            <geom type="mesh" mesh="d" mass="1"/></body></worldbody></mujoco>"""
+        )
+        mujoco.mj_forward(model, data)
+        found.append((data.ncon, data.contact.frame[:, :3], np.ptp(data.contact.pos, axis=0).max()))
+    (n_apart, apart, _), (n_touching, touching, spread) = found
+    return (
+        n_apart == 1 < n_touching
+        and np.allclose(apart, [0.0, 0.0, 1.0])
+        and np.allclose(touching, touching[0], atol=1e-6)
+        and abs(touching[0, 2]) < 0.9
+        and spread < 1e-6
+    )
+
+
 # -- MJX -----------------------------------------------------------------------------------------------
 
 MJX = "MJX", "mujoco.mjx", "3.17.0"
