@@ -18,7 +18,7 @@ class EngineFact:
     ----------
     engine : str
     module : str
-        Module that must be importable to run `probe`.
+        Modules, separated by spaces, that must be importable to run `probe`.
     version : str
         Version of the engine with which the fact was found.
     subject, text : str

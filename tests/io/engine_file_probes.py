@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from engine_drake_probes import DRAKE
 from engine_facts import fact
-from engine_newton_probes import NEWTON
+from engine_newton_probes import NEWTON, NEWTON_MUJOCO
 from engine_probes import GENESIS, MUJOCO, PINOCCHIO, PYBULLET, SAPIEN, make_genesis, make_mujoco, make_pybullet
 
 # -- one URDF in several engines -----------------------------------------------------------------------
@@ -297,7 +297,9 @@ def kamino_drops_mimic():
 
 
 @fact(
-    *NEWTON,
+    "newton",
+    "newton pxr",
+    "1.8.0",
     "USD: `physics:staticFriction`",
     "Static friction of a material is dropped, and dynamic friction becomes the coefficient of the shape.",
 )
@@ -322,7 +324,7 @@ def newton_drops_static_friction():
 
 
 @fact(
-    *NEWTON,
+    *NEWTON_MUJOCO,
     "`save_to_mjcf` of SolverMuJoCo",
     "`solreflimit` is not written: joint limits have MuJoCo's default of 0.02 s in the file, and the stiffness and "
     "damping of `limit_ke` and `limit_kd` in the solver. The time step of the file is 2 ms.",

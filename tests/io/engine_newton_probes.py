@@ -8,6 +8,7 @@ import numpy as np
 from engine_facts import fact
 
 NEWTON = "newton", "newton", "1.8.0"
+NEWTON_MUJOCO = "newton", "newton mujoco_warp", "1.8.0"
 DT = 0.005  # s
 
 
@@ -56,7 +57,7 @@ def run_newton(name, n=60, gravity=(0.0, 0.0, -9.81), friction=(0.5, 0.5), heigh
 
 
 @fact(
-    *NEWTON,
+    *NEWTON_MUJOCO,
     "friction of two shapes",
     "SolverXPBD and SolverKamino use the mean of both coefficients, and SolverMuJoCo the larger one.",
     "The rows have the coefficients of the solver that was run.",
@@ -85,7 +86,7 @@ def kamino_has_reactions_in_newtons():
 
 
 @fact(
-    *NEWTON,
+    *NEWTON_MUJOCO,
     "`contact_f`",
     "The observable is the force in N on the body of `rigid_contact_shape0`, with friction, for SolverXPBD, "
     "SolverKamino, SolverMuJoCo and SolverVBD.",
@@ -101,7 +102,7 @@ def newton_contact_forces_act_on_the_first_shape():
 
 
 @fact(
-    *NEWTON,
+    *NEWTON_MUJOCO,
     "`body_qdd`",
     "The observable of SolverKamino and SolverMuJoCo is the change of the velocity divided by the time step. It "
     "contains the impulses of contacts.",
@@ -115,7 +116,7 @@ def newton_accelerations_contain_contacts():
 
 
 @fact(
-    *NEWTON,
+    *NEWTON_MUJOCO,
     "SolverMuJoCo: `margin`",
     "Margins of shapes act only with `use_mujoco_contacts=False`. By default, the geoms of MuJoCo have the margin 0.",
     "Only contacts with rows are read.",
