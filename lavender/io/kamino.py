@@ -338,16 +338,9 @@ class _Worlds:
 
     def _compute_row_compliance(self) -> FloatArray:
         """Return the compliance of each row [1/kg, 1/(kg m^2)]."""
-        problem, joints = self.problem, self.engine.data.joints
-        soft = (
-            np.zeros(len(self.index))
-            if problem.compliance is None
-            else _copy_as_float64(problem.compliance)[self.position]
-        )
-        for kind, values in (
-            ("dynamic", joints.inv_m_j),
-            ("effort", joints.inv_m_a),
-        ):
+        stored, joints = self.problem.compliance, self.engine.data.joints
+        soft = np.zeros(len(self.index)) if stored is None else _copy_as_float64(stored)[self.position]
+        for kind, values in (("dynamic", joints.inv_m_j), ("effort", joints.inv_m_a)):
             world, row, position = self.layout.soft_rows[kind]
             if len(world):
                 soft[self.row_ptr[world] + row] += _copy_as_float64(values)[position]
