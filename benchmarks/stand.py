@@ -39,7 +39,7 @@ from lavender.base.errors import InputError, UnknownName
 from lavender.cli.options import ListType
 from lavender.report.machine import get_versions
 from lavender.sim.scene import Scene
-from lavender.sim.scene.scene import SCENE_ORDERS
+from lavender.sim.scene.parameters import SCENE_ORDERS
 
 FRICTION = 0.5
 SETTLE = 2.0  # s

@@ -18,7 +18,6 @@ from worked import after, python
 import lavender as lv
 from lavender.sim.engine import check
 from lavender.sim.engine.layout import HEAD
-from lavender.sim.engine.state import KEPT
 
 CARRIED = ("setting", "x", "q", "v", "cache_key", "cache_impulse", "cache_local", "joint_impulse")
 
@@ -406,7 +405,6 @@ def test_a_changed_snapshot_is_rejected_or_stepped(name, how, steps, edits, head
 def test_every_array_of_a_snapshot_that_the_scene_gives_is_compared():
     # One bit of one entry changes, which no other check detects.
     sim = after(5, "bridge", n=4, patch_radius=0.1)
-    assert set(check.GIVEN) | set(check.CARRIED) | {"head", "setting", "ptr"} == set(KEPT)
     for name in check.GIVEN:
         if not sim.state.a[name].size:
             continue

@@ -19,13 +19,16 @@ import numpy as np
 from lavender.base.errors import InputError
 from lavender.problem.cones import get_block_kinds
 from lavender.sim.engine.layout import HEAD, SETTING, SIZE
-from lavender.sim.engine.state import KEPT, State
+from lavender.sim.engine.state import State
 from lavender_ext.engine.arrays import CAP_CONTACT, CAP_PAIR, N_SIZES
 
 CARRIED = (
     "x", "q", "v", "fat", "joint_impulse", "inv_inertia", "cache_impulse", "cache_local", "cache_roll", "cache_key"
 )  # fmt: skip
-GIVEN = tuple(name for name in KEPT if name not in (*CARRIED, "head", "setting", "ptr"))
+GIVEN = (
+    "inv_mass_body", "inertia", "inv_inertia_body", "shape", "friction", "restitution", "patch", "joint", "inv_mass",
+    "kind_of_shape", "dyn", "uneven", "body_of", "joint_kind", "joint_motor", "joint_bodies", "joint_body", "excluded",
+)  # fmt: skip
 FIXED_HEAD = ("position_iterations", "order", "seed", "friction_shape")
 WRITTEN_SETTINGS = {"out": 8, "depth": 1, "joint_error": 1}  # Entries of `setting` that the engine writes.
 # Largest accepted deviation of a squared quaternion norm from 1 [-]; quaternions are normalised in every substep.

@@ -332,10 +332,7 @@ class Simulation(Stepping):
             steps=self._steps,
             failed=self._failed,
             lost=self._find_lost_body(),
-            size=mark_read_only(s.size.copy()),
-            real=mark_read_only(s.real.copy()),
-            index=mark_read_only(s.index.copy()),
-            keys=mark_read_only(s.keys.copy()),
+            **{name: mark_read_only(getattr(s, name).copy()) for name in ("size", "real", "index", "keys")},
         )
 
     @run_exclusively

@@ -12,8 +12,8 @@ from lavender.problem.derived import cached_property
 from lavender.sim.engine.layout import HEAD, JOINT, JOINT_KINDS, ORDER_NUMBER, SETTING, SIZE
 from lavender.sim.engine.values import SolverValues
 from lavender.sim.scene import Box, Plane, Scene, Sphere, arithmetic
+from lavender.sim.scene.parameters import SCENE_ORDERS, Parameters
 from lavender.sim.scene.parts import Body, Joint
-from lavender.sim.scene.scene import SCENE_ORDERS, Parameters
 from lavender_ext.engine import substep
 from lavender_ext.engine.arrays import (
     BOX,
@@ -39,13 +39,6 @@ BRUTE_FORCE_MAX_SHAPES = 32
 BETA = 0.2  # [-] Fraction of a position error that a substep removes.
 MAX_PUSH = 0.2  # [m] A substep corrects at most this much of a position error.
 MAX_BUFFER_BYTES = 2**32  # [bytes] Larger buffers (the three together) are rejected.
-# Arrays that the scene defines or that carry values from one substep to the next; all others are scratch of a substep.
-KEPT = (
-    "setting", "x", "q", "v", "inv_mass_body", "inertia", "inv_inertia_body", "shape", "friction", "restitution",
-    "patch", "fat", "joint", "joint_impulse", "inv_mass", "inv_inertia", "cache_impulse", "cache_local",
-    "cache_roll", "head", "kind_of_shape", "dyn", "uneven", "body_of", "joint_kind", "joint_motor", "joint_bodies",
-    "joint_body", "excluded", "ptr", "cache_key",
-)  # fmt: skip
 
 
 class ObservationViews(NamedTuple):
@@ -259,20 +252,12 @@ def _put_joints(a: dict[str, Any], joints: Sequence[Joint]) -> None:
     row = 0
     for i, j in enumerate(joints):
         values = a["joint"][i]
-        for name, x in (
-            ("anchor_a", j.anchor_a),
-            ("anchor_b", j.anchor_b),
-            ("axis_a", j.axis_a),
-            ("axis_b", j.axis_b),
-        ):
-            values[JOINT[name] : JOINT[name] + 3] = x
+        for name in ("anchor_a", "anchor_b", "axis_a", "axis_b"):
+            values[JOINT[name] : JOINT[name] + 3] = getattr(j, name)
         side = np.cross(j.axis_a, np.eye(3)[np.argmin(np.abs(j.axis_a))])
         values[JOINT["side_a"] : JOINT["side_a"] + 3] = side / arithmetic.compute_norm(side)  # pyright: ignore[reportArgumentType]
-        values[JOINT["length"]], values[JOINT["hertz"]], values[JOINT["damping"]] = (
-            j.length,
-            j.hertz,
-            j.damping,
-        )
+        for name in ("length", "hertz", "damping"):
+            values[JOINT[name]] = getattr(j, name)
         values[JOINT["speed"]], values[JOINT["torque"]] = j.motor_speed or 0.0, j.motor_torque
         a["joint_kind"][i], a["joint_motor"][i] = JOINT_KINDS[j.kind], j.motor_speed is not None
         a["joint_bodies"][i] = j.a, j.b

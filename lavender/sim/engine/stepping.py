@@ -22,7 +22,7 @@ from lavender.sim.engine.layout import HEAD, SIZE
 from lavender.sim.engine.problem import build_problem, summarise_motion, summarise_residual
 from lavender.sim.engine.state import State
 from lavender.sim.scene import Scene
-from lavender.sim.scene.scene import MAX_SWEEPS, MIN_SWEEPS, Parameters
+from lavender.sim.scene.parameters import MAX_SWEEPS, MIN_SWEEPS, Parameters
 from lavender.solvers.newton import SPEC as NEWTON_SPEC
 from lavender.solvers.registry import get
 from lavender.solvers.warm_start import make_warm_start_claim
@@ -278,9 +278,8 @@ class Stepping:
                 self._advance_all_substeps()
                 lost = self._find_lost_body()
                 observation = self._make_observation()
-                if self.films:
-                    for film in self.films:
-                        film.add(self.time, observation)
+                for film in self.films:
+                    film.add(self.time, observation)
                 return observation, 0.0, bool(lost), False, self._make_step_info(lost)
             finally:
                 self._refusal = ""

@@ -1,8 +1,9 @@
 """Scenes: bodies, shapes and joints, built by hand or taken from the gallery."""
 
 from lavender.sim.scene.gallery import SCENES
+from lavender.sim.scene.parameters import ON_FAILURE, Parameters
 from lavender.sim.scene.parts import Body, Box, Joint, Plane, Sphere
-from lavender.sim.scene.scene import ON_FAILURE, Parameters, Scene, named_scene
+from lavender.sim.scene.scene import Scene, named_scene
 
 __all__ = [
     "ON_FAILURE",

@@ -13,7 +13,7 @@ import lavender as lv
 from lavender.io.stored import pack_header, unpack_header
 from lavender.sim.engine.layout import HEAD
 from lavender.sim.engine.snapshot import MAGIC
-from lavender.sim.scene.scene import SCENE_ORDERS
+from lavender.sim.scene.parameters import SCENE_ORDERS
 
 
 def reported(observation, problem):

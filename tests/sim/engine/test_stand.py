@@ -5,7 +5,7 @@ import pytest
 
 import lavender as lv
 from lavender.sim.engine.layout import HEAD, SETTING
-from lavender.sim.scene.scene import SCENE_ORDERS
+from lavender.sim.scene.parameters import SCENE_ORDERS
 
 MOST = 5e-3  # m, that a box may move between two seconds and the end
 SECONDS = 30.0  # s
