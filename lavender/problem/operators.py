@@ -233,8 +233,12 @@ class Operators(ProblemData):
         # Pairs of blocks that share both bodies were counted twice. Rows of J without entries have a diagonal entry.
         if min(bound + self.m, self.m**2) >= MAX_INDEXABLE_ENTRIES:
             raise TooLarge(
-                f"A would have up to {bound:.3g} entries; at most 2^31 - 1 can be indexed: use a solver that does not "
-                "form A, for example a sweep solver that takes rows, or J and M (operator 'generalized')"
+                f"A would have up to {bound:.3g} entries; at most 2^31 - 1 can be indexed: use a "
+                + (
+                    "sweep solver that takes rows"
+                    if self.generalized is None
+                    else "solver that takes J and M"
+                )
             )
 
     @computed_once
