@@ -50,7 +50,7 @@ CAUSES = {
 # [m/s] Slip below this speed is not explained. It is far below the speeds at which objects slip out of a gripper, and
 # above the velocity error of solutions to a relative residual of 1e-9.
 MIN_EXPLAINED_SLIP = 1e-6
-REMEDY_STEPS = 25  # Settings are compared after this number of further steps, when creep has become steady.
+REMEDY_STEPS = 25  # Settings are compared by their mean slip in this number of further steps.
 MAX_REMAINING_SLIP = 0.9  # A setting helps if at most this fraction of the slip remains.
 #: State of a contact that slides at the friction limit: it becomes slower, or not.
 SLIDING_STATES = (
@@ -98,7 +98,7 @@ class Remedy:
     slip : float, m/s
         Mean speed of the contact's points in the explained step, simulated with the setting.
     later : float, m/s
-        The same after `REMEDY_STEPS` further steps; nan if the geoms no longer touch in one of the runs.
+        The same, as a mean of the next `REMEDY_STEPS` steps; nan if the geoms no longer touch after one of the runs.
     """
 
     setting: str
@@ -171,7 +171,7 @@ class SlipExplanation:
     @property
     def remedies_table(self) -> Table:
         """Slip of the fastest contact with each setting [m/s], in the explained step and later."""
-        heads = ["setting", "slip [m/s]", f"{REMEDY_STEPS} steps later [m/s]"]
+        heads = ["setting", "slip [m/s]", f"mean of the next {REMEDY_STEPS} steps [m/s]"]
         columns = [
             format_sizes([get(r) for r in self.remedies]) for get in (attrgetter("slip"), attrgetter("later"))
         ]
@@ -220,10 +220,10 @@ class SlipExplanation:
         get_slip = attrgetter("later" if is_later else "slip")
         before = get_slip(self.remedies[0])
         helpful = [r for r in self.remedies[1:] if get_slip(r) <= MAX_REMAINING_SLIP * before]
-        time = f"{REMEDY_STEPS} steps later" if is_later else "in the same step"
+        time = f"in the next {REMEDY_STEPS} steps" if is_later else "in the same step"
         if not helpful:
             return [f"None of these settings reduces the slip {time} by more than 10 %."]
-        head = f"Settings that help (slip {time}, {format_size(before)} m/s as it is):"
+        head = f"Settings that help (mean slip {time}, {format_size(before)} m/s as it is):"
         return [
             head,
             *(f"  {r.setting}: {format_size(get_slip(r))} m/s" for r in sorted(helpful, key=get_slip)),

@@ -182,21 +182,20 @@ def _change_settings(mj: Any, model: Any, geoms: str) -> Iterator[tuple[str, Any
 
 
 def _simulate_slip(mj: Any, model: Any, state: FloatArray, geoms: str) -> tuple[float, float]:
-    """Return the mean sliding speed [m/s] of two geoms in the step from a state, and `REMEDY_STEPS` steps later.
+    """Return the sliding speed [m/s] of two geoms in the step from a state, and its mean in the next `REMEDY_STEPS`.
 
-    A speed is nan if the geoms do not touch.
+    Steps in which the geoms do not touch do not count. The first speed is nan if the geoms do not touch in its step,
+    the second one if they do not touch in the last step.
     """
-    data, results = mj.MjData(model), []
+    data, means = mj.MjData(model), []
     mj.mj_setState(model, data, state, mj.mjtState.mjSTATE_INTEGRATION)
-    for step in range(REMEDY_STEPS + 1):
-        if step in (0, REMEDY_STEPS):
-            mj.mj_forward(model, data)
-            problem, disk, surface = _read_step(mj, model, data)
-            measured = problem if disk is None else disk
-            sliding = np.flatnonzero(measured.cones.n_tangents > 0).tolist()
-            blocks = [k for k in sliding if get_geoms(measured.block_name(k)) == geoms]
+    for _ in range(REMEDY_STEPS + 1):
+        mj.mj_forward(model, data)
+        problem, disk, surface = _read_step(mj, model, data)
+        measured = problem if disk is None else disk
+        sliding = np.flatnonzero(measured.cones.n_tangents > 0).tolist()
+        blocks = [k for k in sliding if get_geoms(measured.block_name(k)) == geoms]
         mj.mj_step(model, data)
-        if step in (0, REMEDY_STEPS):
-            speeds = [np.linalg.norm(v) for v in compute_slip(measured, blocks, data.qvel, surface)]
-            results.append(float(np.mean(speeds)) if speeds else np.nan)
-    return results[0], results[1]
+        speeds = [np.linalg.norm(v) for v in compute_slip(measured, blocks, data.qvel, surface)]
+        means.append(float(np.mean(speeds)) if speeds else np.nan)
+    return means[0], np.nan if np.isnan(means[-1]) else float(np.nanmean(means[1:]))

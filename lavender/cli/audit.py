@@ -38,8 +38,8 @@ DEFAULT_CLAIM_WORLDS = 8  # Default number of worlds for engines with claims, wh
 @click.option("--keep", type=int, metavar="N",
               help="Keep the N worst steps; default: the worst step of each of three worlds.")  # fmt: skip
 @click.option("--save-states", type=(click.Choice(["contact", "worst"]), FILE), metavar="contact|worst FILE.npz",
-              help="Write the states before steps with contact (up to 1000), or before the worst steps, for --states "
-              "of tune, slip, record and report.")  # fmt: skip
+              help="Write the states before steps with contact (about 1000 at most), or before the worst steps, for "
+              "--states of tune, slip, record and report.")  # fmt: skip
 @threshold_option
 @precision_option
 @click.option("--workers", type=int, default=-1, help="Processes, for mujoco; -1: one for each core.")

@@ -61,9 +61,9 @@ def check(
     each answer from it is printed. A solution stored in a file is judged, too: it is at the floor of its precision,
     close enough (--threshold), or its solver stopped early.
 
-    Exit code 1: a claim is contradicted; a solver named by --solvers, or without this option every solver, does not
-    solve a problem; none of the solvers accepts a problem; a file in a folder cannot be read; or, with --precision or
-    --threshold, a stored solution is neither at its floor nor close enough.
+    Exit code 1: a claim is contradicted; a solver named by --solvers accepts a problem but does not solve it; without
+    this option, no solver solves a problem; none of the solvers accepts a problem; a file in a folder cannot be read;
+    or, with --precision or --threshold, a stored solution is neither at its floor nor close enough.
     Exit code 2: a named file cannot be read, or no file has a stored solution for these options.
     """
     from lavender import report
@@ -72,7 +72,7 @@ def check(
     from lavender.report.check import cross_check
     from lavender.report.records import format_tolerance
     from lavender.report.terminal import print_table
-    from lavender.report.text import format_residual
+    from lavender.report.text import format_count, format_residual
     from lavender.solving.limits import check_time_limit
 
     limit_to_one_thread()
@@ -120,7 +120,9 @@ def check(
     if unsolved:
         print_escaped(f"{unsolved} of the solves did not solve their problem", style="bold red")
     if unaccepted:
-        print_escaped(f"{unaccepted} problems are not accepted by any of these solvers", style="bold red")
+        print_escaped(
+            f"{format_count(unaccepted, 'problem')} not accepted by any of these solvers", style="bold red"
+        )
     if judges_stored and not solutions:
         raise InputError(
             "--precision and --threshold apply to stored solutions, and no file has one (entry `impulse`): "

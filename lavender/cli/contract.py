@@ -40,9 +40,9 @@ def contract(context: click.Context, name: str, list_only: bool) -> None:
         if failure:
             unmet += 1
             print_escaped(f"         {failure}")
-    skipped = [check.name for check in CHECKS.values() if not check.applies(spec)]
+    skipped = [f"{check.name} ({check.applies_to})" for check in CHECKS.values() if not check.applies(spec)]
     print_escaped(f"{name} meets {total - unmet} of {total} requirements")
     if skipped:
-        print_escaped(f"not required, because the spec does not list the capability: {', '.join(skipped)}")
+        print_escaped("\n    ".join(["not required of this solver, and not tested:", *skipped]))
     if unmet:
         context.exit(EXIT_UNMET)

@@ -28,8 +28,8 @@ def slip(model: Path, states: str | None, steps: int, contacts: tuple[str, ...],
     the largest part of this speed with its cause: unfinished solving, shape of the cone, softness of friction, convex
     relaxation, or sliding at the friction limit. A part is the change of the speed if this property is replaced, too:
     exact solution, round cone, hard friction, Coulomb's law. Settings of MuJoCo are then simulated. The second table
-    shows the speed of the fastest contact with each, in the same step and 25 steps later; the last lines name the
-    settings that help.
+    shows the speed of the fastest contact with each, in the same step and as a mean of the next 25 steps; the last
+    lines name the settings that help.
 
     Exit code 1: no state has a contact with friction.
     """

@@ -96,7 +96,7 @@ BACKENDS: tuple[Backend, ...] = (
                 linear_term=0.1, second_solve="other", notes={
                 "false_infeasible": "A solvable program with a singular P can be reported as primal infeasible. With "
                     "rho=0.1 it is not.",
-                "dense_triangle": "It reads the lower triangle of a dense P.",
+                "dense_triangle": "This holds for a sparse P. Of a dense P, the lower triangle is read instead.",
                 "crossed_bounds": "Bounds of a variable that exclude each other (lb > ub) are reported as solved."})),
     Backend("qpalm", ("qpalm",), "qpalm", "proximal augmented Lagrangian, semismooth Newton",
             "Hermans, Themelis, Patrinos 2022, QPALM", call=native.call_qpalm, stoppable=True,
@@ -199,7 +199,7 @@ PROBE_PROGRAMS = {
     "triangle": "min x.P x/2 - x1 - x2 with |x| <= 9 and P = [[2, 1], [0, 2]], then P = [[2, 0], [1, 2]]",
     "repeated": "min |x|²/2 with the row 0.3 x1 + 0.7 x2 = 1 twice",
     "contradictory": "min |x|²/2 with x1 + x2 = 1 and x1 + x2 = 2",
-    "unbounded": "min x1²/2 - x2 with x >= 0, which is unbounded",
+    "unbounded": "min x1²/2 - x2 with x >= 0 (unbounded)",
     "singular": "min x1²/2 - x2 with |x1| <= 5 and 0 <= x2 <= 1",
     "convex_on_rows": "min x1²/2 - x2²/2 with x2 = 0.5 and |x| <= 9",
     "saddle": "min x1²/2 - x2²/2 with |x1| <= 1 and -1 <= x2 <= 2",

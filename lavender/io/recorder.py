@@ -106,7 +106,7 @@ class Recorder:
         removed, unless `every` or `when` selected them.
     when : callable, optional
         Called with the `StepVerdict` of each world; a true result selects it.
-    threshold : float, default 1e-4 m/s
+    threshold : float, default 1e-6 m/s
         Velocity error up to which an answer is close enough (`Residual.verdict`).
     solver : str, default "engine"
         Name of the engine's solver in the records.

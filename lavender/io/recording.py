@@ -118,7 +118,7 @@ def record(
     seed : int
         Seed of "random".
     states : path of an .npz, "keyframes", or arrays, optional
-        Start states (`read_states`): the steps are divided evenly among them. The first step from a state uses
+        Start states (`read_states`): the steps are divided evenly among them. The first step from a state has
         its controls, if it has any. Steps from different states are independent problems. Default: `data` as it is.
     replace : bool
         Whether to remove the problem files of another recording from the folder; if false, such files raise an error.
@@ -196,21 +196,26 @@ def iterate_steps(
     """Step a simulation; yield the numbers of every `every`-th step and of its start state.
 
     `data` then has the constraints of the state after the step. The steps are divided evenly among the start states.
-    The first step from a state uses its controls, if it has any.
+    The first step from a start state has the constraints of this state under its controls, if it has any, and every
+    `every`-th step is counted from there.
     """
     firsts = {} if starts is None else {steps * i // len(starts): i for i in range(len(starts))}
-    i = 0
+    i = first = 0
     for step in range(steps):
-        ctrl = control_at(data, step)
-        if starts is not None and step in firsts:
-            i = firsts[step]
-            mj.mj_setState(model, data, starts.vectors[i], mj.mjtState.mjSTATE_INTEGRATION)
-            ctrl = ctrl if starts.controls is None else starts.controls[i]
-        if ctrl is not None:
-            data.ctrl[:] = ctrl
         try:
-            mj.mj_step(model, data)
-            if (step + 1) % every:
+            if step in firsts:
+                i, first = firsts[step], step
+                mj.mj_setState(model, data, starts.vectors[i], mj.mjtState.mjSTATE_INTEGRATION)
+            elif firsts:
+                mj.mj_step(model, data)  # From the previous constraints, under their controls.
+            ctrl = control_at(data, step)
+            if step in firsts and starts.controls is not None:
+                ctrl = starts.controls[i]
+            if ctrl is not None:
+                data.ctrl[:] = ctrl
+            if not firsts:
+                mj.mj_step(model, data)
+            if (step - first if firsts else step + 1) % every:
                 continue
             mj.mj_forward(model, data)
         except mj.FatalError as error:

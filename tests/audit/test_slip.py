@@ -1,7 +1,5 @@
 """The cause of slip of scenes whose answer is known."""
 
-import copy
-
 import numpy as np
 import pytest
 
@@ -198,7 +196,7 @@ def test_sentences_of_a_sliding_box_state_that_friction_brakes_it_and_that_no_se
     assert 0.0 < explanation.friction_use[i] <= 1.0 + 1e-6  # Friction is within the cone, up to MuJoCo's tolerance.
     best = min(r.later for r in explanation.remedies[1:] if not np.isnan(r.later))
     assert best > 0.9 * explanation.remedies[0].later
-    assert explanation.advice == ["None of these settings reduces the slip 25 steps later by more than 10 %."]
+    assert explanation.advice == ["None of these settings reduces the slip in the next 25 steps by more than 10 %."]
 
 
 def test_sentences_of_an_accelerating_box_state_that_the_load_is_above_the_limit():
@@ -295,17 +293,16 @@ def test_explain_slip_of_states_remedy_has_the_slip_that_the_typed_setting_gives
         typed = block(angle, option=option if "cone=" in option else f'cone="{cone}" {option}')
         data = mujoco.MjData(typed)
         mujoco.mj_setState(typed, data, state, state_kind)
-        for expected, further in ((remedy.slip, 0), (remedy.later, REMEDY_STEPS)):
-            for _ in range(further):
-                mujoco.mj_step(typed, data)
+        means = []
+        for _ in range(REMEDY_STEPS + 1):
             mujoco.mj_forward(typed, data)
             jacobians = np.zeros((data.ncon, 3, typed.nv))
             for jacobian, point in zip(jacobians, data.contact.pos, strict=True):
                 mujoco.mj_jac(typed, data, jacobian, None, point, 1)
-            following = copy.deepcopy(data)
-            mujoco.mj_step(typed, following)
-            speeds = np.linalg.norm((jacobians @ following.qvel)[:, :2], axis=1)  # The normal is z.
-            assert speeds.mean() == pytest.approx(expected, rel=1e-6, abs=1e-12), text
+            mujoco.mj_step(typed, data)
+            means.append(np.linalg.norm((jacobians @ data.qvel)[:, :2], axis=1).mean())  # The normal is z.
+        assert remedy.slip == pytest.approx(means[0], rel=1e-6, abs=1e-12), text
+        assert remedy.later == pytest.approx(np.mean(means[1:]), rel=1e-6, abs=1e-12), text
     best = min(explanation.remedies, key=lambda remedy: remedy.later)
     assert best.setting in explanation.advice[1]
     assert best.later < 0.3 * explanation.remedies[0].later

@@ -99,6 +99,14 @@ def test_what_is_chosen():
     assert '<option iterations="9"/>' in found.lines[0]
 
 
+def test_a_smaller_worst_error_does_not_hide_a_larger_median():
+    now, quick = measured(10.0, 1e-4), measured(8.0, 1e-3, iterations=9)
+    now.error[0] = 1e-1
+    assert quick.error.max() < now.error.max() and chosen(now, quick).faster is None
+    quick.error[:60] = 1e-5
+    assert chosen(now, quick).faster is quick
+
+
 def test_the_fastest_setting_within_a_limit_of_the_error_is_recommended():
     now, quick = measured(10.0, 1e-1), measured(8.0, 1e-2, iterations=9)
     rare, good = measured(11.0, 1e-5, tolerance=1e-5), measured(12.0, 1e-5, tolerance=1e-6)

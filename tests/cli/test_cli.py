@@ -49,7 +49,7 @@ def test_check_states_once_why_problems_have_no_reference(lavender):
 
 def test_a_problem_that_none_of_the_solvers_takes_is_not_checked(lavender):
     code, out, _ = lavender("check", "granularF(n=3)", "--solvers", "sor")
-    assert code == cli.EXIT_UNMET and "1 problems are not accepted by any of these solvers" in out
+    assert code == cli.EXIT_UNMET and "1 problem not accepted by any of these solvers" in out
     assert lavender("check", "granularF(n=3)", "--solvers", "sor", "newton")[0] == 0
 
 

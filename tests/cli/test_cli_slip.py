@@ -47,7 +47,7 @@ def test_a_geom_that_touches_nothing_is_named(lavender, tmp_path):
 def test_settings_are_shown_with_the_slip_that_they_leave(lavender, tmp_path):
     (tmp_path / "slope.xml").write_text(SLOPE.replace("5.5 0 -8.1", "2 0 -9"))
     code, output, _ = lavender("slip", tmp_path / "slope.xml", "--steps", 100)
-    table, helpful = output.split("Settings that help (slip 25 steps later, ")
+    table, helpful = output.split("Settings that help (mean slip in the next 25 steps, ")
     assert code == 0 and '  <option noslip_iterations="20"/>: ' in helpful.splitlines()[1]
     assert "simulated from 1 state" in table
     assert table.count("<option") == 3 and '<geom solref="0.004 1"/>' in table

@@ -7,6 +7,7 @@ import pytest
 from calls import EARLY_BOXES as EARLY
 from calls import keep_values
 
+import lavender as lv
 from lavender.audit.tune import mujoco_settings as tuning
 
 pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[mujoco]'")
@@ -105,8 +106,17 @@ def test_recordings_start_from_states(lavender, tmp_path, boxes):
     np.savez(tmp_path / "two.npz", **states)
     words = (path, "--steps", 10, "--record-every", 5, "--states", tmp_path / "two.npz", "--controls", "zero")
     assert lavender("record", *words, "--out", tmp_path / "steps")[0] == 0
-    rows = [json.loads(line)["rows"] for line in (tmp_path / "steps" / "engine.jsonl").read_text().splitlines()]
+    lines = [json.loads(line) for line in (tmp_path / "steps" / "engine.jsonl").read_text().splitlines()]
+    rows = [line["rows"] for line in lines]
     assert rows[0] > rows[-1]  # The lower box of the second state is far above the floor.
+    mujoco = pytest.importorskip("mujoco")
+    model = mujoco.MjModel.from_xml_path(str(path))
+    for start, (qpos, ctrl) in enumerate(zip(states["qpos"], states["ctrl"], strict=True)):  # The states' own problems.
+        data = mujoco.MjData(model)
+        data.qpos[:], data.ctrl[:] = qpos, ctrl
+        mujoco.mj_forward(model, data)
+        file = next(line["file"] for line in lines if line["start"] == start)
+        np.testing.assert_array_equal(lv.load(tmp_path / "steps" / file).b, lv.io.from_mujoco(model, data).b)
     words = ("report", *words, "--solvers", "auto", "--no-figures", "--out", tmp_path / "page")
     assert lavender(*words)[0] == 0
     (how,) = (tmp_path / "page" / "recorded").glob("*/how.json")

@@ -84,9 +84,16 @@ class Tuning:
         return [m for m in self.measured if not m.setting.changes_problem and np.isfinite(m.mean_step_time)]
 
     def _is_accurate_enough(self, m: Measured) -> bool:
-        """Return whether a setting's error and motion do not exceed the present setting's, or the threshold."""
+        """Return whether a setting's errors and motion do not exceed the present setting's, or the threshold.
+
+        The errors are the median and the maximum, so that a better worst step cannot hide that usual steps are worse.
+        """
         now, threshold = self.present_result, self.threshold
-        pairs = ((m.error.max(), now.error.max()), (m.worst_motion, now.worst_motion))
+        pairs = (
+            (m.error.max(), now.error.max()),
+            (float(np.median(m.error)), float(np.median(now.error))),
+            (m.worst_motion, now.worst_motion),
+        )
         return all(x <= max(own, threshold) for x, own in pairs)
 
     @cached_property
