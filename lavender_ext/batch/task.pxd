@@ -162,7 +162,7 @@ cdef inline bint set_impulse_of_empty_rows(const task_t* j, double tol) noexcept
     return True
 
 
-cdef inline int64_t judge_task_workspace_size(const task_t* j) noexcept nogil:
+cdef inline int64_t judge_task_workspace_size(task_t* j) noexcept nogil:
     """Return the number of doubles of scratch of `judge_task`."""
     cdef view_t v = make_judge_view(j)
     return j.g.n + count_judge_scratch(&v)
