@@ -390,7 +390,11 @@ Both were observed if the backend has an object with a set-up before the solve. 
 nothing was returned."""
 BACKENDS_REPEATED = """\
 The bits of every backend in the tables are the same after programs of other sizes in the same process, and in four
-threads that solve different programs at the same time."""
+threads that solve different programs at the same time.
+
+ECOS, OSQP and SCS replace the handler of Ctrl-C during a solve. Two simultaneous solves of ECOS or of OSQP leave the
+handler of the backend installed: `signal.getsignal` still returns Python's handler, but Ctrl-C no longer raises
+KeyboardInterrupt. lavender therefore runs these three backends one solve at a time, also on several threads."""
 
 BACKENDS_MISSING = """\
 Some backends of qpsolvers have no row: `mosek` needs a licence, `nppro` has no public package, `hpipm` and `pdhcg`,
