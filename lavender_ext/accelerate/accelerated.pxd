@@ -31,7 +31,7 @@ cdef double count_undone_steps(const acceleration_t* c) noexcept nogil
 cdef int32_t count_convex_iterations(int32_t m, int32_t convex) noexcept nogil
 cdef int64_t accelerated_workspace_size(int64_t m, int64_t n_v, int64_t memory) noexcept nogil
 cdef void start_accelerated_sweeps(sweep_run_t* x, acceleration_t* c, int32_t memory, int32_t convex, int32_t keeps,
-                     double* workspace) noexcept nogil
+                                   double* workspace) noexcept nogil
 
 
 cdef class AcceleratedSweeps(Sweeps):

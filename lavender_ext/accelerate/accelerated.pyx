@@ -28,18 +28,16 @@ from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t, uint64_t
 
 from lavender_ext.accelerate.accelerated cimport AUTOMATIC, acceleration_t
-from lavender_ext.accelerate.mixing cimport (
-    CONTROL, MAX_MEMORY, UNDONE, clear_mixing_memory, mix_anderson_iterates, mixing_t, store_evaluation,
-)
+from lavender_ext.accelerate.mixing cimport (CONTROL, MAX_MEMORY, UNDONE, clear_mixing_memory, mix_anderson_iterates, mixing_t,
+                                             store_evaluation)
 from lavender_ext.core.block cimport clip, euclidean_norm
 from lavender_ext.core.order cimport SYMMETRIC
 from lavender_ext.core.block_types cimport CONE, blocks_t, has_independent_rows, get_friction_components, friction_components_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.start cimport is_zero_impulse
 from lavender_ext.core.view cimport view_t
-from lavender_ext.sweep.serial cimport (
-    Sweeps, compute_sweep_velocities, sweep_over_form, sweep_context_t, sweep_run_t, count_sweep_velocities,
-)
+from lavender_ext.sweep.serial cimport (Sweeps, compute_sweep_velocities, sweep_over_form, sweep_context_t, sweep_run_t,
+                                        count_sweep_velocities)
 
 cdef enum:
     # Number of nncg iterations after which v is recomputed, because rounding errors accumulate in it.
@@ -278,7 +276,7 @@ cdef int32_t count_convex_iterations(int32_t m, int32_t convex) noexcept nogil:
 
 
 cdef void start_accelerated_sweeps(sweep_run_t* x, acceleration_t* c, int32_t memory, int32_t convex, int32_t keeps,
-                     double* workspace) noexcept nogil:
+                                   double* workspace) noexcept nogil:
     """Accelerate a run of sweeps x that has been started and has made no sweep.
 
     memory is the number of sweeps that Anderson mixing combines; 0 selects nncg, for which convex is not AUTOMATIC. workspace

@@ -32,19 +32,14 @@ from libc.stdint cimport int32_t, int64_t
 
 import numpy as np
 
-from lavender_ext.accelerate.body_solve cimport (
-    bind_body_solve, body_solve_t, body_solve_workspace_size, compute_body_inverses, solve_body_system,
-)
-from lavender_ext.accelerate.mixing cimport (
-    CONTROL, MAX_MEMORY, UNDONE, clear_mixing_memory, mix_anderson_iterates, mixing_t, store_evaluation,
-)
-from lavender_ext.core.block cimport (
-    clip, euclidean_norm, norm2, index_of_row_group, classify_in_round_cone, compute_round_cone_scale,
-    project_cone_normal,
-)
-from lavender_ext.core.block_types cimport (
-    CONE, blocks_t, is_round_cone_contact, has_independent_rows, get_friction_components, friction_components_t,
-)
+from lavender_ext.accelerate.body_solve cimport (bind_body_solve, body_solve_t, body_solve_workspace_size,
+                                                 compute_body_inverses, solve_body_system)
+from lavender_ext.accelerate.mixing cimport (CONTROL, MAX_MEMORY, UNDONE, clear_mixing_memory, mix_anderson_iterates, mixing_t,
+                                             store_evaluation)
+from lavender_ext.core.block cimport (clip, euclidean_norm, norm2, index_of_row_group, classify_in_round_cone,
+                                      compute_round_cone_scale, project_cone_normal)
+from lavender_ext.core.block_types cimport (CONE, blocks_t, is_round_cone_contact, has_independent_rows,
+                                            get_friction_components, friction_components_t)
 from lavender_ext.core.problem cimport Data
 from lavender_ext.factor.linear cimport LinearSystem, solve_linear_system, linear_t
 from lavender_ext.judge.reference cimport is_strictly_inactive_contact, is_strictly_inactive_row
@@ -147,7 +142,7 @@ cdef inline void scale_friction_components(const blocks_t* p, const double* root
 
 
 cdef inline void project_scaled_block(const blocks_t* p, const double* root, int32_t i, const double* u,
-                               double* z) noexcept nogil:
+                                      double* z) noexcept nogil:
     """Compute z = Pi_K(u) of block i by core/block.pxd (7); u and z are scaled vectors of all rows."""
     cdef int32_t j = p.ptr[i], end = p.ptr[i + 1], k, g
     cdef friction_components_t q
@@ -234,7 +229,7 @@ cdef public double lav_admm_workspace_size(int32_t m, int32_t memory) noexcept n
 
 
 cdef public void lav_begin_admm(admm_t* c, const blocks_t* p, int32_t memory, double rho, double alpha,
-                              double* workspace) noexcept nogil:
+                                double* workspace) noexcept nogil:
     """Initialise a run over p before its first iteration; workspace (`lav_admm_workspace_size`) must be zero-initialised."""
     cdef int64_t m = p.n_rows
     cdef int32_t i

@@ -42,7 +42,7 @@ cdef struct mixing_t:
 
 
 cdef inline int32_t solve_mixing_coefficients(int32_t n, int32_t head, int32_t memory, const double* gram, const double* rhs,
-                                  double* gamma) noexcept nogil:
+                                              double* gamma) noexcept nogil:
     """Solve the normal equations of (1) over the n newest differences; return the number of columns that were used.
 
     gamma (memory) receives the coefficient of each slot of the ring buffers. The method is Cholesky's with the newest

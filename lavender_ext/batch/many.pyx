@@ -23,11 +23,10 @@ from lavender_ext.batch.task cimport (copy_small_judgement, compute_missing_deri
                                      solve_small_task, solve_task, task_t, task_workspaces_t)
 from lavender_ext.small.limits cimport max_newton_cost, estimate_newton_cost, limits_t
 from lavender_ext.small.workspace cimport grow_workspace_to, free_workspace
-from lavender_ext.batch.world cimport (
-    BAD, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, LATE, LEFT, MASS, MU, N_ARRAYS, PLACES, READY, AT_ROW, FIELDS, ROWS,
-    SOFT, STARTED, TARGET, TRIED, VELOCITIES, VELOCITY, worker_scratch_t, convert_body_world, convert_matrix_world,
-    convert_generalized_world, worlds_t,
-)
+from lavender_ext.batch.world cimport (BAD, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, LATE, LEFT, MASS, MU, N_ARRAYS, PLACES, READY,
+                                       AT_ROW, FIELDS, ROWS, SOFT, STARTED, TARGET, TRIED, VELOCITIES, VELOCITY,
+                                       worker_scratch_t, convert_body_world, convert_matrix_world, convert_generalized_world,
+                                       worlds_t)
 from lavender_ext.judge.measure cimport set_zero_impulse, make_judged, count_judge_scratch
 from lavender_ext.judge.rounding cimport float32_floor_of_score, compute_squared_float32_rounding
 from lavender_ext.judge.tally cimport rhs_energy_and_velocity_norms
@@ -335,7 +334,7 @@ cdef class Worlds:
         return self.tasks[i].general if self.tasks != NULL else self.w.general
 
     cdef int32_t convert_world(self, int64_t i, worker_scratch_t* scratch, workspace_t* slack_error, const derived_t* made,
-                     task_t* j) noexcept nogil:
+                               task_t* j) noexcept nogil:
         """Convert world i for a solve or for the judge; return READY, BAD or LEFT."""
         cdef const int64_t* at = self.w.at + i * PLACES
         cdef int32_t code = READY
@@ -388,7 +387,7 @@ cdef class Worlds:
         return READY
 
     cdef int32_t solve_world(self, int64_t i, worker_t* h, const limits_t* limits, const small_rules_t* rules, double tol,
-                       double max_cost) noexcept nogil:
+                             double max_cost) noexcept nogil:
         """Solve world i, store its result and return its status."""
         cdef task_t j
         cdef int32_t k, code = LEFT

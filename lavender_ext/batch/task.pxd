@@ -25,11 +25,9 @@ from lavender_ext.judge.measure cimport (refine_reported_view, residual_above_fl
 from lavender_ext.judge.score cimport make_empty_score, score_t
 from lavender_ext.judge.slack cimport compute_generalized_slack
 from lavender_ext.small.call cimport (N_COUNTS, RESULT_IS_START, RESULT_SOLVED, are_all_rows_bounded, derive_small_problem,
-                                      small_problem_t,
-                                      small_rules_t, solve_small, solve_workspaces_t, can_use_small_call)
-from lavender_ext.small.limits cimport (
-    max_newton_cost, estimate_newton_cost, limits_t, estimate_newton_step_cost, max_factorisation_work,
-)
+                                      small_problem_t, small_rules_t, solve_small, solve_workspaces_t, can_use_small_call)
+from lavender_ext.small.limits cimport (max_newton_cost, estimate_newton_cost, limits_t, estimate_newton_step_cost,
+                                        max_factorisation_work)
 from lavender_ext.small.workspace cimport fits_workspace, grow_workspace_to, grow_workspace_to_arena
 from lavender_ext.batch.world cimport THIN_PADDING, LEFT, READY, STARTED, TRIED, compress_dense_rows
 from lavender_ext.velocity_newton.soft cimport needs_no_proximal_terms
@@ -117,7 +115,7 @@ cdef inline double estimate_task_cost(const task_t* j, const limits_t* l, double
 
 
 cdef inline int32_t run_newton_within_cost(task_t* j, const view_t* v, const options_t* o, const workspace_t* r,
-                                const limits_t* l) noexcept nogil:
+                                           const limits_t* l) noexcept nogil:
     """Run Newton's steps while their estimated cost is below the task's limit; set `limit_reached` if the limit ends them.
 
     Each call runs as many steps as the remaining cost permits if every step factorises. Steps without a factorisation cost
@@ -195,7 +193,7 @@ cdef inline bint compute_missing_derived_numbers(task_t* j) noexcept nogil:
 
 
 cdef inline void solve_task(task_t* j, workspace_t* workspace, workspace_t* islands, const limits_t* limits,
-                           double tol) noexcept nogil:
+                            double tol) noexcept nogil:
     """Solve and judge a task of J and M by Newton's method, if its estimated cost is within the limits."""
     cdef view_t v
     cdef options_t o = options_t(NEWTON, NEWTON_STEPS_PER_ISLAND, 0, 0, has_wide(), tol, 0.0, 0.0, limits.values, 0.0)

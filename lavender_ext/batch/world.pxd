@@ -112,8 +112,7 @@ cdef inline void convert_entries_to_float64(const worlds_t* w, int32_t which, in
 
 
 cdef inline const double* convert_matrix_to_float64(const worlds_t* w, int32_t which, int64_t first, int32_t m, int32_t n,
-                                                    int64_t* row,
-                                  double* out) noexcept nogil:
+                                                    int64_t* row, double* out) noexcept nogil:
     """Return a matrix (m, n) in place, or converted from float32 in out (m n); row: stride of its rows."""
     cdef int32_t i
     if not row[0]:
@@ -127,7 +126,7 @@ cdef inline const double* convert_matrix_to_float64(const worlds_t* w, int32_t w
 
 
 cdef inline int32_t drop_zeros_of_triangle(const int32_t* row_ptr, const int32_t* col, const double* x, int32_t n, int32_t* ptr,
-                               int32_t* idx, double* val) noexcept nogil:
+                                           int32_t* idx, double* val) noexcept nogil:
     """Copy a lower triangle (n, n) in compressed rows, except off-diagonal zeros, and return the number of copied entries."""
     cdef int32_t i, k, q = 0
     ptr[0] = 0
@@ -303,7 +302,7 @@ cdef inline int32_t convert_generalized_world(const worlds_t* w, int64_t i, work
 
 
 cdef inline int32_t convert_matrix_world(const worlds_t* w, int64_t i, worker_scratch_t* d, blocks_t* p, const double** a,
-                               int64_t* row) noexcept nogil:
+                                         int64_t* row) noexcept nogil:
     """Convert world i of A to p and to a (m, m) with row stride `row`, in the worker's scratch d; return READY, BAD or LEFT."""
     cdef const int64_t* at = w.at + i * PLACES
     cdef int32_t m = <int32_t>at[ROWS], k = <int32_t>at[BLOCKS], j
@@ -358,7 +357,7 @@ cdef inline int32_t convert_body_world(const worlds_t* w, int64_t i, worker_scra
 
 
 cdef inline int32_t convert_world_blocks(const worlds_t* w, const int64_t* at, blocks_t* p, const double* b, int32_t* ptr,
-                               double* mu, bint has_mu=False) noexcept nogil:
+                                         double* mu, bint has_mu=False) noexcept nogil:
     """Bind the blocks of a world to p, with rows numbered from 0; return READY or BAD.
 
     A mu that is given per world replaces that of the blocks; with has_mu it is in mu already.

@@ -6,7 +6,7 @@ from lavender_ext.core.view cimport rows_t
 
 
 cdef public void lav_list_blocks_of_bodies(const blocks_t* p, const rows_t* r, int32_t* start, int32_t* blocks,
-                                 int64_t* bound) noexcept nogil
+                                           int64_t* bound) noexcept nogil
 cdef public void lav_form_delassus_matrix(const blocks_t* p, const rows_t* r, const int32_t* start, const int32_t* blocks,
                                           double* jac, int32_t* scratch, int32_t* indptr, int32_t* indices,
                                           double* data) noexcept nogil

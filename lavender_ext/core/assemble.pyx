@@ -38,7 +38,7 @@ cdef void expand_rows(const blocks_t* p, const rows_t* r, double* jac, double* m
 
 
 cdef public void lav_list_blocks_of_bodies(const blocks_t* p, const rows_t* r, int32_t* start, int32_t* blocks,
-                                 int64_t* bound) noexcept nogil:
+                                           int64_t* bound) noexcept nogil:
     """List the blocks of body i in increasing order in blocks[start[i]:start[i + 1]]; start (n + 1), blocks (2 k).
 
     bound[0] receives an upper bound on the number of stored entries of A.
@@ -74,7 +74,7 @@ cdef public void lav_list_blocks_of_bodies(const blocks_t* p, const rows_t* r, i
 
 
 cdef inline int32_t list_coupled_blocks(const rows_t* r, int32_t i, const int32_t* start, const int32_t* blocks,
-                                   int32_t* out) noexcept nogil:
+                                        int32_t* out) noexcept nogil:
     """List block i and the blocks that share a body with it in `out`, increasing; return their number."""
     cdef int32_t a = get_moving_body(r, i, 0), b = get_moving_body(r, i, 1), x = 0, y = 0, xe = 0, ye = 0, n = 0, u, v
     if a >= 0:
@@ -355,7 +355,7 @@ def stack_csr_matrices(int32_t n, matrices):
 
 
 cdef public void lav_count_gram_entries(int32_t m, const int32_t* indptr, const int32_t* indices, const int32_t* ptr,
-                                  const int32_t* row, int32_t* mark, int32_t* count) noexcept nogil:
+                                        const int32_t* row, int32_t* mark, int32_t* count) noexcept nogil:
     """Write the row pointers of the pattern of Y Y^T + D, diagonal included, into count (m + 1); mark (m) is scratch."""
     cdef int32_t i, q, p, k
     for i in range(m):

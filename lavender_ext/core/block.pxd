@@ -58,8 +58,8 @@ cdef inline double compute_row_error(double lam, double w, double d, double low,
     return clip(w / d, lam - high, lam - low)
 
 
-cdef inline void compute_tangent_error(const double* lam, const double* w, double d, double radius,
-                               int32_t n, double* e) noexcept nogil:
+cdef inline void compute_tangent_error(const double* lam, const double* w, double d, double radius, int32_t n,
+                                       double* e) noexcept nogil:
     """Compute the error of n tangent rows on the disk of this radius by (6)."""
     cdef double x, y, r
     if n == 1:
@@ -77,7 +77,7 @@ cdef inline void compute_tangent_error(const double* lam, const double* w, doubl
 
 
 cdef inline void compute_coulomb_error(const double* lam, const double* w, const double* d, const friction_components_t* q,
-                               double* e) noexcept nogil:
+                                       double* e) noexcept nogil:
     """Compute the error (6) of a contact under Coulomb's law."""
     cdef double normal_impulse = lam[0] if lam[0] > 0.0 else 0.0, inf = 1.0 / 0.0
     cdef int32_t g, j
@@ -119,7 +119,7 @@ cdef inline double project_cone_normal(const int32_t n, const double* a, const d
 
 
 cdef inline void compute_cone_error(const double* lam, const double* w, const double* d, const friction_components_t* q,
-                            double* e) noexcept nogil:
+                                    double* e) noexcept nogil:
     """Compute the error e of a contact's rows under the cone law by (7).
 
     The projection is computed for y = sqrt(d) (lam - w / d), in which the metric of d is the Euclidean one.
@@ -217,7 +217,7 @@ cdef inline double compute_round_cone_scale_complement(double a, double rise, do
 
 
 cdef inline void compute_round_cone_error(const double* lam, const double* w, const double* d, double mu, int32_t nt,
-                             double* e) noexcept nogil:
+                                          double* e) noexcept nogil:
     """Compute the error (7) of a ROUND contact, |lam_T| <= mu lam_n over all its tangents together.
 
     Each group g (sliding, spin, rolling) has one d: (8) with y = sqrt(d) (lam - w / d), T_g = |y_g|, a_g = mu sqrt(d_g / d_n).
@@ -247,8 +247,7 @@ cdef inline void compute_round_cone_error(const double* lam, const double* w, co
 
 
 cdef inline void compute_contact_error(int32_t law, const double* lam, const double* w, const double* d,
-                                       const friction_components_t* q,
-                               double* e) noexcept nogil:
+                                       const friction_components_t* q, double* e) noexcept nogil:
     """Compute the error e of one contact with friction components q under `law`."""
     if law == CONE:
         compute_cone_error(lam, w, d, q, e)
@@ -257,7 +256,7 @@ cdef inline void compute_contact_error(int32_t law, const double* lam, const dou
 
 
 cdef inline void compute_block_error(const blocks_t* p, int32_t i, const double* lam, const double* w,
-                             double* e) noexcept nogil:
+                                     double* e) noexcept nogil:
     """Compute the error e [N s] of block i; lam, w, e are vectors of all rows (m)."""
     cdef int32_t j = p.ptr[i], end = p.ptr[i + 1]
     cdef friction_components_t q

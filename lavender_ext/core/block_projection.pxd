@@ -34,7 +34,7 @@ cdef inline int32_t classify_active_bound(double y, double lower, double upper) 
 
 
 cdef inline void add_tangential_derivative(const double* y, double t, double kappa, int32_t j, int32_t m, int32_t n,
-                           double* p) noexcept nogil:
+                                           double* p) noexcept nogil:
     """Add kappa (I - y y^T / t^2) of rows [j, j + m) to p (n, n)."""
     cdef int32_t k, l
     cdef double u[5]
@@ -48,8 +48,8 @@ cdef inline void add_tangential_derivative(const double* y, double t, double kap
 
 
 cdef inline void project_contact_components(int32_t law, const int32_t n_components, const int32_t n,
-                                            const friction_components_t* q,
-                                    const double* y, double* out, double* p) noexcept nogil:
+                                            const friction_components_t* q, const double* y, double* out,
+                                            double* p) noexcept nogil:
     """Compute Pi(y) and P of `project_contact` for n rows and n_components friction components."""
     cdef double t[MAX_FRICTION_COMPONENTS]
     cdef double ray[6]

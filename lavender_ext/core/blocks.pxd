@@ -18,8 +18,7 @@ cdef class Blocks:
     cdef readonly bint single_rows                      # every block is one bounded row
 
     cdef bint bind_arrays(self, const int32_t[::1] ptr, const int32_t[::1] kind, const double[::1] lower,
-                    const double[::1] upper, const double[::1] mu, const double[::1] radius,
-                    const double[::1] rolling)
+                          const double[::1] upper, const double[::1] mu, const double[::1] radius, const double[::1] rolling)
     cdef bint validate(self) noexcept
 
 

@@ -44,7 +44,7 @@ cdef class Blocks:
         return self.at.n_rows
 
     cdef bint bind_arrays(self, const int32_t[::1] ptr, const int32_t[::1] kind, const double[::1] lower,
-                    const double[::1] upper, const double[::1] mu, const double[::1] radius, const double[::1] rolling):
+                          const double[::1] upper, const double[::1] mu, const double[::1] radius, const double[::1] rolling):
         cdef Py_ssize_t k = kind.shape[0], m = lower.shape[0]
         if ptr.shape[0] != k + 1 or mu.shape[0] != k or radius.shape[0] != k or upper.shape[0] != m \
                 or rolling.shape[0] != k:

@@ -11,8 +11,7 @@ successive contacts, 1.3 times as fast.
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block_types cimport (blocks_t, friction_components_t, get_friction_components, is_box_friction_contact,
-                                            is_disk_friction_contact,
-                                            count_angular_rows, count_tangent_rows)
+                                            is_disk_friction_contact, count_angular_rows, count_tangent_rows)
 from lavender_ext.core.joint cimport relax_joint_block
 from lavender_ext.core.numbers cimport (apply_contact_impulse_changes_to_body, clip_below_zero, clip_to_bound,
                                         convert_to_type_of, dot_numbers, number_t, project_disk, compute_relative_angular_velocity)
@@ -182,7 +181,7 @@ cdef inline void bind_contact_arrays(const blocks_t* p, const rows_t* r, int32_t
 
 
 cdef inline void bind_contact_friction(const blocks_t* p, int32_t i, friction_components_t* components, double* tangent2,
-                               contact_t* out) noexcept nogil:
+                                       contact_t* out) noexcept nogil:
     """Add the friction of contact block i to `out`, and compute its `components` and second tangent (3)."""
     cdef int32_t n_angular = count_angular_rows(p, i)
     get_friction_components(p, i, components)

@@ -90,7 +90,7 @@ cdef inline double csr_row_dot_with_abs_sum(const csr_t* a, int32_t i, const dou
 
 
 cdef inline void transpose_csr(int32_t m, int32_t n, const int32_t* indptr, const int32_t* indices, const double* data,
-                            int32_t* ptr, int32_t* row, double* value) noexcept nogil:
+                               int32_t* ptr, int32_t* row, double* value) noexcept nogil:
     """Transpose a matrix (m, n) in compressed rows: pointers in ptr (n + 2), ascending rows, values."""
     cdef int32_t i, j, q
     for j in range(n + 2):
@@ -113,7 +113,7 @@ cdef inline double scale_asymmetry(double gap, double d_i, double d_j) noexcept 
 
 
 cdef inline double measure_asymmetry_and_bandwidth(const csr_t* a, const double* d, int32_t n, int32_t* cursor,
-                                int32_t* band) noexcept nogil:
+                                                   int32_t* band) noexcept nogil:
     """Return the asymmetry of A and write its lower and upper bandwidth to band[2]; columns must be sorted.
 
     The asymmetry is max |A - A^T| / max |A|. If that is rounding (at most 1e-14) and max |A_ij - A_ji| / sqrt(d_i d_j) is

@@ -10,8 +10,7 @@ from lavender_ext.core.validate cimport any_magnitude_above
 from lavender_ext.core.condition cimport estimate_condition
 from lavender_ext.core.generalized cimport multiply_jacobian_transpose, multiply_jacobian_row, solve_mass_matrix
 from lavender_ext.core.mass cimport (THIN_PADDING, relative_entry_asymmetry, compress_lower_triangle, factor_mass,
-                                     count_mass_factor_work,
-                                     is_symmetric, ordering_pays_off)
+                                     count_mass_factor_work, is_symmetric, ordering_pays_off)
 from lavender_ext.core.tree cimport find_tree_factor_pattern
 
 cdef object new = np.empty, I4 = np.dtype(np.int32)

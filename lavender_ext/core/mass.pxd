@@ -15,7 +15,7 @@ cdef enum:
 # -- layout ------------------------------------------------------------------------------------------------------
 
 cdef inline int32_t compress_dense_rows(const double* a, int64_t stride, int32_t m, int32_t n, int32_t* ptr, int32_t* idx,
-                                  double* val) noexcept nogil:
+                                        double* val) noexcept nogil:
     """Write a dense matrix (m, n) in compressed rows without zeros; return the number of entries."""
     cdef int32_t i, q = 0
     ptr[0] = 0

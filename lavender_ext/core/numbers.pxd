@@ -71,7 +71,7 @@ cdef inline void project_disk(number_t* x, number_t* y, number_t radius) noexcep
 
 
 cdef inline void compute_relative_angular_velocity(const number_t* va, const number_t* vb, int32_t body_a, int32_t body_b,
-                                           number_t* omega) noexcept nogil:
+                                                   number_t* omega) noexcept nogil:
     """Compute omega_b - omega_a from the velocities (6) of the bodies; a negative body is static."""
     cdef int32_t k
     for k in range(3):
@@ -83,8 +83,8 @@ cdef inline void compute_relative_angular_velocity(const number_t* va, const num
 
 
 cdef inline void apply_contact_impulse_changes_to_body(number_t* v, const number_t* inv_mass, const number_t* inv_inertia_arm,
-                                       const number_t* impulse, const number_t* change, int32_t nt, bint spins,
-                                       int32_t sign) noexcept nogil:
+                                                       const number_t* impulse, const number_t* change, int32_t nt, bint spins,
+                                                       int32_t sign) noexcept nogil:
     """Apply the impulse changes of one contact to the velocity v (6) of one body by (3) of core/rows.pxd.
 
     change (4) belongs to normal, t1, t2 and spin, and `impulse` (3) is their linear impulse. inv_inertia_arm points at the first

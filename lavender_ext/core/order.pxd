@@ -26,10 +26,10 @@ cdef inline uint64_t next_random(uint64_t* state) noexcept nogil:
 cdef void shuffle_blocks(int32_t* order, int32_t first, int32_t end, uint64_t* rng) noexcept nogil
 cdef void reverse_blocks(int32_t* order, int32_t first, int32_t end) noexcept nogil
 cdef void update_sweep_order(int32_t mode, int32_t first_sweep, int32_t* order, int32_t first, int32_t end,
-                        uint64_t* rng) noexcept nogil
+                             uint64_t* rng) noexcept nogil
 cdef int32_t find_block_levels(int32_t n_blocks, const int32_t* body, int32_t n_bodies, int32_t* level,
                                int32_t* out) noexcept nogil
 cdef void sort_blocks_by_level(int32_t n_blocks, const int32_t* level, int32_t n_levels, int32_t* start,
-                        int32_t* order) noexcept nogil
+                               int32_t* order) noexcept nogil
 cdef int32_t color_blocks_by_bodies(int32_t n_blocks, const int32_t* body, int32_t n_bodies, uint64_t* used,
-                             int32_t* color) noexcept nogil
+                                    int32_t* color) noexcept nogil

@@ -29,7 +29,7 @@ cdef void reverse_blocks(int32_t* order, int32_t first, int32_t end) noexcept no
 
 
 cdef void update_sweep_order(int32_t mode, int32_t first_sweep, int32_t* order, int32_t first, int32_t end,
-                        uint64_t* rng) noexcept nogil:
+                             uint64_t* rng) noexcept nogil:
     """Update order[first:end] in place for the next sweep, as `mode` requires; first_sweep is 1 before the first sweep."""
     if mode == RANDOM:
         shuffle_blocks(order, first, end, rng)
@@ -77,7 +77,7 @@ cdef int32_t find_block_levels(int32_t n_blocks, const int32_t* body, int32_t n_
 
 
 cdef void sort_blocks_by_level(int32_t n_blocks, const int32_t* level, int32_t n_levels, int32_t* start,
-                        int32_t* order) noexcept nogil:
+                               int32_t* order) noexcept nogil:
     """Sort blocks by level (stable counting sort); blocks of level -1 are omitted.
 
     start (n_levels + 1) receives the first index of each level in `order`.
@@ -97,7 +97,7 @@ cdef void sort_blocks_by_level(int32_t n_blocks, const int32_t* level, int32_t n
 
 
 cdef int32_t color_blocks_by_bodies(int32_t n_blocks, const int32_t* body, int32_t n_bodies, uint64_t* used,
-                             int32_t* color) noexcept nogil:
+                                    int32_t* color) noexcept nogil:
     """Colour blocks greedily so that no two blocks of one colour share a moving body; return the number of colours.
 
     `used` (n_bodies) holds one bit per colour of the current group of 63 colours. Blocks without a free bit are coloured in
@@ -138,8 +138,8 @@ cdef int32_t color_blocks_by_bodies(int32_t n_blocks, const int32_t* body, int32
 
 
 cdef public int32_t lav_color_blocks_by_matrix(int32_t n_blocks, const int32_t* block_ptr, const int32_t* block_of,
-                                     const int32_t* indptr, const int32_t* indices, int32_t* mark,
-                                     int32_t* color) noexcept nogil:
+                                               const int32_t* indptr, const int32_t* indices, int32_t* mark,
+                                               int32_t* color) noexcept nogil:
     """Colour blocks greedily so that no two blocks of one colour are coupled in A; return the number of colours.
 
     The pattern of A must be symmetric. mark (n_blocks + 1) is scratch.
@@ -184,7 +184,7 @@ def compute_body_colors(const int32_t[:, ::1] body, int n_bodies):
 
 
 def compute_matrix_colors(const int32_t[::1] block_ptr, const int32_t[::1] block_of, const int32_t[::1] indptr,
-                 const int32_t[::1] indices):
+                          const int32_t[::1] indices):
     """Return the colour (k,) of each block; no two blocks of one colour are coupled in the symmetric pattern."""
     cdef int32_t k = <int32_t>block_ptr.shape[0] - 1
     cdef int32_t[::1] mark = np.empty(k + 1, np.int32), color = np.empty(k + 1, np.int32)

@@ -24,9 +24,8 @@ from lavender_ext.core.generalized cimport Operator
 from lavender_ext.core.block_types cimport (CONE, COULOMB, MAX_FRICTION_COMPONENTS, blocks_t, is_box_friction_contact, islands_t,
                                             count_tangent_rows,
                                             count_angular_rows, get_friction_components, friction_components_t)
-from lavender_ext.core.rows cimport (
-    compute_contact_delassus_block, dot12, largest_eigenvalue_2x2, multiply_inverse_mass, multiply_jacobian,
-)
+from lavender_ext.core.rows cimport (compute_contact_delassus_block, dot12, largest_eigenvalue_2x2, multiply_inverse_mass,
+                                     multiply_jacobian)
 from lavender_ext.core.steps cimport compute_block_steps, largest_eigenvalue_of_csr_pair, average_diagonal_of_pairs
 from lavender_ext.core.whiten cimport find_panel_pattern, whiten_panel
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t

@@ -39,7 +39,7 @@ cdef inline int32_t find_panel(const row_form_t* form, int32_t i) noexcept nogil
 
 
 cdef inline double compute_row_slack(const row_form_t* form, const blocks_t* p, int32_t panel, int32_t row, const double* lam,
-                             const double* v) noexcept nogil:
+                                     const double* v) noexcept nogil:
     """Return the slack w [m/s] of a row. `panel` is `find_panel` of its block; v (nv) is read only if the form is J and M."""
     if row_form_t is csr_t:
         return csr_row_dot(form, row, lam) - p.b[row]
@@ -60,7 +60,7 @@ cdef inline double get_row_step(const row_form_t* form, const blocks_t* p, int32
 
 
 cdef inline void set_row_impulse(const row_form_t* form, int32_t panel, int32_t row, double impulse, double* lam,
-                             double* v) noexcept nogil:
+                                 double* v) noexcept nogil:
     """Set the impulse [N s] of a row in lam (m), and update v (nv) if the form is J and M."""
     if row_form_t is generalized_t:
         add_scaled_whitened_row(form, panel, row, impulse - lam[row], v)

@@ -29,8 +29,8 @@ cdef inline void cross(const double* a, const double* b, double* out) noexcept n
     out[2] = a[0] * b[1] - a[1] * b[0]
 
 
-cdef inline void compute_relative_velocity(const double* v, int32_t a, int32_t b, const double* arm_a,
-                                   const double* arm_b, double* u, double* spin) noexcept nogil:
+cdef inline void compute_relative_velocity(const double* v, int32_t a, int32_t b, const double* arm_a, const double* arm_b,
+                                           double* u, double* spin) noexcept nogil:
     """Compute the relative velocity u (1), and omega_b - omega_a in `spin`."""
     cdef const double* x
     cdef int32_t k
@@ -54,7 +54,7 @@ cdef inline void compute_relative_velocity(const double* v, int32_t a, int32_t b
 
 
 cdef inline void apply_impulse_to_body(double* v, double inv_mass, const double* inv_inertia, const double* arm,
-                      const double* impulse, const double* twist, double sign) noexcept nogil:
+                                       const double* impulse, const double* twist, double sign) noexcept nogil:
     """Apply an impulse to one body by (3); twist = s n [N m s], or NULL. `sign` is -1 for body a, 1 for body b."""
     cdef double l[3]
     cdef int32_t k
@@ -69,9 +69,9 @@ cdef inline void apply_impulse_to_body(double* v, double inv_mass, const double*
         v[3 + k] += dot3(inv_inertia + 3 * k, l)
 
 
-cdef inline void apply_impulse_to_bodies(double* v, int32_t a, int32_t b, const double* inv_mass,
-                             const double* inv_inertia, const double* arm_a, const double* arm_b,
-                             const double* impulse, const double* twist) noexcept nogil:
+cdef inline void apply_impulse_to_bodies(double* v, int32_t a, int32_t b, const double* inv_mass, const double* inv_inertia,
+                                         const double* arm_a, const double* arm_b, const double* impulse,
+                                         const double* twist) noexcept nogil:
     """Apply an impulse (3) [N s] and an angular impulse `twist` (3) [N m s] or NULL to the velocities of both bodies by (3)."""
     if a >= 0:
         apply_impulse_to_body(v + 6 * a, inv_mass[a], inv_inertia + 9 * a, arm_a, impulse, twist, -1.0)
@@ -92,8 +92,7 @@ cdef inline double joint_row_velocity(const double* jac, const double* v, int32_
     return s + t
 
 
-cdef inline void apply_joint_impulse(const double* minv_jac, double change, double* v, int32_t a,
-                                     int32_t b) noexcept nogil:
+cdef inline void apply_joint_impulse(const double* minv_jac, double change, double* v, int32_t a, int32_t b) noexcept nogil:
     """Apply the impulse change of one joint row to the velocities of its bodies."""
     cdef int32_t k
     if a >= 0:
@@ -105,7 +104,7 @@ cdef inline void apply_joint_impulse(const double* minv_jac, double change, doub
 
 
 cdef inline void compute_contact_velocity(const rows_t* r, int32_t c, int32_t nt, int32_t n_angular, const double* v,
-                               double* w) noexcept nogil:
+                                          double* w) noexcept nogil:
     """Compute the relative velocities w of the rows of one contact by (2), its rows of J v."""
     cdef double u[3]
     cdef double omega[3]
@@ -137,8 +136,7 @@ cdef inline void multiply_jacobian(const blocks_t* p, const rows_t* r, const dou
         compute_contact_velocity(r, c, count_tangent_rows(p, i), count_angular_rows(p, i), v, out + p.ptr[i])
 
 
-cdef inline void form_contact_jacobian(const rows_t* r, int32_t c, int32_t nt, int32_t n_angular,
-                                  double* jac) noexcept nogil:
+cdef inline void form_contact_jacobian(const rows_t* r, int32_t c, int32_t nt, int32_t n_angular, double* jac) noexcept nogil:
     """Write the rows of one contact (1 + nt + n_angular, 12) in the layout of joint rows; columns of static bodies are zero."""
     cdef const double* n = r.normal + 3 * c
     cdef const double* t1 = r.tangent + 3 * c
@@ -184,7 +182,7 @@ cdef inline const double* get_block_jacobian(const blocks_t* p, const rows_t* r,
 
 
 cdef inline void multiply_inverse_mass(const double* jac, const double* inv_mass, const double* inv_inertia, int32_t a,
-                            int32_t b, double* out) noexcept nogil:
+                                       int32_t b, double* out) noexcept nogil:
     """Compute M^-1 J^T of one row in the layout of joint rows."""
     cdef int32_t k
     for k in range(12):
@@ -200,10 +198,9 @@ cdef inline void multiply_inverse_mass(const double* jac, const double* inv_mass
 
 
 cdef inline void compute_contact_delassus_block(const double* normal, const double* tangent, const double* arm_a,
-                                  const double* arm_b,
-                                  int32_t nt, int32_t n_angular, int32_t a, int32_t b, const double* inv_mass,
-                                  const double* inv_inertia, double* d, double* off, double* coupling,
-                                  double* inv_inertia_arm) noexcept nogil:
+                                                const double* arm_b, int32_t nt, int32_t n_angular, int32_t a, int32_t b,
+                                                const double* inv_mass, const double* inv_inertia, double* d, double* off,
+                                                double* coupling, double* inv_inertia_arm) noexcept nogil:
     """Compute the block of A of one contact, without compliance.
 
     d (1 + nt + n_angular) is its diagonal, off = (A_t1t2, A_r1r2), coupling (5) as in `rows_t`. inv_inertia_arm

@@ -33,7 +33,7 @@ cdef inline double largest_eigenvalue_of_csr_pair(const csr_t* a, int32_t j, con
 
 
 cdef inline void compute_block_steps(const blocks_t* p, int32_t i, const friction_components_t* part, const double* eigenvalue,
-                             const double* d, double* step) noexcept nogil:
+                                     const double* d, double* step) noexcept nogil:
     """Compute the steps (3) of block i; eigenvalue[g] is lambda_max of component g if it has two rows."""
     cdef int32_t j = p.ptr[i], g, k
     for k in range(j, p.ptr[i + 1]):

@@ -52,9 +52,9 @@ cdef inline void sort_row_columns(int32_t k, const int32_t* mark, int32_t count,
         i += 1
 
 
-cdef inline int32_t find_tree_factor_pattern(int32_t n, const int32_t* mptr, const int32_t* midx, int32_t workspace, int32_t* lptr,
-                                 int32_t* lidx, int32_t* parent, int32_t* mark, int32_t* next_child,
-                                 int32_t* first_child) noexcept nogil:
+cdef inline int32_t find_tree_factor_pattern(int32_t n, const int32_t* mptr, const int32_t* midx, int32_t workspace,
+                                             int32_t* lptr, int32_t* lidx, int32_t* parent, int32_t* mark, int32_t* next_child,
+                                             int32_t* first_child) noexcept nogil:
     """Compute the pattern of L from the lower triangle of M; return the number of entries, -1 if `workspace` is too small.
 
     Rows are computed from the last to the first. Row k has the entries of row k of M and those that the elimination of the
@@ -104,9 +104,8 @@ cdef inline int32_t find_tree_factor_pattern(int32_t n, const int32_t* mptr, con
     return lptr[n]
 
 
-cdef inline int32_t factor_tree(int32_t n, const int32_t* mptr, const int32_t* midx, const double* mval,
-                                const int32_t* lptr, const int32_t* lidx, double* lval, double* pivot,
-                                double* inv_pivot) noexcept nogil:
+cdef inline int32_t factor_tree(int32_t n, const int32_t* mptr, const int32_t* midx, const double* mval, const int32_t* lptr,
+                                const int32_t* lidx, double* lval, double* pivot, double* inv_pivot) noexcept nogil:
     """Compute L and 1 / D of (1) for a mass matrix; return -1, or the row of a pivot that is too small."""
     cdef int32_t k, q, j, first, count, at
     # copy M into the pattern of L
@@ -133,7 +132,7 @@ cdef inline int32_t factor_tree(int32_t n, const int32_t* mptr, const int32_t* m
 
 
 cdef inline int32_t factor_tree_matrix(int32_t n, const int32_t* lptr, const int32_t* lidx, double* lval, double* pivot,
-                                   double* inv_pivot, double min_pivot) noexcept nogil:
+                                       double* inv_pivot, double min_pivot) noexcept nogil:
     """Overwrite M in the pattern of L with L, D and 1 / D of (1); return -1, or the row of a pivot that is too small.
 
     lptr indexes both lidx and lval. `pivot` and `inv_pivot` contain the diagonal of M. A pivot is too small if it is at most
@@ -170,8 +169,8 @@ cdef inline bint invert_pivot(const double* pivot, double* inv_pivot, int32_t k,
 
 
 cdef inline void eliminate_chain_rows(const int32_t* lptr, const int32_t* lidx, double* lval, double* pivot,
-                                     const double* inv_pivot, int32_t k, int32_t j, int32_t count, double** row,
-                                     int32_t s) noexcept nogil:
+                                      const double* inv_pivot, int32_t k, int32_t j, int32_t count, double** row,
+                                      int32_t s) noexcept nogil:
     """Eliminate the s rows k, k - 1 ... of a chain from row j, which is their column number `count`.
 
     Their `count` columns before that one are subtracted from row j.

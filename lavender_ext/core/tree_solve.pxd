@@ -18,7 +18,7 @@ cdef inline void axpy_subtract_2(double* x, const double* l, double f, const dou
 
 
 cdef inline void solve_tree_factor(int32_t n, const int32_t* lptr, const int32_t* lidx, const double* lval,
-                           const double* inv_pivot, double* x) noexcept nogil:
+                                   const double* inv_pivot, double* x) noexcept nogil:
     """Overwrite x (n) with (L^T D L)^-1 x; lptr indexes both lidx and lval."""
     cdef int32_t k, q, first, end
     cdef double z

@@ -17,8 +17,7 @@ cdef inline void add_vector_6(double* total, const double* x) noexcept nogil:
         total[k] += x[k]
 
 
-cdef inline void add_joint_wrench(const blocks_t* p, const rows_t* r, int32_t i, const double* lam,
-                              double* f) noexcept nogil:
+cdef inline void add_joint_wrench(const blocks_t* p, const rows_t* r, int32_t i, const double* lam, double* f) noexcept nogil:
     """Add J^T lam of joint i to f (n, 6)."""
     cdef double x[12]
     cdef const double* row
@@ -36,7 +35,7 @@ cdef inline void add_joint_wrench(const blocks_t* p, const rows_t* r, int32_t i,
 
 
 cdef inline void add_contact_wrench(const rows_t* r, int32_t c, int32_t nt, int32_t n_angular, const double* lam,
-                                double* f) noexcept nogil:
+                                    double* f) noexcept nogil:
     """Add J^T lam of contact c to f (n, 6); lam points at its normal."""
     cdef double t2[3]
     cdef double x[3]

@@ -11,7 +11,7 @@ cdef enum:
 
 
 cdef inline int32_t collect_panel_columns(const generalized_t* g, int32_t first, int32_t last, int32_t stamp, int32_t previous,
-                                    int32_t* mark, int32_t* out, int32_t* same) noexcept nogil:
+                                          int32_t* mark, int32_t* out, int32_t* same) noexcept nogil:
     """List the columns of Y in rows [first, last), unsorted, in out (n); return their number.
 
     mark (n) receives `stamp` at these columns. `same` receives the number of these columns that had the mark `previous`.
@@ -45,9 +45,9 @@ cdef inline void sort_descending_runs(int32_t* x, int32_t n) noexcept nogil:
         x[j + 1] = t
 
 
-cdef inline int32_t find_panel_pattern_by_bits(const generalized_t* g, int32_t n_blocks, const int32_t* ptr, uint64_t* ancestors,
-                               int32_t* prow, int32_t* pcol, int32_t* pval, int32_t* cols, int32_t workspace,
-                               int32_t* n_cols, double* n_values) noexcept nogil:
+cdef inline int32_t find_panel_pattern_by_bits(const generalized_t* g, int32_t n_blocks, const int32_t* ptr,
+                                               uint64_t* ancestors, int32_t* prow, int32_t* pcol, int32_t* pval, int32_t* cols,
+                                               int32_t workspace, int32_t* n_cols, double* n_values) noexcept nogil:
     """Do what `find_panel_pattern` does for at most 64 velocities, with bit sets of columns; ancestors (n) is scratch."""
     cdef int32_t i, q, k, first, last, count = 0, previous_entries = -1, at = 0, n = 0, nv = g.n, end, entries, differs
     cdef const int32_t* jptr = g.jptr
@@ -103,8 +103,8 @@ cdef inline int32_t find_panel_pattern_by_bits(const generalized_t* g, int32_t n
 
 
 cdef inline int32_t find_panel_pattern(const generalized_t* g, int32_t n_blocks, const int32_t* ptr, int32_t* mark,
-                                  int32_t* prow, int32_t* pcol, int32_t* pval, int32_t* cols, int32_t workspace,
-                                  int32_t* n_cols, double* n_values) noexcept nogil:
+                                       int32_t* prow, int32_t* pcol, int32_t* pval, int32_t* cols, int32_t workspace,
+                                       int32_t* n_cols, double* n_values) noexcept nogil:
     """Group consecutive blocks with the same columns of Y into panels; return the number of panels.
 
     The result is -1 if `workspace` columns do not suffice. mark (2 n) is scratch, aligned to 8 bytes. n_cols and n_values

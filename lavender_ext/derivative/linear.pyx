@@ -29,9 +29,8 @@ from lavender_ext.derivative.natural cimport (CLOSED, FREE, HIGH, LOW, OPEN, SLI
 from lavender_ext.factor.factors cimport has_wide
 from lavender_ext.factor.linear cimport (LU, analyse_dense, factor_linear_system_matrix, solve_linear_system,
                                          solve_transposed_linear_system)
-from lavender_ext.judge.measure cimport (
-    residual_above_floor, relative_floor_of_score, judge_view, relative_residual_of_score, count_judge_scratch,
-)
+from lavender_ext.judge.measure cimport (residual_above_floor, relative_floor_of_score, judge_view, relative_residual_of_score,
+                                         count_judge_scratch)
 from lavender_ext.judge.score cimport make_empty_score, score_t
 
 cdef object empty = np.empty

@@ -58,7 +58,7 @@ cdef struct linearised_t:           # a judged and linearised solution
 
 
 cdef inline void linearise_row_projection(double lam, double w, double low, double high, double root, double* f, double* margin,
-                               int8_t* case_, double* p) noexcept nogil:
+                                          int8_t* case_, double* p) noexcept nogil:
     """Compute (1), P, case and margin of one bounded row."""
     cdef double y = lam - w / (root * root)
     cdef int32_t side = classify_active_bound(y, low, high)
@@ -80,7 +80,7 @@ cdef inline void linearise_row_projection(double lam, double w, double low, doub
 
 
 cdef inline void linearise_contact_projection(const blocks_t* b, int32_t i, const double* lam, const double* w,
-                                   const natural_t* out) noexcept nogil:
+                                              const natural_t* out) noexcept nogil:
     """Compute (1), P, dPi/de, cases and margins of contact i."""
     cdef int32_t j = b.ptr[i], n = b.ptr[i + 1] - j, k, g, first, size
     cdef double* root = out.root + j
@@ -128,7 +128,7 @@ cdef inline void linearise_contact_projection(const blocks_t* b, int32_t i, cons
 
 
 cdef inline void linearise_all_projections(const blocks_t* b, const double* lam, const double* w, int32_t* value_ptr,
-                             const natural_t* out) noexcept nogil:
+                                           const natural_t* out) noexcept nogil:
     """Compute (1) and (2) of all blocks; `value_ptr` (k + 1) is the array of `out`."""
     cdef int32_t i, j, k, n
     value_ptr[0] = 0
@@ -159,8 +159,7 @@ cdef inline int32_t number_system_rows(const blocks_t* b, const natural_t* x, in
 
 
 cdef inline void multiply_block_derivatives(const natural_t* x, const blocks_t* b, const double* values, const double* v,
-                                            bint transpose,
-                             double* out) noexcept nogil:
+                                            bint transpose, double* out) noexcept nogil:
     """Compute out (m), the products of the blocks in `values`, or of their transposes, with v."""
     cdef int32_t i, j, k, l, n
     cdef const double* a
@@ -183,7 +182,7 @@ cdef inline void multiply_block_derivatives(const natural_t* x, const blocks_t* 
 
 
 cdef inline void form_scaled_csr(const csr_t* a, int32_t m, int32_t count, const int32_t* system_row, const double* root,
-                            double* h) noexcept nogil:
+                                 double* h) noexcept nogil:
     """Compute H (count, count) of a matrix on the rows of G."""
     cdef int32_t i, q, c
     cdef double* row
@@ -200,7 +199,7 @@ cdef inline void form_scaled_csr(const csr_t* a, int32_t m, int32_t count, const
 
 
 cdef inline void form_scaled_generalized(const generalized_t* g, int32_t count, const int32_t* system_row, const double* root,
-                                double* y, double* h) noexcept nogil:
+                                         double* y, double* h) noexcept nogil:
     """Compute H (count, count) of J and M on the rows of G; y (count, nv) is scratch."""
     cdef int32_t i, k, c, b, nc, n = g.n
     cdef const double* from_
@@ -229,7 +228,7 @@ cdef inline void form_scaled_generalized(const generalized_t* g, int32_t count, 
 
 
 cdef inline void form_reduced_system(const natural_t* x, const blocks_t* b, int32_t count, const int32_t* system_row,
-                             const double* h, double* g) noexcept nogil:
+                                     const double* h, double* g) noexcept nogil:
     """Compute G (count, count) of (3) from H; system_row (m) is the row of G of each row, or -1."""
     cdef int32_t i, j, k, l, n, c
     cdef const double* p

@@ -207,7 +207,7 @@ cdef struct engine_t:
 
 
 cdef inline void bind_engine_arrays(const int32_t* size, double* real, int32_t* index, uint64_t* keys, engine_t* e,
-                      int64_t* used) noexcept nogil:
+                                    int64_t* used) noexcept nogil:
     """Point every array of `e` into the three buffers; `used` (3) receives the number of entries of each buffer."""
     cdef int64_t n = size[N_BODY], nd = size[N_DYNAMIC], kj = size[N_JOINT], mj = size[N_JOINT_ROW]
     cdef int64_t c = size[CAP_CONTACT], p = size[CAP_PAIR], k = kj + c, m = mj + c * size[ROWS_PER_CONTACT]

@@ -4,8 +4,7 @@ from libc.stdint cimport int32_t, int64_t, uint64_t
 import numpy as np
 
 from lavender_ext.engine.arrays cimport (N_CACHE_IMPULSE, N_INDEX_ARRAYS, N_JOINT_REAL, N_KEY_ARRAYS, N_REAL_ARRAYS,
-                                         bind_engine_arrays,
-                                         engine_t)
+                                         bind_engine_arrays, engine_t)
 
 
 cdef public void lav_engine_lengths(const int32_t* size, int32_t* used) noexcept nogil:

@@ -74,8 +74,7 @@ cdef inline void rotate_tensor_to_world(const double* r, const double* body, dou
             out[3 * j + i] = out[3 * i + j]
 
 
-cdef inline void multiply_by_world_tensor(const double* r, const double* body, const double* a,
-                             double* out) noexcept nogil:
+cdef inline void multiply_by_world_tensor(const double* r, const double* body, const double* a, double* out) noexcept nogil:
     """Compute out = R T R^T a: a tensor in the body's frame times a world vector."""
     cdef double s[3]
     cdef double t[3]
@@ -85,7 +84,7 @@ cdef inline void multiply_by_world_tensor(const double* r, const double* body, c
 
 
 cdef inline void advance_rotation(double* q, double* omega, const double* inertia, const double* inv_inertia,
-                                double h) noexcept nogil:
+                                  double h) noexcept nogil:
     """Advance q and omega over h at constant angular momentum, (3)."""
     cdef double r[9]
     cdef double half[4]

@@ -14,9 +14,8 @@ when more than MAX_PAIRS boxes overlap.
 from libc.math cimport fabs, floor
 from libc.stdint cimport int32_t, uint32_t
 
-from lavender_ext.engine.arrays cimport (BOX, CAP_PAIR, H_PAIRS, H_PAIRS_VALID, H_REBUILDS, MAX_PAIRS, N_BODY,
-                                         N_BUCKET, N_EXCLUDED, NO_SHAPE, PLANE, SPHERE, S_MARGIN, S_SKIN,
-                                         PAIR_COUNT_OVERFLOW, engine_t)
+from lavender_ext.engine.arrays cimport (BOX, CAP_PAIR, H_PAIRS, H_PAIRS_VALID, H_REBUILDS, MAX_PAIRS, N_BODY, N_BUCKET,
+                                         N_EXCLUDED, NO_SHAPE, PLANE, SPHERE, S_MARGIN, S_SKIN, PAIR_COUNT_OVERFLOW, engine_t)
 
 
 cdef inline void compute_half_extents(const engine_t* e, int32_t i, double* half) noexcept nogil:

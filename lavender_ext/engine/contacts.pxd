@@ -29,9 +29,8 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, uint64_t
 
 from lavender_ext.core.block_types cimport choose_contact_kind
-from lavender_ext.core.rows cimport (compute_contact_delassus_block, compute_contact_velocity, cross, dot3, largest_eigenvalue_2x2,
-                                     reciprocal_or_zero,
-                                     compute_relative_velocity)
+from lavender_ext.core.rows cimport (compute_contact_delassus_block, compute_contact_velocity, cross, dot3,
+                                     largest_eigenvalue_2x2, reciprocal_or_zero, compute_relative_velocity)
 from lavender_ext.core.view cimport rows_t
 from lavender_ext.engine.arrays cimport (ALTERNATING, BOX, CAP_CONTACT, H_CACHED, H_CONTACTS, H_CONTACT_ROWS,
                                          H_FRICTION_SHAPE, H_MATCHES, H_ORDER, H_PAIRS, H_STEP, H_WARM_START,
@@ -81,7 +80,7 @@ cdef inline double squared_distance_to_cached_contact(const engine_t* e, int32_t
 
 
 cdef inline void match_contacts_of_pair_to_cache(const engine_t* e, int32_t c, int32_t n, int32_t first,
-                            int32_t* entry) noexcept nogil:
+                                                 int32_t* entry) noexcept nogil:
     """Find the cache entries of contacts c .. c + n - 1 of one pair; the pair's entries begin at `first`.
 
     Contacts are matched by key, then by position: a contact with a new key gets the nearest entry that no key has
@@ -120,7 +119,7 @@ cdef inline void match_contacts_of_pair_to_cache(const engine_t* e, int32_t c, i
 
 
 cdef inline void warm_start_contact(engine_t* e, int32_t c, int32_t entry, int32_t nt, int32_t n_angular,
-                               double* lam) noexcept nogil:
+                                    double* lam) noexcept nogil:
     """Write the cached impulse to lam in this contact's frame; the cache stores friction as a world vector."""
     cdef double t2[3]
     cdef const double* p = e.cache_impulse + N_CACHE_IMPULSE * entry
@@ -158,9 +157,8 @@ cdef inline void rotate_arm_to_body(const engine_t* e, int32_t body, const doubl
         copy3(arm, out)
 
 
-cdef inline void build_contact(engine_t* e, const rows_t* r, int32_t c, int32_t row, int32_t a, int32_t b,
-                              const manifold_t* m, int32_t at, const double* tangent, int32_t nt,
-                              int32_t n_angular) noexcept nogil:
+cdef inline void build_contact(engine_t* e, const rows_t* r, int32_t c, int32_t row, int32_t a, int32_t b, const manifold_t* m,
+                               int32_t at, const double* tangent, int32_t nt, int32_t n_angular) noexcept nogil:
     """Fill rows row .. row + nt + n_angular of contact c from point `at` of the manifold, except for the target."""
     cdef double off[2]
     cdef double w[6]

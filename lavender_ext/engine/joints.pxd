@@ -35,7 +35,7 @@ cdef inline void rotate_direction_to_world(const engine_t* e, int32_t body, cons
 
 
 cdef inline void compute_world_anchor(const engine_t* e, int32_t body, const double* local, double* arm,
-                        double* point) noexcept nogil:
+                                      double* point) noexcept nogil:
     """Compute an anchor's arm from the body's centre and its point, both in the world frame."""
     rotate_direction_to_world(e, body, local, arm)
     if body < 0:
@@ -45,7 +45,7 @@ cdef inline void compute_world_anchor(const engine_t* e, int32_t body, const dou
 
 
 cdef inline void fill_linear_jacobian_row(double* jac, const double* axis, const double* arm_a,
-                           const double* arm_b) noexcept nogil:
+                                          const double* arm_b) noexcept nogil:
     """Fill the Jacobian row (12) of axis.(v_b + omega_b x arm_b - v_a - omega_a x arm_a)."""
     scale3(-1.0, axis, jac)
     cross(arm_a, axis, jac + 3)

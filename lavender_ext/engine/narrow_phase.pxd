@@ -34,7 +34,7 @@ cdef struct manifold_t:
 
 
 cdef inline void collide_sphere_sphere(const double* xa, double ra, const double* xb, double rb, double margin,
-                               manifold_t* m) noexcept nogil:
+                                       manifold_t* m) noexcept nogil:
     """Compute the manifold m of two spheres with centres xa, xb (3) and radii ra, rb [m]; empty beyond the margin."""
     cdef double d[3]
     cdef double s, f
@@ -60,7 +60,7 @@ cdef inline void collide_sphere_sphere(const double* xa, double ra, const double
 
 
 cdef inline void collide_plane_sphere(const double* plane, const double* x, double r, double margin,
-                              manifold_t* m) noexcept nogil:
+                                      manifold_t* m) noexcept nogil:
     """Compute the manifold m of a plane (normal, offset) and a sphere with centre x (3) and radius r [m]."""
     cdef double gap = dot3(plane, x) - plane[3] - r
     if gap > margin:
@@ -72,8 +72,8 @@ cdef inline void collide_plane_sphere(const double* plane, const double* x, doub
     m.n = 1
 
 
-cdef inline void collide_plane_box(const double* plane, const double* x, const double* rot, const double* half,
-                           double margin, manifold_t* m) noexcept nogil:
+cdef inline void collide_plane_box(const double* plane, const double* x, const double* rot, const double* half, double margin,
+                                   manifold_t* m) noexcept nogil:
     """Compute the manifold m of a plane and a box: the four corners with the smallest gaps g + sum +-p_k.
 
     Of equal gaps, the lower corner number is taken first.
@@ -116,8 +116,8 @@ cdef inline void collide_plane_box(const double* plane, const double* x, const d
             m.n += 1
 
 
-cdef inline void collide_box_sphere(const double* xa, const double* rot, const double* half, const double* xb,
-                            double r, double margin, manifold_t* m) noexcept nogil:
+cdef inline void collide_box_sphere(const double* xa, const double* rot, const double* half, const double* xb, double r,
+                                    double margin, manifold_t* m) noexcept nogil:
     """Compute the manifold m of a box (centre xa, axes rot, half extents) and a sphere (centre xb, radius r [m])."""
     cdef double d[3]
     cdef double c[3]
@@ -159,8 +159,7 @@ cdef inline void collide_box_sphere(const double* xa, const double* rot, const d
 
 
 cdef inline int32_t clip_polygon_to_side(int32_t n, const double* p, const int32_t* code, int32_t axis, double sign,
-                              double bound, double tol, int32_t line, double* out,
-                              int32_t* out_code) noexcept nogil:
+                                         double bound, double tol, int32_t line, double* out, int32_t* out_code) noexcept nogil:
     """Clip the polygon p (n, 3) against sign * p[axis] <= bound and return the number of points left.
 
     code[i] identifies the edge from point i to i + 1, `line` the clipping side. A corner within tol of the side
@@ -229,7 +228,7 @@ cdef inline void select_four_contact_points(const double* p, int32_t kept, doubl
 
 
 cdef inline void transform_to_face_frame(const double* along_x, const double* along_y, const double* along_z, const double* a,
-                         double* out) noexcept nogil:
+                                         double* out) noexcept nogil:
     """Transform a world vector to the frame of a face."""
     out[0] = dot3(a, along_x)
     out[1] = dot3(a, along_y)
@@ -237,8 +236,8 @@ cdef inline void transform_to_face_frame(const double* along_x, const double* al
 
 
 cdef inline void build_face_manifold(const double* xr, const double* rr, const double* hr, int32_t axis, double sign,
-                             const double* xo, const double* ro, const double* ho, int32_t on_b,
-                             double margin, manifold_t* m) noexcept nogil:
+                                     const double* xo, const double* ro, const double* ho, int32_t on_b, double margin,
+                                     manifold_t* m) noexcept nogil:
     """Build a face manifold: clip the other box's incident face by the reference face.
 
     The reference face of the box (xr, rr, hr) is given by `axis` and `sign`; x, y, n are the axes of its frame.
@@ -352,8 +351,8 @@ cdef inline void build_face_manifold(const double* xr, const double* rr, const d
     scale3(-1.0 if on_b else 1.0, n, m.normal)
 
 
-cdef inline int32_t find_support_edge_centre(const double* x, const double* rot, const double* half, int32_t axis, const double* n,
-                                double sign, double* out) noexcept nogil:
+cdef inline int32_t find_support_edge_centre(const double* x, const double* rot, const double* half, int32_t axis,
+                                             const double* n, double sign, double* out) noexcept nogil:
     """Compute the centre of the edge along `axis` that is farthest along sign n; return two bits that identify it."""
     cdef double side[3]
     cdef double u[3]
@@ -369,8 +368,8 @@ cdef inline int32_t find_support_edge_centre(const double* x, const double* rot,
 
 
 cdef inline void build_edge_manifold(const double* xa, const double* ra, const double* ha, int32_t i, const double* xb,
-                            const double* rb, const double* hb, int32_t j, double* n, double gap,
-                            manifold_t* m) noexcept nogil:
+                                     const double* rb, const double* hb, int32_t j, double* n, double gap,
+                                     manifold_t* m) noexcept nogil:
     """Build an edge manifold from the closest points of the edges along axis i of a and axis j of b."""
     cdef double p[3]
     cdef double q[3]
@@ -401,8 +400,8 @@ cdef inline void build_edge_manifold(const double* xa, const double* ra, const d
     m.n = 1
 
 
-cdef inline void collide_box_box(const double* xa, const double* ra, const double* ha, const double* xb,
-                         const double* rb, const double* hb, double margin, manifold_t* m) noexcept nogil:
+cdef inline void collide_box_box(const double* xa, const double* ra, const double* ha, const double* xb, const double* rb,
+                                 const double* hb, double margin, manifold_t* m) noexcept nogil:
     """Compute the manifold m of two boxes: separating axis test, then a face or edge manifold on the axis of least penetration."""
     cdef double c[9]            # R_a^T R_b
     cdef double f[9]            # |c|
@@ -483,8 +482,7 @@ cdef inline void collide_box_box(const double* xa, const double* ra, const doubl
         build_face_manifold(xa, ra, ha, axis_a, -1.0 if ta[axis_a] < 0.0 else 1.0, xb, rb, hb, 0, margin, m)
 
 
-cdef inline void collide_bodies(const engine_t* e, int32_t a, int32_t b, double margin,
-                         manifold_t* m) noexcept nogil:
+cdef inline void collide_bodies(const engine_t* e, int32_t a, int32_t b, double margin, manifold_t* m) noexcept nogil:
     """Compute the manifold of bodies a < b; m.n = 0 if their gap exceeds the margin."""
     cdef int32_t ka = e.kind_of_shape[a], kb = e.kind_of_shape[b], flip = 0
     cdef const double* xa = e.x + 3 * a

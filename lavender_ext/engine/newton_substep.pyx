@@ -59,7 +59,7 @@ cdef inline void bind_substep_memory(const view_t* v, int64_t newton, warm_t* s,
 
 
 cdef public int32_t lav_newton_index_workspace_size(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
-                                          int32_t all_stages) noexcept nogil:
+                                                    int32_t all_stages) noexcept nogil:
     """Return the number of scratch integers with which `lav_newton_plan` begins, -1 if too many; all_stages = 0: first phase."""
     cdef engine_t e
     cdef int64_t used[3]
@@ -120,7 +120,7 @@ cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* 
 
 
 cdef inline int32_t run_newton_stages(const view_t* problem, const options_t* o, workspace_t* workspace, warm_t* s, double* lam,
-                                   double* v) noexcept nogil:
+                                      double* v) noexcept nogil:
     """Run Newton's method after `solve_from_warm_start`, also from lam = 0; return UNDECIDED with the best lam above tol."""
     cdef info_t said
     cdef int32_t result = start_newton_over_bodies(problem, o, workspace, lam)
@@ -134,7 +134,7 @@ cdef inline int32_t run_newton_stages(const view_t* problem, const options_t* o,
 
 
 cdef inline int32_t solve_newton_substep(const blocks_t* p, const rows_t* r, warm_t* s, double tol, int32_t all_stages,
-                                          const memory_t* memory, double* workspace, double* lam, double* v) noexcept nogil:
+                                         const memory_t* memory, double* workspace, double* lam, double* v) noexcept nogil:
     """Run the first phase, then with `all_stages` the further steps of Newton's method; return the phase's result code."""
     cdef int32_t j, result = solve_from_warm_start(p, r, s, tol, lam, v, 1)
     cdef double e0 = 1.0, v0 = 1.0
@@ -162,7 +162,7 @@ cdef inline int32_t solve_newton_substep(const blocks_t* p, const rows_t* r, war
 
 
 cdef inline void find_substep_islands(blocks_t* p, const rows_t* r, warm_t* s, int32_t* index, double* reference,
-                              islands_t* islands) noexcept nogil:
+                                      islands_t* islands) noexcept nogil:
     """Find the islands of the substep and their reference errors, if there are several and all bounds contain 0.
 
     The arrays of s are scratch. Bounds of contact rows are not read.

@@ -13,9 +13,8 @@ from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport clip, project_normal_update
-from lavender_ext.core.rows cimport (
-    cross, dot3, apply_joint_impulse, joint_row_velocity, apply_impulse_to_bodies, compute_relative_velocity,
-)
+from lavender_ext.core.rows cimport (cross, dot3, apply_joint_impulse, joint_row_velocity, apply_impulse_to_bodies,
+                                     compute_relative_velocity)
 from lavender_ext.engine.arrays cimport (H_CONTACTS, H_POSITION_ITERATIONS, H_PROJECTED, J_HERTZ, N_DYNAMIC,
                                          N_JOINT, N_JOINT_REAL, N_JOINT_ROW, S_BETA, S_DEPTH, S_H,
                                          S_JOINT_ERROR, S_MAX_PUSH, S_SLOP, engine_t)

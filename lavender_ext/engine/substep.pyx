@@ -23,12 +23,11 @@ from lavender_ext.core.order cimport (RANDOM, SYMMETRIC, update_sweep_order, fin
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.velocity cimport compute_velocity_change
 from lavender_ext.core.view cimport rows_t
-from lavender_ext.engine.arrays cimport (AT_RANDOM, BOTTOM_UP, CAP_CONTACT, CAP_PAIR, COLORED, H_CONTACTS,
-                                         H_CONTACT_ROWS, H_ITERATIONS, H_LOST, H_MATCHES,
-                                         H_NEED_CONTACTS, H_NEED_PAIRS, H_ORDER, H_SEED, H_SOLVED, H_STEP,
-                                         H_WARM_START, NEED_CAPACITY, NOT_FINITE, N_DYNAMIC, N_JOINT,
-                                         N_JOINT_ROW, OK, REVERSED, ROWS_PER_CONTACT, SYMMETRICALLY, S_OUT,
-                                         TOP_DOWN, bind_engine_arrays, engine_t)
+from lavender_ext.engine.arrays cimport (AT_RANDOM, BOTTOM_UP, CAP_CONTACT, CAP_PAIR, COLORED, H_CONTACTS, H_CONTACT_ROWS,
+                                         H_ITERATIONS, H_LOST, H_MATCHES, H_NEED_CONTACTS, H_NEED_PAIRS, H_ORDER, H_SEED,
+                                         H_SOLVED, H_STEP, H_WARM_START, NEED_CAPACITY, NOT_FINITE, N_DYNAMIC, N_JOINT,
+                                         N_JOINT_ROW, OK, REVERSED, ROWS_PER_CONTACT, SYMMETRICALLY, S_OUT, TOP_DOWN,
+                                         bind_engine_arrays, engine_t)
 from lavender_ext.engine.bodies cimport advance_bodies, begin_body_substep
 from lavender_ext.engine.broad_phase cimport update_pair_list
 from lavender_ext.engine.contacts cimport build_contacts, store_contact_cache
@@ -123,7 +122,7 @@ cdef inline void set_sweep_order_of_blocks(engine_t* e) noexcept nogil:
 
 
 cdef inline void record_sweep_error(const engine_t* e, const blocks_t* p, const rows_t* r, double* out,
-                            double* scratch) noexcept nogil:
+                                    double* scratch) noexcept nogil:
     """Write max |e_n| [N s] over the contacts and E = sqrt(sum d e^2) [sqrt J] over all rows to out (2); scratch (2 m)."""
     cdef double violation
     cdef score_t s = make_empty_score()
@@ -134,7 +133,7 @@ cdef inline void record_sweep_error(const engine_t* e, const blocks_t* p, const 
 
 
 cdef void sweep_joints_then_contacts(engine_t* e, const blocks_t* p, const rows_t* r, int32_t sweeps, double* curve,
-                    double* scratch) noexcept nogil:
+                                     double* scratch) noexcept nogil:
     """Run sweeps over joints, then contacts.
 
     curve (sweeps + 1, 2) or NULL receives max |e_n| and E after sweep s in row s + 1; the caller writes row 0."""
@@ -152,7 +151,7 @@ cdef void sweep_joints_then_contacts(engine_t* e, const blocks_t* p, const rows_
 
 
 cdef inline int32_t sweep_packed_blocks(engine_t* e, const blocks_t* p, const rows_t* r, int32_t sweeps,
-                               double* workspace) noexcept nogil:
+                                        double* workspace) noexcept nogil:
     """Sweep over packed blocks with the same bits; return 0 if there are too few blocks or the order changes."""
     if e.head[H_ORDER] == SYMMETRICALLY or e.head[H_ORDER] == AT_RANDOM:
         return 0
@@ -160,8 +159,7 @@ cdef inline int32_t sweep_packed_blocks(engine_t* e, const blocks_t* p, const ro
 
 
 cdef inline void run_velocity_sweeps(engine_t* e, const blocks_t* p, const rows_t* r, int32_t sweeps, double* workspace,
-                                     double* curve,
-                       double* scratch) noexcept nogil:
+                                     double* curve, double* scratch) noexcept nogil:
     """Run the sweeps in the order of H_ORDER, over packed blocks if that pays."""
     set_sweep_order_of_blocks(e)
     if workspace == NULL or sweeps < MIN_PACKED_SWEEPS or not sweep_packed_blocks(e, p, r, sweeps, workspace):
@@ -229,8 +227,7 @@ cdef int32_t finish_substep(engine_t* e) noexcept nogil:
     return OK if e.head[H_LOST] < 0 else NOT_FINITE
 
 
-cdef public int32_t lav_engine_prepare(const int32_t* size, double* real, int32_t* index,
-                                       uint64_t* keys) noexcept nogil:
+cdef public int32_t lav_engine_prepare(const int32_t* size, double* real, int32_t* index, uint64_t* keys) noexcept nogil:
     """Build the coming substep's velocity problem without changing the state; return OK or NEED_CAPACITY."""
     cdef engine_t e
     cdef int64_t n[3]
@@ -259,8 +256,7 @@ cdef public void lav_engine_solve_watched(const int32_t* size, double* real, int
     solve_substep(&e, 1, NULL, curve, scratch)
 
 
-cdef public int32_t lav_engine_finish(const int32_t* size, double* real, int32_t* index,
-                                      uint64_t* keys) noexcept nogil:
+cdef public int32_t lav_engine_finish(const int32_t* size, double* real, int32_t* index, uint64_t* keys) noexcept nogil:
     """Update positions, velocities and cache after the solve; return OK or NOT_FINITE."""
     cdef engine_t e
     cdef int64_t n[3]

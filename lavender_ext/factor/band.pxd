@@ -33,7 +33,7 @@ cdef inline double invert_pivot_or_count_it(double p, double size, int32_t i, do
 
 
 cdef inline void factor_tridiagonal_ldl(int32_t n, double* c, const double* size, double tiny, double* x,
-                              pivots_t* out) noexcept nogil:
+                                        pivots_t* out) noexcept nogil:
     """Factor a tridiagonal matrix by (1) from both ends to the middle row h (twisted factorisation).
 
     The two chains of divisions are independent. c[2 i] becomes 1 / p_i, and the off-diagonals stay. If x is not NULL, the first
@@ -93,8 +93,8 @@ cdef inline void solve_tridiagonal_ldl(int32_t n, const double* c, double* x) no
     back_substitute_tridiagonal_ldl(n, c, x)
 
 
-cdef inline void factor_band_ldl_columns(int32_t begin, int32_t end, int32_t width, int32_t height, double* c, const double* size,
-                             double tiny, double* x, pivots_t* out) noexcept nogil:
+cdef inline void factor_band_ldl_columns(int32_t begin, int32_t end, int32_t width, int32_t height, double* c,
+                                         const double* size, double tiny, double* x, pivots_t* out) noexcept nogil:
     """Apply (1) to columns begin ... end - 1, of `height` rows, or down to row end - 1 if that is 0.
 
     If x is not NULL, `forward_substitute_band_ldl` is applied to it as well.
@@ -123,7 +123,7 @@ cdef inline int32_t full_columns(int32_t n, int32_t width) noexcept nogil:
 
 
 cdef inline void factor_band_ldl(int32_t n, int32_t width, double* c, const double* size, double tiny, double* x,
-                            pivots_t* out) noexcept nogil:
+                                 pivots_t* out) noexcept nogil:
     """Factor by (1); pivots are compared with size (n) > 0.
 
     If x is not NULL, the first half of `solve_band_ldl` is applied to it, which is hidden by the latency of the divisions.
@@ -141,7 +141,7 @@ cdef inline void factor_band_ldl(int32_t n, int32_t width, double* c, const doub
 
 
 cdef inline void forward_substitute_band_ldl(int32_t begin, int32_t end, int32_t width, int32_t height, const double* c,
-                             double* x) noexcept nogil:
+                                             double* x) noexcept nogil:
     """Overwrite x by forward substitution with columns begin ... end - 1 of L."""
     cdef int32_t i, last
     cdef const double* col
@@ -152,7 +152,7 @@ cdef inline void forward_substitute_band_ldl(int32_t begin, int32_t end, int32_t
 
 
 cdef inline void back_substitute_band_ldl(int32_t begin, int32_t end, int32_t width, int32_t height, const double* c,
-                          double* x) noexcept nogil:
+                                          double* x) noexcept nogil:
     """Overwrite x by back substitution with columns end - 1 ... begin of D L^T."""
     cdef int32_t i, t, last
     cdef double y

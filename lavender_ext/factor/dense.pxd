@@ -11,8 +11,7 @@ from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.dot cimport dot
 from lavender_ext.factor.panels cimport (LU_STRIP, factor_panel_by_cholesky, gemm_subtract_lower, gemm_subtract_nonzeros,
-                                         factor_panel_by_lu,
-                                         swap_entries)
+                                         factor_panel_by_lu, swap_entries)
 from lavender_ext.factor.tiles cimport axpy_subtract
 
 
@@ -25,8 +24,7 @@ cdef inline int64_t panel_offset(int32_t n, int32_t k) noexcept nogil:
     return <int64_t>k * n - <int64_t>PANEL_COLUMNS * (k // PANEL_COLUMNS) * (k // PANEL_COLUMNS - 1) // 2 * PANEL_COLUMNS
 
 
-cdef inline int32_t dense_cholesky(int32_t wide, int32_t n, const double* a, const double* min_pivot,
-                                   double* l) noexcept nogil:
+cdef inline int32_t dense_cholesky(int32_t wide, int32_t n, const double* a, const double* min_pivot, double* l) noexcept nogil:
     """Write the factor (1) of a symmetric a (n, n) to l; return the number of lost pivots.
 
     l has `cholesky_workspace_size` of `linear.pxd`. The entries of a at and after the diagonal of each row are read. 1 / L_jj

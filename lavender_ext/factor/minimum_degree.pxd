@@ -110,7 +110,7 @@ cdef inline int32_t gather_element_neighbours(quotient_t* g, int32_t p, int32_t 
 
 
 cdef inline int32_t initialise_quotient_graph(quotient_t* g, const int32_t* size, int32_t* integers, int32_t* last,
-                                int32_t* order) noexcept nogil:
+                                              int32_t* order) noexcept nogil:
     """Bind the integers, compute degrees, and order vertices with very many neighbours last, from order[last] on.
 
     Return the total weight of the other vertices.

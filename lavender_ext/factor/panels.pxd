@@ -33,7 +33,7 @@ cdef inline void gemm_subtract_lower(int32_t wide, int32_t m, int32_t n, int32_t
 
 
 cdef inline int32_t factor_panel_by_cholesky(int32_t wide, int32_t width, int32_t rows, double* a,
-                                   const double* min_pivot) noexcept nogil:
+                                             const double* min_pivot) noexcept nogil:
     """Factor the panel a (rows, width) by (1) in place; return the number of pivots that are too small.
 
     A pivot must exceed min_pivot (width), or, if that is NULL, 1e-15 of its value before the last strip. The column of L of a
@@ -109,8 +109,7 @@ cdef inline void swap_entries(double* y, int32_t n, const int32_t* swap) noexcep
 
 
 cdef inline int32_t factor_panel_by_lu(int32_t wide, int32_t width, int32_t rows, int32_t candidates, double* a, int64_t lda,
-                                       int32_t* swap,
-                             double min_pivot, double* scratch) noexcept nogil:
+                                       int32_t* swap, double min_pivot, double* scratch) noexcept nogil:
     """Factor the panel a (rows, width) by (2) in place; return the number of pivots that are too small.
 
     The pivot of a column is its largest entry among the first `candidates` rows, whose exchange is written to swap (width). It

@@ -49,8 +49,8 @@ def has_symmetric_pattern(const int32_t[::1] indptr, const int32_t[::1] indices)
     return True
 
 
-def extract_free_part(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] data,
-              const int32_t[::1] place, int n_free):
+def extract_free_part(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] data, const int32_t[::1] place,
+                      int n_free):
     """Return (indptr, indices, data) of the rows and columns with place >= 0, numbered in the order of the rows."""
     cdef int32_t i, q, k = 0, n = <int32_t>indptr.shape[0] - 1
     ptr_array = np.zeros(n_free + 1, np.int32)

@@ -64,8 +64,7 @@ cdef inline int64_t supernodal_scratch_size(const supernodal_t* f, bint lu) noex
 
 
 cdef inline void add_scratch_to_panel(const supernodal_t* f, int32_t begin, int32_t end, int32_t skipped, int32_t n,
-                                      const int32_t* columns,
-                             int32_t base, int64_t ld, double* panel) noexcept nogil:
+                                      const int32_t* columns, int32_t base, int64_t ld, double* panel) noexcept nogil:
     """Add scratch (end - begin, n) to a panel, at the rows of row_indices[begin:end] and these columns, minus `base`.
 
     `skipped` is the number of the panel's first rows that `panel` leaves out.
@@ -183,8 +182,8 @@ cdef inline void swap_columns(double* u, int32_t n, int32_t ld, const int32_t* s
                 z[i] = x
 
 
-cdef inline int32_t factor_supernode_by_lu(const supernodal_t* f, int32_t width, int32_t below, double* a, double* u, int32_t* swap,
-                                 double min_pivot) noexcept nogil:
+cdef inline int32_t factor_supernode_by_lu(const supernodal_t* f, int32_t width, int32_t below, double* a, double* u,
+                                           int32_t* swap, double min_pivot) noexcept nogil:
     """Factor one panel a and its rows u of U, transposed, by (2) and (3); return the number of pivots that are too small."""
     cdef int32_t j, j0 = 0, t, n, rows = width + below
     cdef int32_t lost = factor_panel_by_lu(f.wide, width, rows, width, a, rows, swap, min_pivot, f.scratch)
@@ -232,7 +231,7 @@ cdef inline int32_t factor_supernode(const supernodal_t* f, int32_t i, const int
 
 
 cdef inline void subtract_three_columns(int32_t n, int32_t columns, const double* a, int64_t lda, const double* t,
-                                double* y) noexcept nogil:
+                                        double* y) noexcept nogil:
     """Subtract A t from y (n). The products of up to three columns of A are subtracted one after the other."""
     cdef int32_t q
     cdef double t0 = t[0], t1, t2

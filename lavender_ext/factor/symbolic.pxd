@@ -11,8 +11,8 @@ cdef inline double max_zero_fraction() noexcept nogil:
     return 0.1
 
 
-cdef inline void compute_block_elimination_tree(int32_t n, const int32_t* nptr, const int32_t* nind, int32_t* parent, int32_t* mark,
-                            int32_t* row_count, int32_t* column_count) noexcept nogil:
+cdef inline void compute_block_elimination_tree(int32_t n, const int32_t* nptr, const int32_t* nind, int32_t* parent,
+                                                int32_t* mark, int32_t* row_count, int32_t* column_count) noexcept nogil:
     """Compute the elimination tree of a lower pattern, and the number of off-diagonal entries in each row and column of L."""
     cdef int32_t k, q, j
     for k in range(n):
@@ -32,8 +32,8 @@ cdef inline void compute_block_elimination_tree(int32_t n, const int32_t* nptr, 
 
 
 cdef inline void list_factor_rows_by_column(int32_t n, const int32_t* nptr, const int32_t* nind, const int32_t* parent,
-                                            int32_t* mark,
-                                const int32_t* lptr, int32_t* next_entry, int32_t* lind) noexcept nogil:
+                                            int32_t* mark, const int32_t* lptr, int32_t* next_entry,
+                                            int32_t* lind) noexcept nogil:
     """List the rows of every column of L below the diagonal, ascending; mark and next_entry (n) are scratch."""
     cdef int32_t k, q, j
     for k in range(n):
@@ -76,7 +76,7 @@ cdef inline void find_postorder(int32_t n, const int32_t* parent, int32_t* child
 
 
 cdef inline void list_permuted_lower_pattern(int32_t n, const int32_t* ptr, const int32_t* neighbour, const int32_t* rank,
-                                        const int32_t* order, int32_t* nptr, int32_t* nind) noexcept nogil:
+                                             const int32_t* order, int32_t* nptr, int32_t* nind) noexcept nogil:
     """List the lower pattern of a graph in an order, with the diagonal last in each row."""
     cdef int32_t k, i, q, to = 0
     for k in range(n):
@@ -195,10 +195,10 @@ cdef inline double list_supernode_rows(int32_t supernodes, const int32_t* starts
 
 
 cdef int32_t order_rows(int32_t n, const int32_t* indptr, const int32_t* indices, int32_t workspace, int32_t* scratch,
-                            int64_t* outside, int32_t* begin, int32_t* order, int32_t* size, int32_t* nptr, int32_t* nind,
-                            int32_t* parent, int32_t* lptr) noexcept nogil
+                        int64_t* outside, int32_t* begin, int32_t* order, int32_t* size, int32_t* nptr, int32_t* nind,
+                        int32_t* parent, int32_t* lptr) noexcept nogil
 cdef int32_t find_vertex_supernodes(int32_t count, const int32_t* nptr, const int32_t* nind, const int32_t* parent,
-                            const int32_t* size, const int32_t* lptr, int32_t* lind, int32_t* scratch, int32_t* group,
-                            int64_t* below) noexcept nogil
-cdef void number_rows(int32_t n, int32_t count, const int32_t* begin, const int32_t* order, int32_t* starts,
-                          int32_t* row_order, int32_t* position) noexcept nogil
+                                    const int32_t* size, const int32_t* lptr, int32_t* lind, int32_t* scratch, int32_t* group,
+                                    int64_t* below) noexcept nogil
+cdef void number_rows(int32_t n, int32_t count, const int32_t* begin, const int32_t* order, int32_t* starts, int32_t* row_order,
+                      int32_t* position) noexcept nogil

@@ -10,7 +10,7 @@ from lavender_ext.factor.symbolic cimport (apply_postorder, compute_block_elimin
 
 
 cdef int32_t find_equal_rows(int32_t n, const int32_t* indptr, const int32_t* indices, int32_t* vertex,
-                                        int32_t* first) noexcept nogil:
+                             int32_t* first) noexcept nogil:
     """Group consecutive rows with the same columns to vertices: write the vertex of each row.
 
     `first` (n + 1) receives the first row of each vertex, then n.
@@ -36,7 +36,7 @@ cdef int32_t find_equal_rows(int32_t n, const int32_t* indptr, const int32_t* in
 
 
 cdef int32_t find_vertex_graph(int32_t count, const int32_t* indptr, const int32_t* indices, const int32_t* vertex,
-                                          const int32_t* first, int32_t* ptr, int32_t* neighbour) noexcept nogil:
+                               const int32_t* first, int32_t* ptr, int32_t* neighbour) noexcept nogil:
     """List the neighbours of each vertex, without itself; return the length of all lists. Columns must ascend."""
     cdef int32_t k, q, j, last, total = 0
     for k in range(count):
@@ -52,9 +52,9 @@ cdef int32_t find_vertex_graph(int32_t count, const int32_t* indptr, const int32
     return total
 
 
-cdef int32_t order_rows(int32_t n, const int32_t* indptr, const int32_t* indices, int32_t workspace,
-                                   int32_t* scratch, int64_t* outside, int32_t* begin, int32_t* order, int32_t* size,
-                                   int32_t* nptr, int32_t* nind, int32_t* parent, int32_t* lptr) noexcept nogil:
+cdef int32_t order_rows(int32_t n, const int32_t* indptr, const int32_t* indices, int32_t workspace, int32_t* scratch,
+                        int64_t* outside, int32_t* begin, int32_t* order, int32_t* size, int32_t* nptr, int32_t* nind,
+                        int32_t* parent, int32_t* lptr) noexcept nogil:
     """Order the vertices of a symmetric pattern for elimination, and count the columns of L.
 
     begin (n + 1) receives the first row of each vertex as they stand; order, size (n), nptr (n + 1), nind (nnz / 2 + n + 1),
@@ -92,8 +92,8 @@ cdef int32_t order_rows(int32_t n, const int32_t* indptr, const int32_t* indices
 
 
 cdef int32_t find_vertex_supernodes(int32_t count, const int32_t* nptr, const int32_t* nind, const int32_t* parent,
-                                   const int32_t* size, const int32_t* lptr, int32_t* lind, int32_t* scratch, int32_t* group,
-                                   int64_t* below) noexcept nogil:
+                                    const int32_t* size, const int32_t* lptr, int32_t* lind, int32_t* scratch, int32_t* group,
+                                    int64_t* below) noexcept nogil:
     """Find supernodes of vertices: write their first vertices to group (count + 1); return their number.
 
     lind (lptr[count]) receives the vertices below each, `below` the rows below all supernodes; scratch has 2 count entries.
@@ -109,8 +109,8 @@ cdef int32_t find_vertex_supernodes(int32_t count, const int32_t* nptr, const in
     return k
 
 
-cdef void number_rows(int32_t n, int32_t count, const int32_t* begin, const int32_t* order, int32_t* starts,
-                                 int32_t* row_order, int32_t* position) noexcept nogil:
+cdef void number_rows(int32_t n, int32_t count, const int32_t* begin, const int32_t* order, int32_t* starts, int32_t* row_order,
+                      int32_t* position) noexcept nogil:
     """Write the row at each position, the position of each row, and the first position of each vertex (count + 1)."""
     cdef int32_t i, j, c = 0
     for i in range(count):

@@ -8,10 +8,8 @@ from libc.string cimport memcpy
 
 import numpy as np
 
-from lavender_ext.engine.arrays cimport (
-    CAP_CONTACT, CAP_PAIR, H_NEED_CONTACTS, H_NEED_PAIRS, H_PAIRS_VALID, N_CACHE_IMPULSE, N_JOINT,
-    N_SIZES, ROWS_PER_CONTACT, S_OUT, bind_engine_arrays, engine_t,
-)
+from lavender_ext.engine.arrays cimport (CAP_CONTACT, CAP_PAIR, H_NEED_CONTACTS, H_NEED_PAIRS, H_PAIRS_VALID, N_CACHE_IMPULSE,
+                                         N_JOINT, N_SIZES, ROWS_PER_CONTACT, S_OUT, bind_engine_arrays, engine_t)
 
 
 cdef public void lav_engine_values(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
@@ -32,7 +30,7 @@ cdef inline int32_t add_quarter_capacity(int32_t need) noexcept nogil:
 
 
 cdef public void lav_engine_grow_workspace(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
-                                      int32_t* out) noexcept nogil:
+                                           int32_t* out) noexcept nogil:
     """Write sizes (N_SIZES) of buffers for the pairs and contacts that did not fit in the last substep, and a quarter more."""
     cdef engine_t e
     cdef int64_t n[3]
@@ -46,9 +44,8 @@ cdef public void lav_engine_grow_workspace(const int32_t* size, double* real, in
         out[CAP_CONTACT] = add_quarter_capacity(e.head[H_NEED_CONTACTS])
 
 
-cdef public void lav_engine_move(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
-                                 const int32_t* to_size, double* to_real, int32_t* to_index,
-                                 uint64_t* to_keys) noexcept nogil:
+cdef public void lav_engine_move(const int32_t* size, double* real, int32_t* index, uint64_t* keys, const int32_t* to_size,
+                                 double* to_real, int32_t* to_index, uint64_t* to_keys) noexcept nogil:
     """Copy the state that is carried between substeps, without scratch, to larger, zero-initialised buffers."""
     cdef engine_t a, b
     cdef int64_t used[3]
@@ -77,6 +74,6 @@ def compute_grown_workspace_sizes(const int32_t[::1] size, double[::1] real, int
 
 
 def move_engine_state(const int32_t[::1] size, double[::1] real, int32_t[::1] index, uint64_t[::1] keys,
-         const int32_t[::1] to_size, double[::1] to_real, int32_t[::1] to_index, uint64_t[::1] to_keys):
+                      const int32_t[::1] to_size, double[::1] to_real, int32_t[::1] to_index, uint64_t[::1] to_keys):
     """Copy the state that is carried between substeps to zero-initialised buffers of at least the same sizes."""
     lav_engine_move(&size[0], &real[0], &index[0], &keys[0], &to_size[0], &to_real[0], &to_index[0], &to_keys[0])

@@ -94,8 +94,8 @@ cdef inline double compute_row_abs_velocity(const double* jac, const int32_t* bo
     return s + t
 
 
-cdef inline void judge_impulse_over_bodies(const blocks_t* p, const rows_t* r, const double* lam, double* w, double* e, double* v,
-                            bint floor, score_t* out) noexcept nogil:
+cdef inline void judge_impulse_over_bodies(const blocks_t* p, const rows_t* r, const double* lam, double* w, double* e,
+                                           double* v, bint floor, score_t* out) noexcept nogil:
     """Judge lam over bodies; v (12 n + m) is scratch, (6 n) without a floor."""
     cdef double* abs_velocity = v + 6 * <ssize_t>r.n_bodies
     cdef double* sizes = abs_velocity + 6 * <ssize_t>r.n_bodies
@@ -119,8 +119,8 @@ cdef inline void judge_impulse_over_bodies(const blocks_t* p, const rows_t* r, c
 # -- generalised coordinates ---------------------------------------------------------------------------
 
 
-cdef inline const double* bound_generalized_terms(const blocks_t* p, const generalized_t* g, const double* lam, const double* extra,
-                                        double* x) noexcept nogil:
+cdef inline const double* bound_generalized_terms(const blocks_t* p, const generalized_t* g, const double* lam,
+                                                  const double* extra, double* x) noexcept nogil:
     """Return |Y| |Y|^T |lam| + c |lam| + extra (m), an upper bound of |A| |lam|, inside x (n + m); extra is (m) or NULL."""
     cdef int32_t i
     cdef double* size = x + g.n
@@ -138,14 +138,14 @@ cdef inline const double* bound_generalized_terms(const blocks_t* p, const gener
     return size
 
 
-cdef inline void score_generalized_slack(const blocks_t* p, const generalized_t* g, const double* lam, const double* w, double* e,
-                               double* x, const double* extra, score_t* out) noexcept nogil:
+cdef inline void score_generalized_slack(const blocks_t* p, const generalized_t* g, const double* lam, const double* w,
+                                         double* e, double* x, const double* extra, score_t* out) noexcept nogil:
     """Compute errors e from the slack w, their norms and floors; extra as in `bound_generalized_terms`, x (n + m) is scratch."""
     score_all_blocks(p, lam, w, e, bound_generalized_terms(p, g, lam, extra, x), out)
 
 
-cdef inline void judge_impulse_over_generalized(const blocks_t* p, const generalized_t* g, const double* lam, double* w, double* e,
-                               double* x, bint floor, score_t* out) noexcept nogil:
+cdef inline void judge_impulse_over_generalized(const blocks_t* p, const generalized_t* g, const double* lam, double* w,
+                                                double* e, double* x, bint floor, score_t* out) noexcept nogil:
     """Judge lam over J and M; x (n + m) is scratch, (n) without a floor."""
     compute_generalized_slack(p, g, lam, x, w)
     if floor:

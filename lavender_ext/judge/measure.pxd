@@ -21,13 +21,12 @@ cdef bint refine_view(const view_t* v, const double* lam, double* w, double* e, 
                       double reference_velocity, double tol, double relative_, score_t* out) noexcept nogil
 cdef bint refine_reported_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, double reference_energy,
                                double reference_velocity, double tol, double relative_, score_t* out) noexcept nogil
-cdef void score_given_generalized_slack(const blocks_t* p, const generalized_t* g, const double* lam, const double* w, double* e,
-                                        double* x,
-                        score_t* out) noexcept nogil
+cdef void score_given_generalized_slack(const blocks_t* p, const generalized_t* g, const double* lam, const double* w,
+                                        double* e, double* x, score_t* out) noexcept nogil
 cdef void score_given_slack(const blocks_t* p, const double* lam, const double* w, double* e, score_t* out) noexcept nogil
 cdef void find_reference(blocks_t* p, const double* x, const double* w, const double* e, double* out) noexcept nogil
 cdef void judge_zero_impulse(view_t* v, int32_t* index, islands_t* islands, double* reference, double* x, double* w, double* e,
-                        double* scratch, double* out) noexcept nogil
+                             double* scratch, double* out) noexcept nogil
 
 
 # -- the zero impulse, and a pass over an impulse relative to it -----------------------------------------
@@ -45,7 +44,7 @@ cdef inline bint set_zero_impulse(const blocks_t* p, double* x, double* w) noexc
 
 
 cdef inline double relative_residual_of_score(const score_t* s, const double* w, int32_t m, double reference_energy,
-                               double reference_velocity) noexcept nogil:
+                                              double reference_velocity) noexcept nogil:
     """Return the relative residual of a pass with slack w (m); inf if a number is not finite.
 
     If the pass computed a floor of at least 1e-3, the result is at least that floor: the impulse is so large that rounding

@@ -14,14 +14,12 @@ from lavender_ext.core.problem cimport Data, Workspace, allocate_bytes
 from lavender_ext.core.start cimport clip_zero_to_row_bounds
 from lavender_ext.core.velocity cimport compute_velocity_change
 from lavender_ext.core.view cimport generalized_t, view_t
-from lavender_ext.judge.best cimport (best_workspace_size, best_t, bind_best,
-                                      count_islands, copy_score_without_islands, replace_stale_islands, store_better_islands,
-                                      store_better_start)
+from lavender_ext.judge.best cimport (best_workspace_size, best_t, bind_best, count_islands, copy_score_without_islands,
+                                      replace_stale_islands, store_better_islands, store_better_start)
 from lavender_ext.judge.forms cimport (compute_csr_slack, judge_impulse_over_bodies, judge_impulse_over_csr,
                                        judge_impulse_over_generalized, score_generalized_slack)
-from lavender_ext.judge.measure cimport (
-    residual_above_floor, set_zero_impulse, relative_floor_of_score, relative_residual_of_score, count_judge_scratch,
-)
+from lavender_ext.judge.measure cimport (residual_above_floor, set_zero_impulse, relative_floor_of_score,
+                                         relative_residual_of_score, count_judge_scratch)
 from lavender_ext.judge.reference cimport reference_needs_islands, compute_reference
 from lavender_ext.judge.refine cimport estimate_factor_loss, min_reported_loss, refine_generalized_slack
 from lavender_ext.judge.rounding cimport mass_t, relative_size_of_change, compute_squared_float32_rounding
@@ -73,9 +71,8 @@ cdef bint refine_reported_view(const view_t* v, const double* lam, double* w, do
                        relative_ if relative_ < strictest or not relative_ < 1.0 / 0.0 else strictest, out)
 
 
-cdef void score_given_generalized_slack(const blocks_t* p, const generalized_t* g, const double* lam, const double* w, double* e,
-                                        double* x,
-                        score_t* out) noexcept nogil:
+cdef void score_given_generalized_slack(const blocks_t* p, const generalized_t* g, const double* lam, const double* w,
+                                        double* e, double* x, score_t* out) noexcept nogil:
     """Compute errors e (m) from the slack w over J and M, their norms and floors; x (n + m) is scratch."""
     score_generalized_slack(p, g, lam, w, e, x, NULL, out)
 
@@ -91,7 +88,7 @@ cdef void find_reference(blocks_t* p, const double* x, const double* w, const do
 
 
 cdef void judge_zero_impulse(view_t* v, int32_t* index, islands_t* islands, double* reference, double* x, double* w, double* e,
-                        double* scratch, double* out) noexcept nogil:
+                             double* scratch, double* out) noexcept nogil:
     """Judge the zero impulse, written to x (m), and write the results of `compute_reference` to out (3).
 
     If there are several islands, v.p receives them with their references. index (`island_workspace_integers`), islands
@@ -458,8 +455,8 @@ cdef double TARGET_ROUNDING = 1e-12
 cdef double MIN_TERMS_FRACTION = 1e-3
 
 
-def compute_program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac, ordered_,
-                      sizes_without_rows, double least_force):
+def compute_program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac, ordered_, sizes_without_rows,
+                              double least_force):
     """Compute the residuals of a quadratic program, and each relative to its own terms.
 
     Rows: J x = target (the first `free`), J x >= target (the others). Row i acts if it is one of the first, is violated,

@@ -106,8 +106,7 @@ cdef inline bint closes_gap_within(double gap, double closing_speed, double max_
 
 
 cdef inline bint reaches_friction_bound(const progress_t* s, const double* lam, int32_t now, int32_t first, int32_t end,
-                                        double slope,
-                            double normal, double rate, double max_sweeps) noexcept nogil:
+                                        double slope, double normal, double rate, double max_sweeps) noexcept nogil:
     """Return whether the norm of rows [first, end) reaches its bound, slope times the normal, within `max_sweeps` sweeps."""
     cdef double size = 0.0, along = 0.0, v = 0.0
     cdef int32_t k
@@ -119,7 +118,7 @@ cdef inline bint reaches_friction_bound(const progress_t* s, const double* lam, 
 
 
 cdef inline bint any_row_reaches_bound(const progress_t* s, const blocks_t* p, const double* lam, int32_t now,
-                             double max_sweeps) noexcept nogil:
+                                       double max_sweeps) noexcept nogil:
     """Return whether (2) holds for a row within `max_sweeps` sweeps."""
     cdef int32_t i, j, k, g
     cdef double v, rate

@@ -25,8 +25,7 @@ from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport euclidean_norm
 from lavender_ext.core.block_types cimport (CONE, blocks_t, get_row_groups, has_independent_rows, islands_t,
-                                            get_friction_components,
-                                            friction_components_t)
+                                            get_friction_components, friction_components_t)
 from lavender_ext.judge.score cimport relative_residual
 from lavender_ext.judge.tally cimport get_block_in_order, make_empty_tally, relative_residual_by_rows, add_block_error, tally_t
 
@@ -96,8 +95,8 @@ cdef inline void add_block_terms(const blocks_t* p, int32_t i, const double* x, 
         add_row_terms(p, j + q.first[g], q.size[g], energy, fast)
 
 
-cdef inline double compute_island_reference(const blocks_t* p, const int32_t* order, int32_t first, int32_t end, const double* x,
-                                 const double* w, const double* e, double* out) noexcept nogil:
+cdef inline double compute_island_reference(const blocks_t* p, const int32_t* order, int32_t first, int32_t end,
+                                            const double* x, const double* w, const double* e, double* out) noexcept nogil:
     """Write E0 and V0 of blocks order[first:end] to out (2); return the relative residual of the zero impulse x.
 
     If an error is not finite both are 0, which makes every relative residual infinite.

@@ -86,7 +86,7 @@ cdef inline void multiply_jacobian_transpose_double_double(const generalized_t* 
 
 
 cdef inline void subtract_mass_product_double_double(const generalized_t* g, const double* x, const double* x_low, double* high,
-                                   double* low) noexcept nogil:
+                                                     double* low) noexcept nogil:
     """Subtract M (x + x_low) from high + low (n)."""
     cdef int32_t i, j, q
     cdef double a
@@ -175,7 +175,7 @@ cdef inline double refine_velocity_change(const generalized_t* g, const double* 
 
 
 cdef inline void refine_generalized_slack(const blocks_t* p, const generalized_t* g, const double* lam, double* w, double* e,
-                                double* scratch, score_t* out) noexcept nogil:
+                                          double* scratch, score_t* out) noexcept nogil:
     """Replace w (m) of the first pass by the refined one, with its errors e (m), norms and floor; scratch (6 n + 2 m)."""
     cdef int32_t i, q, n = g.n
     cdef double* extra = scratch

@@ -10,9 +10,8 @@ squared entry by entry, and u = 2^-24 (the formulas of lavender/judge/residuals.
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.generalized cimport (
-    multiply_jacobian_transpose, multiply_jacobian_row, solve_mass_matrix, add_scaled_whitened_row,
-)
+from lavender_ext.core.generalized cimport (multiply_jacobian_transpose, multiply_jacobian_row, solve_mass_matrix,
+                                            add_scaled_whitened_row)
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport generalized_t
 from lavender_ext.judge.score cimport relative_residual, score_t
@@ -48,9 +47,9 @@ cdef inline void unwhiten_row(const generalized_t* g, int32_t panel, int32_t row
         z[k] = x
 
 
-cdef inline void compute_squared_float32_rounding(const blocks_t* p, const generalized_t* g, const mass_t* mass, const double* free,
-                           const double* lam, double* impulse, double* data, double* velocities,
-                           double* work) noexcept nogil:
+cdef inline void compute_squared_float32_rounding(const blocks_t* p, const generalized_t* g, const mass_t* mass,
+                                                  const double* free, const double* lam, double* impulse, double* data,
+                                                  double* velocities, double* work) noexcept nogil:
     """Compute (1), (4) and (5), (m) [m2/s2] each; free (n) is v*, work (4 n + m) is scratch."""
     cdef int32_t i, j, q, k, m = p.n_rows, n = g.n, panel = 0
     cdef double* x = work
@@ -137,8 +136,7 @@ cdef inline bint is_float32_rounding(double residual, double floor) noexcept nog
 
 
 cdef inline double float32_floor_of_score(const blocks_t* p, const double* square, const score_t* s, double now, double e0,
-                                          double v0,
-                                    double* above) noexcept nogil:
+                                          double v0, double* above) noexcept nogil:
     """Return the float32 floor of a pass; with islands, the floor of the island with the largest residual.
 
     `above` receives the relative residual that float32 rounding does not explain.

@@ -8,7 +8,7 @@ from lavender_ext.core.view cimport generalized_t, rows_t
 
 
 cdef inline void compute_body_slack(const blocks_t* p, const rows_t* r, const double* lam, const double* v,
-                                double* w) noexcept nogil:
+                                    double* w) noexcept nogil:
     """Compute w = J v + c lam - b, with v = M^-1 J^T lam."""
     cdef int32_t j
     multiply_jacobian(p, r, v, w)
@@ -17,7 +17,7 @@ cdef inline void compute_body_slack(const blocks_t* p, const rows_t* r, const do
 
 
 cdef inline void compute_generalized_slack(const blocks_t* p, const generalized_t* g, const double* lam, double* x,
-                               double* w) noexcept nogil:
+                                           double* w) noexcept nogil:
     """Compute w = J x + c lam - b with x (n) = M^-1 J^T lam, solved with the factor of M."""
     cdef int32_t i
     multiply_jacobian_transpose(g, lam, x)

@@ -72,9 +72,8 @@ cdef inline int64_t stopping_test_workspace_size(int64_t m, int64_t n) noexcept 
     return best_workspace_size(m, n) + n + 2 * m
 
 
-cdef inline void begin_stopping_test(stopping_test_t* s, const blocks_t* p, double reference_energy,
-                                     double reference_velocity, double relative_at_zero, int32_t patience,
-                                     double* workspace) noexcept nogil:
+cdef inline void begin_stopping_test(stopping_test_t* s, const blocks_t* p, double reference_energy, double reference_velocity,
+                                     double relative_at_zero, int32_t patience, double* workspace) noexcept nogil:
     """Initialise s before the first sweep; workspace (`stopping_test_workspace_size`)."""
     s.total = s.check_at = s.last_at = 0
     s.start = 0.0
@@ -104,8 +103,8 @@ cdef inline bint restart_if_stalled(stopping_test_t* s, int32_t patience) noexce
 
 
 cdef int32_t check_start(stopping_test_t* s, const view_t* v, const view_t* confirm, double* lam, double tol) noexcept nogil
-cdef int32_t run_until_stop(stopping_test_t* s, const view_t* v, const view_t* confirm, sweep_t sweep, void* context, double* lam,
-                     int32_t n, double tol, int32_t* done) noexcept nogil
+cdef int32_t run_until_stop(stopping_test_t* s, const view_t* v, const view_t* confirm, sweep_t sweep, void* context,
+                            double* lam, int32_t n, double tol, int32_t* done) noexcept nogil
 
 
 cdef class StoppingTest:

@@ -10,10 +10,8 @@ from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport view_t
 from lavender_ext.judge.best cimport (count_islands, copy_score_without_islands, relative_residual_of_best,
                                       replace_stale_islands, store_better_islands, store_zero_if_better)
-from lavender_ext.judge.measure cimport (
-    residual_above_floor, relative_floor_of_score, judge_view, refine_view, relative_residual_of_score,
-    count_judge_scratch,
-)
+from lavender_ext.judge.measure cimport (residual_above_floor, relative_floor_of_score, judge_view, refine_view,
+                                         relative_residual_of_score, count_judge_scratch)
 from lavender_ext.judge.progress cimport residual_envelope_slope, record_impulse, has_stalled, record_residual
 from lavender_ext.judge.score cimport make_empty_score, relative_residual, score_t, take_smallest_island_reference
 from lavender_ext.judge.stopping_test cimport (AT_FLOOR, CONVERGED, DIVERGED, N_EARLY_SWEEPS, RUNNING, STALLED,
@@ -39,7 +37,7 @@ cdef inline double judge_with_floor(const stopping_test_t* s, const view_t* v, c
 
 
 cdef inline double judge_with_refinement(const stopping_test_t* s, const view_t* v, const double* lam, double tol, score_t* x,
-                                 bint* refined) noexcept nogil:
+                                         bint* refined) noexcept nogil:
     """Return the judge's relative residual of a pass with a floor, refined if M is ill-conditioned."""
     cdef double now = judge_with_floor(s, v, lam, x)
     refined[0] = refine_view(v, lam, s.w, s.e, s.v, s.reference_energy, s.reference_velocity, tol, now, x)
@@ -167,7 +165,7 @@ cdef inline int32_t perform_residual_check(stopping_test_t* s, const view_t* v, 
 
 
 cdef inline int32_t confirm_status_in_other_form(const stopping_test_t* s, const view_t* v, const double* lam, double tol,
-                                   int32_t status) noexcept nogil:
+                                                 int32_t status) noexcept nogil:
     """Judge lam in another form of the problem; return `status` if it holds there, otherwise RUNNING or STALLED."""
     cdef score_t x = make_empty_score()
     cdef double now
@@ -187,7 +185,7 @@ cdef inline int32_t confirm_status_in_other_form(const stopping_test_t* s, const
 
 
 cdef inline int32_t check_if_due(stopping_test_t* s, const view_t* v, const view_t* confirm, double* lam, double tol,
-                        int32_t* step) noexcept nogil:
+                                 int32_t* step) noexcept nogil:
     """Perform a check if one is due, and reduce `step` to the sweeps until the next; with tol = 0 there are no checks.
 
     confirm is NULL, or the same problem in another form in which the status must also hold.
@@ -210,8 +208,8 @@ cdef int32_t check_start(stopping_test_t* s, const view_t* v, const view_t* conf
     return check_if_due(s, v, confirm, lam, tol, &step)
 
 
-cdef int32_t run_until_stop(stopping_test_t* s, const view_t* v, const view_t* confirm, sweep_t sweep, void* context, double* lam,
-                     int32_t n, double tol, int32_t* done) noexcept nogil:
+cdef int32_t run_until_stop(stopping_test_t* s, const view_t* v, const view_t* confirm, sweep_t sweep, void* context,
+                            double* lam, int32_t n, double tol, int32_t* done) noexcept nogil:
     """Run n sweeps, or fewer if a check stops them; write their number to `done` and return the status."""
     cdef int32_t step, status
     done[0] = 0

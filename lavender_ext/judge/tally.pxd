@@ -4,12 +4,9 @@ from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport compute_block_error, euclidean_norm
 from lavender_ext.core.block_types cimport (CONE, blocks_t, get_disk_component, get_row_groups, is_disk_friction_contact,
-                                            has_independent_rows,
-                                            get_friction_components, friction_components_t)
-from lavender_ext.judge.score cimport (
-    zero_if_at_floor, floor_hides_residual, is_at_floor, ratio_to_reference, relative_residual, score_t,
-    unit_roundoff,
-)
+                                            has_independent_rows, get_friction_components, friction_components_t)
+from lavender_ext.judge.score cimport (zero_if_at_floor, floor_hides_residual, is_at_floor, ratio_to_reference,
+                                       relative_residual, score_t, unit_roundoff)
 
 
 cdef struct tally_t:
@@ -34,8 +31,8 @@ cdef inline double ratio_to_row_terms(double size, double own, double scale) noe
     return ratio_to_reference(size, own) if own > 0.0 or size == 0.0 else scale
 
 
-cdef inline double relative_residual_by_rows(const blocks_t* p, const int32_t* order, int32_t first, int32_t end, const double* e,
-                                    double total_energy) noexcept nogil:
+cdef inline double relative_residual_by_rows(const blocks_t* p, const int32_t* order, int32_t first, int32_t end,
+                                             const double* e, double total_energy) noexcept nogil:
     """Return (3) of judge/reference.pxd over blocks order[first:end]; if order is NULL, over blocks [first, end).
 
     total_energy is E0 of all rows.
@@ -287,7 +284,7 @@ cdef inline double relative_floor_of_island(const blocks_t* p, int32_t island, c
 
 
 cdef inline void add_island_to_score(const blocks_t* p, int32_t island, const double* w, const double* e, const tally_t* s,
-                              const floor_t* f, tally_t* total, score_t* out) noexcept nogil:
+                                     const floor_t* f, tally_t* total, score_t* out) noexcept nogil:
     """Add the sums of an island to the total and its relative residual to the score; f is NULL without a floor.
 
     If the problem has no list of islands, only the sums are added; the caller computes the relative residual from them.

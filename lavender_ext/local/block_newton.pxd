@@ -54,7 +54,7 @@ cdef struct scaled_block_t:
 
 
 cdef inline void prepare_block_newton(int32_t n, const double* W, const double* d, const friction_components_t* components,
-                                double* g) noexcept nogil:
+                                      double* g) noexcept nogil:
     """Compute the prepared numbers g (n n + 2 n) of a block; components.n is 0 for bounded rows."""
     cdef double* root = g + n * n
     cdef double* inverse = root + n

@@ -17,7 +17,7 @@ from lavender_ext.local.small cimport FAILED, OPEN, SLIP, STICK, safeguard_newto
 
 
 cdef inline int32_t minimize_energy_on_cone_ray(const double* W, const double* q, double mu, double s0, double s1,
-                           double* lam) noexcept nogil:
+                                                double* lam) noexcept nogil:
     """Minimise the energy on the ray lam = l (1, mu s0, mu s1), l > 0; return FAILED if the result is not a solution.
 
     At the minimum lam.w = 0.

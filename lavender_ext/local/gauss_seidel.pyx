@@ -20,14 +20,12 @@ from libc.stdint cimport int32_t
 from lavender_ext.core.block cimport project_normal_update, project_row_update
 from lavender_ext.core.dot cimport dot
 from lavender_ext.core.block_types cimport (CONE, blocks_t, is_disk_friction_contact, has_independent_rows, count_tangent_rows,
-                                            count_angular_rows,
-                                      friction_components_t, get_friction_components)
+                                            count_angular_rows, friction_components_t, get_friction_components)
 from lavender_ext.core.joint cimport relax_joint_block
 from lavender_ext.core.numbers cimport apply_contact_impulse_changes_to_body
 from lavender_ext.core.row_forms cimport find_panel, row_form_t, compute_row_slack, set_row_impulse
 from lavender_ext.core.rows cimport (apply_impulse_to_bodies, apply_joint_impulse, get_block_jacobian, compute_contact_velocity,
-                                     cross, dot12,
-                                     dot3, joint_row_velocity, multiply_inverse_mass, compute_relative_velocity)
+                                     cross, dot12, dot3, joint_row_velocity, multiply_inverse_mass, compute_relative_velocity)
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.local.block_newton cimport prepare_block_newton, scaled_block_t, solve_block_newton
 from lavender_ext.local.cone cimport solve_cone_disk
@@ -108,7 +106,7 @@ cdef int32_t solve_rejected_disk(const blocks_t* p, int32_t i, const double* g, 
 
 
 cdef inline int32_t solve_block_exactly(const blocks_t* p, int32_t i, const double* g, const double* w,
-                                double* lam) noexcept nogil:
+                                        double* lam) noexcept nogil:
     """Solve block i exactly from its slack w (n) [m/s] into lam (n) [N s]; return 1 if projected steps were used, otherwise 0."""
     cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k, t
     cdef double x[MAX_ROWS]
@@ -175,7 +173,7 @@ cdef inline void multiply_three_csr_rows(const csr_t* a, int32_t i, const double
 
 
 cdef inline void compute_block_slack(const blocks_t* p, const row_form_t* form, int32_t i, const double* g, const double* lam,
-                             const double* v, double* w) noexcept nogil:
+                                     const double* v, double* w) noexcept nogil:
     """Compute the slacks w (n) of block i."""
     cdef int32_t j = p.ptr[i], panel = find_panel(form, i), k
     if row_form_t is csr_t:
@@ -211,7 +209,7 @@ cdef inline int32_t solve_rows_block(const blocks_t* p, const row_form_t* form, 
 
 
 cdef inline int32_t update_disk_contact(const blocks_t* p, const rows_t* r, int32_t i, const double* g, double* lam,
-                                          double* v) noexcept nogil:
+                                        double* v) noexcept nogil:
     """Update a disk under Coulomb's law by (2); lam points at its normal."""
     cdef int32_t j = p.ptr[i], c = i - r.n_joints, a = r.contact_body[2 * c], b = r.contact_body[2 * c + 1], k, axis
     cdef double w[3]
@@ -245,7 +243,7 @@ cdef inline int32_t update_disk_contact(const blocks_t* p, const rows_t* r, int3
 
 
 cdef inline int32_t solve_bodies_block(const blocks_t* p, const rows_t* r, int32_t i, const double* g, double* lam,
-                                     double* v) noexcept nogil:
+                                       double* v) noexcept nogil:
     """Update block i over bodies by (2); return 1 if projected steps were used, otherwise 0."""
     cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, c = i - r.n_joints, k, a, b, nt, n_angular, roll, fallbacks
     cdef double w[MAX_ROWS]
@@ -388,8 +386,8 @@ ctypedef fused exact_form_t:
     rows_t
 
 
-cdef inline int32_t sweep_exact_blocks_of_form(const blocks_t* p, const exact_form_t* form, const int32_t* start, const double* g,
-                                   const int32_t* order, double* lam, double* v) noexcept nogil:
+cdef inline int32_t sweep_exact_blocks_of_form(const blocks_t* p, const exact_form_t* form, const int32_t* start,
+                                               const double* g, const int32_t* order, double* lam, double* v) noexcept nogil:
     """Sweep once over one form of A; return the number of blocks for which projected steps were used."""
     cdef int32_t k, i, fallbacks = 0
     for k in range(p.n_blocks):

@@ -32,19 +32,15 @@ from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles, take_int
 from lavender_ext.core.block cimport clip
 from lavender_ext.core.problem cimport Data
 from lavender_ext.factor.linear cimport CHOLESKY, LU
-from lavender_ext.judge.measure cimport (
-    residual_above_floor, relative_floor_of_score, judge_view, make_judged, relative_residual_of_score,
-    count_judge_scratch,
-)
+from lavender_ext.judge.measure cimport (residual_above_floor, relative_floor_of_score, judge_view, make_judged,
+                                         relative_residual_of_score, count_judge_scratch)
 from lavender_ext.judge.score cimport is_at_floor, make_empty_score, score_t
-from lavender_ext.pivot.direct cimport (CYCLING, DESCENT, EXCHANGE, GUESS, PASS, PASS_ENDED, PASS_HALVED, PASSES_USED,
-                                        direct_t)
-from lavender_ext.pivot.principal cimport (
-    INDEFINITE, ROUNDS_USED, SMALL_PIVOT, SOLVED, STUCK, bind_pivoting_arrays, compute_slack_and_rounding,
-    correct_free_row_solution, exchange_infeasible_rows, factor_all_rows, factor_free_rows, guess_free_rows_by_sweeps,
-    pivoting_t, reset_exchange_patience, reset_pivoting, run_exchange_rounds, set_diagonal_shift,
-    solve_with_all_rows_free,
-)
+from lavender_ext.pivot.direct cimport CYCLING, DESCENT, EXCHANGE, GUESS, PASS, PASS_ENDED, PASS_HALVED, PASSES_USED, direct_t
+from lavender_ext.pivot.principal cimport (INDEFINITE, ROUNDS_USED, SMALL_PIVOT, SOLVED, STUCK, bind_pivoting_arrays,
+                                           compute_slack_and_rounding, correct_free_row_solution, exchange_infeasible_rows,
+                                           factor_all_rows, factor_free_rows, guess_free_rows_by_sweeps, pivoting_t,
+                                           reset_exchange_patience, reset_pivoting, run_exchange_rounds, set_diagonal_shift,
+                                           solve_with_all_rows_free)
 
 
 cdef enum:

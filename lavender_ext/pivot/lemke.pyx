@@ -45,8 +45,7 @@ from lavender_ext.core.validate cimport norm_inf
 from lavender_ext.core.order cimport next_random
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.pivot.direct cimport (Pivoting, begin_direct_solve, begin_bound_exchanges, direct_t, is_solved_to_rounding,
-                                        judge_iterate,
-                                        step_direct_solve)
+                                        judge_iterate, step_direct_solve)
 from lavender_ext.pivot.lemke cimport DONE, LATE, PIVOTS, RAY, dictionary_t, lemke_t
 from lavender_ext.pivot.principal cimport AT_LOWER, AT_UPPER, FREE
 

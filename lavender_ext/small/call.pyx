@@ -31,15 +31,12 @@ from lavender_ext.small.call cimport (N_COUNTS, RESULT_FAILED, RESULT_IS_START, 
 from lavender_ext.small.friction cimport friction_run_t, subproblem_t, solve_subproblem, subproblem_work_size
 from lavender_ext.small.limits cimport has_only_free_rows
 from lavender_ext.small.workspace cimport fits_workspace, free_workspace, grow_workspace_to, grow_workspace_to_arena
-from lavender_ext.judge.measure cimport (
-    set_zero_impulse, relative_floor_of_score, judge_view, make_judged, relative_residual_of_score,
-    count_judge_scratch,
-)
+from lavender_ext.judge.measure cimport (set_zero_impulse, relative_floor_of_score, judge_view, make_judged,
+                                         relative_residual_of_score, count_judge_scratch)
 from lavender_ext.judge.score cimport make_empty_score
 from lavender_ext.local.gauss_seidel cimport prepare_exact_blocks, index_prepared_numbers
-from lavender_ext.pivot.direct cimport (
-    PASS, PASS_HALVED, begin_direct_solve, bind_direct_arrays, direct_t, is_solved_to_rounding, step_direct_solve,
-)
+from lavender_ext.pivot.direct cimport (PASS, PASS_HALVED, begin_direct_solve, bind_direct_arrays, direct_t,
+                                        is_solved_to_rounding, step_direct_solve)
 from lavender_ext.pivot.lemke cimport RAY, begin_lemke_solve, bind_lemke_arrays, follow_lemke_paths, lemke_t
 from lavender_ext.pivot.principal cimport SMALL_PIVOT
 
@@ -109,8 +106,7 @@ cdef void judge_small_impulse(small_problem_t* s, const double* lam, double* bot
 
 
 cdef bint set_start_of_small_problem(small_problem_t* s, const small_rules_t* rules, double* own, bint cold, double tol,
-                                     double* both,
-                    double* scratch) noexcept nogil:
+                                     double* both, double* scratch) noexcept nogil:
     """Set the start `own` (m) [N s], the zero impulse if `cold`; return whether it is a solution, which is then judged.
 
     The residual is checked only if another method follows. A start with a residual above that of the zero impulse, or above
@@ -190,7 +186,7 @@ cdef inline int32_t run_lemke_paths(direct_t* t, double tol, double* remaining_c
 
 
 cdef bint solve_by_pivoting(const small_problem_t* s, double* own, double tol, bint follows, double* remaining_cost,
-                      solve_workspaces_t* workspaces, int32_t* counts) noexcept nogil:
+                            solve_workspaces_t* workspaces, int32_t* counts) noexcept nogil:
     """Solve free or bounded rows by factorisations and exchanges; return whether there is a result.
 
     counts receives (rounds plus pivots of Lemke's paths, 1 if swept, refinements, factorisations, exchanged rows, shifts, rank of
@@ -232,7 +228,7 @@ cdef inline void store_work_counts(const friction_run_t* o, int32_t n_subproblem
 
 
 cdef bint solve_by_sweeps(const small_problem_t* s, double* own, double tol, int32_t swept, double* remaining_cost,
-                      solve_workspaces_t* workspaces, int32_t* counts) noexcept nogil:
+                          solve_workspaces_t* workspaces, int32_t* counts) noexcept nogil:
     """Solve contacts as one subproblem, with at most `swept` sweeps before factorisations; counts as in `store_work_counts`."""
     cdef int32_t m = s.v.p.n_rows, n = s.over.r.n_bodies if s.over.r != NULL else 0
     cdef subproblem_t sub
@@ -329,7 +325,7 @@ cdef inline void bind_island_arrays(island_t* x, arena_t* arena, const int32_t* 
 
 
 cdef inline void copy_island_blocks(island_t* x, const blocks_t* p, const int32_t* block, const double* lam,
-                             int32_t* place) noexcept nogil:
+                                    int32_t* place) noexcept nogil:
     """Copy the blocks `block` of the complete problem; place (rows of the problem) receives the row indices in the island."""
     cdef const double* of_row[ROW_DOUBLES]
     cdef const double* of_block[N_FRICTION_ARRAYS]
@@ -356,7 +352,7 @@ cdef inline void copy_island_blocks(island_t* x, const blocks_t* p, const int32_
 
 
 cdef inline void copy_island_matrix(island_t* x, const blocks_t* p, const csr_t* a, const int32_t* block,
-                            const int32_t* place) noexcept nogil:
+                                    const int32_t* place) noexcept nogil:
     """Copy the entries of A between the island's rows; other entries, zeros of immovable bodies, have a place of -1."""
     cdef int32_t i, k, q, row, at = 0, n = 0
     cdef int32_t* indptr = <int32_t*>x.a.indptr
@@ -393,8 +389,8 @@ cdef inline void copy_entry_numbers(const double* to, int64_t n, const double* x
     memcpy(<void*>to, x + n * i, n * sizeof(double))
 
 
-cdef inline void copy_island_bodies(island_t* x, const blocks_t* p, const rows_t* r, const int32_t* block, const int32_t* number,
-                          const int32_t* body) noexcept nogil:
+cdef inline void copy_island_bodies(island_t* x, const blocks_t* p, const rows_t* r, const int32_t* block,
+                                    const int32_t* number, const int32_t* body) noexcept nogil:
     """Copy the island's joints, contacts and bodies."""
     cdef const blocks_t* own = &x.s.v.p
     cdef const rows_t* y = &x.r

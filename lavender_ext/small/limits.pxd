@@ -76,7 +76,7 @@ cdef inline bint are_rows_short(const generalized_t* g, double columns) noexcept
 
 
 cdef inline double max_newton_cost(const blocks_t* p, const generalized_t* g, const limits_t* l, int32_t islands,
-                           bint soft) noexcept nogil:
+                                   bint soft) noexcept nogil:
     """Return the permitted cost [ns], 0 if Newton's method must not run; with a rigid row at most the estimated cost of sweeps."""
     cdef bint frictional = has_friction(p)
     cdef double each = l.sweep_cone if p.law != COULOMB and frictional else l.sweep_entry

@@ -24,11 +24,10 @@ from libc.stdint cimport int32_t, int64_t, uintptr_t
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.pair cimport LANES, load_pair, pair_t, store_pair
 from lavender_ext.core.view cimport get_block_bodies, rows_t
-from lavender_ext.sweep.records cimport (
-    CODE, HEADER_SIZE, MAX_RECORD_ROWS, N_KINDS, OWNER, UNPACKED, VELOCITY_BYTES, WRITE_OFFSET, classify_record_kind,
-    decode_record_kind, count_record_rows, decode_previous_record_size, encode_record_header, record_size_in_pairs,
-    relax_record, decode_record_size, write_block_record,
-)
+from lavender_ext.sweep.records cimport (CODE, HEADER_SIZE, MAX_RECORD_ROWS, N_KINDS, OWNER, UNPACKED, VELOCITY_BYTES,
+                                         WRITE_OFFSET, classify_record_kind, decode_record_kind, count_record_rows,
+                                         decode_previous_record_size, encode_record_header, record_size_in_pairs, relax_record,
+                                         decode_record_size, write_block_record)
 
 
 cdef enum:                      # doubles of workspace: a record and four int32 for every block
@@ -86,8 +85,7 @@ cdef int64_t packed_workspace_size_of_blocks(const blocks_t* p, const rows_t* r)
 
 
 cdef inline int32_t compute_schedule_levels(const blocks_t* p, const rows_t* r, const int32_t* order, int32_t second_part,
-                                            plan_t* x,
-                               int32_t* n_levels) noexcept nogil:
+                                            plan_t* x, int32_t* n_levels) noexcept nogil:
     """Compute the levels of the blocks and their number, and return T of (1).
 
     The levels of blocks from order[second_part] on begin after all levels before.
@@ -123,7 +121,7 @@ cdef inline int32_t compute_schedule_levels(const blocks_t* p, const rows_t* r, 
 
 
 cdef inline int32_t delay_wide_bodies(const blocks_t* p, const rows_t* r, const int32_t* order, plan_t* x, int32_t t,
-                                   int32_t* n_levels) noexcept nogil:
+                                      int32_t* n_levels) noexcept nogil:
     """Let bodies whose blocks span more levels than necessary begin later; return the T of the new levels."""
     cdef int32_t i, shortest = p.n_blocks // BLOCKS_PER_SLOT, _round
     for i in range(r.n_bodies):
@@ -177,7 +175,7 @@ cdef inline bint have_common_moving_body(const int32_t* x, const int32_t* y) noe
 
 
 cdef inline int32_t find_block_for_same_record(const rows_t* r, const int32_t* order, const plan_t* x, const int32_t* unpaired,
-                                 int32_t n_unpaired, int32_t begin, int32_t end) noexcept nogil:
+                                               int32_t n_unpaired, int32_t begin, int32_t end) noexcept nogil:
     """Return a block of the next slot, by_slot[begin:end], that may be paired with the block unpaired[0], or -1.
 
     The returned block has the kind of unpaired[0], and no body of any block in unpaired (n_unpaired). All of these come before
@@ -197,8 +195,7 @@ cdef inline int32_t find_block_for_same_record(const rows_t* r, const int32_t* o
 
 
 cdef inline void append_packed_record(const blocks_t* p, const rows_t* r, const int32_t* order, const double* lam, plan_t* x,
-                                      int32_t i,
-                               int32_t j, packed_t* out) noexcept nogil:
+                                      int32_t i, int32_t j, packed_t* out) noexcept nogil:
     """Append the record of blocks order[i] and order[j]; j = -1 for one block."""
     cdef pair_t* record = <pair_t*>out.end
     cdef int32_t kind = x.kind[i], k = i if j < 0 else j
@@ -219,8 +216,7 @@ cdef inline void append_packed_record(const blocks_t* p, const rows_t* r, const 
 
 
 cdef inline void append_records_of_slot(const blocks_t* p, const rows_t* r, const int32_t* order, const double* lam, plan_t* x,
-                                        int32_t begin,
-                             int32_t end, int32_t next_end, packed_t* out) noexcept nogil:
+                                        int32_t begin, int32_t end, int32_t next_end, packed_t* out) noexcept nogil:
     """Append the records of one slot, the blocks by_slot[begin:end], two blocks of one kind per record.
 
     Blocks that stay single come last. Each is paired with a block of the next slot, by_slot[end:next_end], if possible.
@@ -250,7 +246,7 @@ cdef inline void append_records_of_slot(const blocks_t* p, const rows_t* r, cons
 
 
 cdef int32_t pack_blocks_in_order(const blocks_t* p, const rows_t* r, const int32_t* order, bint single, double* workspace,
-                        const double* lam, packed_t* out) noexcept nogil:
+                                  const double* lam, packed_t* out) noexcept nogil:
     """Pack the blocks of an order (k) with their impulses lam (m) into records in `workspace` (`packed_workspace_size`).
 
     Return 0 without records if slots have fewer than MIN_BLOCKS_PER_SLOT blocks on average, or if most blocks are UNPACKED. Every
@@ -342,7 +338,7 @@ cdef inline int32_t find_active_lanes(const int64_t* header, int32_t pass_, int3
 
 
 cdef inline void mask_inactive_lanes(const pair_t* record, int32_t n, int32_t due, int64_t unused, int64_t* write_offset,
-                            double* saved) noexcept nogil:
+                                     double* saved) noexcept nogil:
     """Redirect the velocities of lanes that are not due to an unused place, and save the impulses of the record."""
     cdef const int64_t* header = <const int64_t*>record
     cdef int32_t k
@@ -377,7 +373,7 @@ cdef inline void store_record_impulses(const pair_t* record, int32_t n, const pa
 
 
 cdef inline void relax_records(const blocks_t* p, const rows_t* r, const packed_t* packed, const span_t* span, double* lam,
-                        double* v) noexcept nogil:
+                               double* v) noexcept nogil:
     """Update the blocks of the records of a span that are due."""
     cdef int32_t kind, n, due, all_lanes = (1 << LANES) - 1
     cdef int64_t code, unused = VELOCITY_BYTES * <int64_t>(r.n_bodies + 1)

@@ -13,4 +13,4 @@ cdef void sweep_bodies(const blocks_t* p, const rows_t* r, const int32_t* order,
                        double* v) noexcept nogil
 cdef void sweep_bodies_in_sequence(const blocks_t* p, const rows_t* r, double* lam, double* v) noexcept nogil
 cdef void sweep_generalized(const blocks_t* p, const generalized_t* g, const int32_t* order, double* lam,
-                        double* v) noexcept nogil
+                            double* v) noexcept nogil

@@ -14,9 +14,8 @@ from lavender_ext.core.block_types cimport blocks_t, friction_components_t, get_
 from lavender_ext.core.contact cimport relax_bodies_block
 from lavender_ext.core.csr cimport csr_row_dot
 from lavender_ext.core.numbers cimport project_disk
-from lavender_ext.core.row_forms cimport (
-    damped_csr_t, find_panel, row_form_t, compute_row_slack, get_row_step, set_row_impulse, stored_slack_t,
-)
+from lavender_ext.core.row_forms cimport (damped_csr_t, find_panel, row_form_t, compute_row_slack, get_row_step,
+                                          set_row_impulse, stored_slack_t)
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t
 
 
@@ -132,6 +131,6 @@ cdef void sweep_bodies_in_sequence(const blocks_t* p, const rows_t* r, double* l
 
 
 cdef void sweep_generalized(const blocks_t* p, const generalized_t* g, const int32_t* order, double* lam,
-                        double* v) noexcept nogil:
+                            double* v) noexcept nogil:
     """Sweep over J and M with the whitened velocities v (nv) = Y^T lam."""
     sweep_blocks(p, g, order, p.n_blocks, lam, v)

@@ -18,8 +18,7 @@ from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.block_types cimport blocks_t, friction_components_t, is_box_friction_contact, count_tangent_rows
 from lavender_ext.core.contact cimport (bind_contact_arrays, bind_contact_friction, contact_kind_t, contact_t, disk_t, normal_t,
-                                        other_contact_t,
-                                        relax_contact)
+                                        other_contact_t, relax_contact)
 from lavender_ext.core.joint cimport bind_joint_arrays, joint_t, relax_joint
 from lavender_ext.core.pair cimport LANES, byte_offset, load_pair, load_six, pair_t, store_six
 from lavender_ext.core.view cimport get_block_bodies, rows_t
@@ -157,7 +156,7 @@ cdef inline void write_joint_record(const blocks_t* p, const rows_t* r, int32_t 
 
 
 cdef inline void write_block_record(const blocks_t* p, const rows_t* r, int32_t kind, int32_t i, int32_t j, int64_t owner_i,
-                              int64_t owner_j, const double* lam, pair_t* out) noexcept nogil:
+                                    int64_t owner_j, const double* lam, pair_t* out) noexcept nogil:
     """Write the record of blocks i and j of one kind, without its code; j = i for one block."""
     cdef int64_t* header = <int64_t*>out
     cdef const int32_t* body
@@ -204,7 +203,7 @@ cdef inline void bind_contact_to_record(const pair_t* record, int32_t kind, cont
 
 
 cdef inline void relax_contact_record(const contact_kind_t* contacts, const int64_t* read_offset, const int64_t* write_offset,
-                                pair_t* lam, double* v) noexcept nogil:
+                                      pair_t* lam, double* v) noexcept nogil:
     """Update two contacts; lam (n) are their impulses in pairs, v the velocities of all bodies.
 
     The offsets locate the velocities of both bodies of each contact in v.
@@ -219,7 +218,7 @@ cdef inline void relax_contact_record(const contact_kind_t* contacts, const int6
 
 
 cdef inline void relax_joint_record(const pair_t* record, int32_t kind, pair_t* lam, double* v,
-                              const int64_t* write_offset) noexcept nogil:
+                                    const int64_t* write_offset) noexcept nogil:
     """Update two joints of this kind; arguments as for `relax_contact_record`."""
     cdef const int64_t* read_offset = <const int64_t*>record
     cdef int32_t n = count_record_rows(kind)

@@ -22,12 +22,10 @@ from lavender_ext.core.problem cimport Data
 from lavender_ext.core.velocity cimport compute_velocity_change
 from lavender_ext.core.view cimport csr_t, view_t
 from lavender_ext.judge.stopping_test cimport (CONVERGED, RUNNING, STALLED, StoppingTest, check_start, restart_if_stalled,
-                                               run_until_stop,
-                                               stopping_test_t)
+                                               run_until_stop, stopping_test_t)
 from lavender_ext.local.gauss_seidel cimport prepare_exact_blocks, index_prepared_numbers, sweep_exact_blocks
 from lavender_ext.sweep.packed cimport (MAX_PACKED_BLOCKS, load_packed_impulses, pack_blocks_in_order,
-                                        packed_workspace_size_of_blocks, store_packed_impulses,
-                                        sweep_records)
+                                        packed_workspace_size_of_blocks, store_packed_impulses, sweep_records)
 from lavender_ext.sweep.pgs cimport (sweep_bodies, sweep_matrix_sor, sweep_generalized, sweep_csr_once, sweep_bounded_rows,
                                      sweep_jacobi)
 from lavender_ext.sweep.serial cimport (ALL_SWEEPS, MIN_PACKED_BLOCKS, NOT_PACKED, NOT_WORTH_PACKING, PACKED, packing_t,
