@@ -2,7 +2,6 @@
 
 Native builds run its first phase only, WebAssembly all of it. After `prepare` and `solve` without sweeps:
 
-    index_workspace_size    number of integers with which `plan` begins
     plan                    bands, elements, elimination order; integers and doubles that the factor needs
     substep                 the first phase of `newton` (newton/warm_start.pxd), then its steps (newton/solve.pyx); the
                             judge decides when to stop
@@ -58,36 +57,17 @@ cdef inline void bind_substep_memory(const view_t* v, int64_t newton, warm_t* s,
     memory.reference = take_doubles(a, 3 * <int64_t>v.p.n_blocks)
 
 
-cdef public int32_t lav_newton_index_workspace_size(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
-                                                    int32_t all_stages) noexcept nogil:
-    """Return the number of scratch integers with which `lav_newton_plan` begins, -1 if too many; all_stages = 0: first phase."""
-    cdef engine_t e
-    cdef int64_t used[3]
-    cdef blocks_t p
-    cdef rows_t r
-    cdef view_t v
-    cdef workspace_t n
-    cdef warm_t s
-    cdef memory_t memory
-    cdef arena_t a = make_arena(NULL, NULL)
-    bind_engine_arrays(size, real, index, keys, &e, used)
-    bind_substep_problem(&e, &p, &r)
-    v = view_t(p, NULL, &r, NULL)
-    s.width = 0
-    bind_substep_memory(&v, n.n_index if all_stages and bodies_workspace_size(&v, NULL, &n) else 0, &s, &memory, &a)
-    return <int32_t>a.n_index if a.n_index < INDEX_LIMIT else -1
-
-
 cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* index, uint64_t* keys, int32_t all_stages,
                                     int32_t available, int32_t* scratch) noexcept nogil:
     """Fill scratch (8-byte aligned); return the number of doubles that the solve needs, -1 if too many for int32.
 
-    `available` is the number of integers of scratch. If the factor needs more, the result is SCRATCH_TOO_SMALL: the host allocates
-    scratch[2] integers and calls again.
+    `available` is the number of integers of scratch, at least SCRATCH_HEADER. If it is too small, the result is
+    SCRATCH_TOO_SMALL: the host allocates scratch[2] integers and calls again. With all_stages = 0 only the first phase is planned.
     """
     cdef engine_t e
     cdef int64_t used[3]
-    cdef int64_t needed = 0, own
+    cdef int64_t needed = 0, own, n_index
+    cdef bint has_stages
     cdef blocks_t p
     cdef rows_t r
     cdef view_t v
@@ -101,7 +81,14 @@ cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* 
     s.width = 0
     bind_substep_memory(&v, 0, &s, &memory, &a)
     own, scratch[1] = a.n_index, 0
-    if all_stages and bodies_workspace_size(&v, NULL, &n):
+    has_stages = all_stages and bodies_workspace_size(&v, NULL, &n)
+    n_index = own + (n.n_index if has_stages else 0)
+    if n_index >= INDEX_LIMIT:
+        return -1
+    if n_index > available:
+        scratch[2] = <int32_t>n_index
+        return SCRATCH_TOO_SMALL
+    if has_stages:
         scratch[1] = <int32_t>(available - own)
         n = workspace_t(scratch[1], 0, scratch + SCRATCH_HEADER, NULL, 0, 0, 0, 0.0)
         start_newton_over_bodies(&v, NULL, &n, NULL)                # Computes the pattern and the size of the other workspace.
@@ -238,16 +225,8 @@ cdef class Substep:
 
     def __init__(self, const int32_t[::1] size, double[::1] real, int32_t[::1] index, uint64_t[::1] keys, bint all_stages):
         self.size, self.real, self.index, self.keys, self.all_stages = size, real, index, keys, all_stages
-        self.scratch, self.workspace = np.empty(1), np.empty(1)
+        self.scratch, self.workspace = np.empty(SCRATCH_HEADER // 2), np.empty(1)
         self.noted = np.zeros((MAX_TRACED_SCORES if all_stages else 0, 3))
-
-    cdef int _make_scratch(self, int32_t n) except -1:
-        """Make sure that scratch has at least n integers."""
-        if n < 0:
-            raise MemoryError("the substep needs more than 2^31 numbers of scratch")
-        if 2 * self.scratch.shape[0] < n:
-            self.scratch = np.empty(n // 2 + n // 8 + 1)
-        return 0
 
     cdef int32_t _plan(self) noexcept:
         return lav_newton_plan(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], self.all_stages,
@@ -257,13 +236,12 @@ cdef class Substep:
         """Solve after `prepare` and `solve(False)`; return (result code, sweeps, factorisations, relative residual)."""
         cdef int32_t result, n
         cdef double* trace = NULL
-        self._make_scratch(lav_newton_index_workspace_size(&self.size[0], &self.real[0], &self.index[0], &self.keys[0],
-                                                           self.all_stages))
         if self.all_stages:
             trace = &self.noted[0, 0]
         n = self._plan()
-        if n == SCRATCH_TOO_SMALL:
-            self._make_scratch((<int32_t*>&self.scratch[0])[2])
+        while n == SCRATCH_TOO_SMALL:
+            n = (<int32_t*>&self.scratch[0])[2]
+            self.scratch = np.empty(n // 2 + n // 8 + 1)
             n = self._plan()
         if n < 0:
             raise MemoryError("the substep needs more than 2^31 numbers of scratch")

@@ -5,6 +5,7 @@
 const SIZES = 10; // Entries of size[], as in lavender_ext/engine/arrays.pxd.
 const MOST_SWEEPS = 64;
 const SCRATCH_TOO_SMALL = -2; // Result of lav_newton_plan, as in lavender_ext/engine/newton_substep.pyx.
+const SCRATCH_HEADER = 4; // Smallest number of integers of its scratch, also as there.
 const MOST_TRACED = 256; // Largest number of checks of one solve by Newton's method, as in lavender_ext/newton/warm_start.pxd.
 export const TOL = 1e-6; // Relative residual at which Newton's method ends, as in Python.
 const OK = 0;
@@ -93,9 +94,9 @@ export class Newton {
   // Return { met, sweeps, steps, relative, at, energy, normal }: whether the residual is within tol, the work, and the
   // relative residual; for each check, the work until then, E [sqrt J] and max |e_n| [N s].
   solve(buffers, tol) {
-    let whole = this.#scratch(0, this.f.lav_newton_index_workspace_size(...buffers, 1));
+    let whole = this.#scratch(0, SCRATCH_HEADER);
     let numbers = this.f.lav_newton_plan(...buffers, 1, this.workspace[0], whole);
-    if (numbers === SCRATCH_TOO_SMALL) {
+    while (numbers === SCRATCH_TOO_SMALL) {
       whole = this.#scratch(0, this.k.i32(whole, 3)[2]);
       numbers = this.f.lav_newton_plan(...buffers, 1, this.workspace[0], whole);
     }
