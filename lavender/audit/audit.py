@@ -27,15 +27,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lavender.audit.result import (
-    N_WORST_WORLDS,
-    NOT_JUDGED,
-    WORST_ROW_ERRORS,
-    Audit,
-    Piece,
-    StepState,
-    Worst,
-)
+from lavender.audit.result import N_WORST_WORLDS, NOT_JUDGED, WORST_ROW_ERRORS, Audit, Piece, StepState, Worst
 from lavender.audit.simulated_worlds import (
     ENGINES,
     N_TRIAL_WORLDS,

@@ -11,11 +11,7 @@ MERGE_NOTE = (
     "If the line replaces the model's own <option>, its integrator and time step are lost."
 )
 # Prefixes of the names of MuJoCo's enumerators; the remaining part of a name is the MJCF keyword.
-ENUMS = {
-    "solver": "mjSOL_",
-    "cone": "mjCONE_",
-    "jacobian": "mjJAC_",
-}
+ENUMS = {"solver": "mjSOL_", "cone": "mjCONE_", "jacobian": "mjJAC_"}
 OPTIONS = ("solver", "iterations", "tolerance", "ls_iterations", "ls_tolerance", "jacobian")
 PROBLEM_OPTIONS = ("cone", "impratio", "noslip_iterations")  # Options that change the problem.
 

@@ -41,14 +41,7 @@ from lavender.io.start_states import (
 
 ENGINES = ("mujoco", "mjx", "mujoco_warp")
 # Arrays of the state from which MJX and Warp start.
-START_FIELDS = (
-    "qpos",
-    "qvel",
-    "act",
-    "qacc_warmstart",
-    "mocap_pos",
-    "mocap_quat",
-)
+START_FIELDS = ("qpos", "qvel", "act", "qacc_warmstart", "mocap_pos", "mocap_quat")
 ACCELERATION_FIELDS = ("qacc_smooth", "qfrc_smooth", "qacc")  # Arrays of each step for `from_efc`.
 STEP_FIELDS = ("qpos", "qvel", "act", "ctrl", "qacc_warmstart")  # Arrays on which a step depends.
 # mjtConstraint -> name of a block that is not a contact.

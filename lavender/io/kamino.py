@@ -321,8 +321,7 @@ class _Worlds:
             )
         inertia = np.linalg.inv(inv_inertia)
         values = np.concatenate(
-            [np.repeat(1.0 / inv_mass[:, None], 3, axis=1), inertia[(slice(None), *INERTIA_ENTRIES)]],
-            axis=1,
+            [np.repeat(1.0 / inv_mass[:, None], 3, axis=1), inertia[(slice(None), *INERTIA_ENTRIES)]], axis=1
         )
         if self.layout.has_equal_bodies:
             return (values.reshape(self.n, -1), *self.layout.mass_pattern), is_fixed

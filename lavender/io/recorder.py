@@ -24,25 +24,13 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import (
-    check_bool,
-    check_float,
-    check_int,
-    to_numpy,
-)
+from lavender.base.arrays import check_bool, check_float, check_int, to_numpy
 from lavender.base.errors import InputError, LavenderError
 from lavender.batch.data import Batch
 from lavender.batch.residuals import residual_many
 from lavender.io.engine_step import Claims, EngineStep
 from lavender.io.npz import write_npz
-from lavender.io.stored import (
-    ENGINE,
-    STATES_FOLDER,
-    lock_step_folder,
-    make_folder,
-    write_arrays,
-    write_text,
-)
+from lavender.io.stored import ENGINE, STATES_FOLDER, lock_step_folder, make_folder, write_arrays, write_text
 from lavender.judge.residuals import DEFAULT_THRESHOLD, residual
 from lavender.problem import Problem
 

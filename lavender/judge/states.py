@@ -19,15 +19,7 @@ from lavender.problem import Problem
 from lavender_ext.derivative.linear import CASES, Linear, Linears
 
 # Names of states by the case numbers of the kernels.
-NAMES = (
-    "open",
-    "closed",
-    "sticks",
-    "slides",
-    "free",
-    "at a bound",
-    "at a bound",
-)
+NAMES = ("open", "closed", "sticks", "slides", "free", "at a bound", "at a bound")
 assert tuple(CASES.values()) == tuple(range(len(NAMES)))
 
 

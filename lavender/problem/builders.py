@@ -9,14 +9,7 @@ from typing import TYPE_CHECKING, Any, TypedDict, TypeVar
 
 import numpy as np
 
-from lavender.base.arrays import (
-    ArrayLike,
-    FloatArray,
-    IntArray,
-    as_array,
-    get_common_precision,
-    get_shape,
-)
+from lavender.base.arrays import ArrayLike, FloatArray, IntArray, as_array, get_common_precision, get_shape
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import issparse
 from lavender.problem.cones import Cones

@@ -18,13 +18,7 @@ import pandas as pd
 from lavender.base.deadline import format_seconds
 from lavender.judge.residuals import at_floor
 from lavender.judge.solution import CONFIRMED, CONTRADICTED, NOT_PROVEN
-from lavender.report.ranking import (
-    MAX_NOISE,
-    PREFERRED_SOLVER,
-    get_times,
-    rank_solvers,
-    select_starts,
-)
+from lavender.report.ranking import MAX_NOISE, PREFERRED_SOLVER, get_times, rank_solvers, select_starts
 from lavender.report.records import Skip, describe_target, format_tolerance
 from lavender.report.text import format_count, format_residual
 

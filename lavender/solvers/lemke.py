@@ -22,10 +22,7 @@ from lavender.base.deadline import CHUNK_TIME, Deadline
 from lavender.judge.certificates import check_certificate
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
-from lavender.solvers.certify import (
-    CERTIFICATE_ROWS,
-    find_certificate_by_linear_program,
-)
+from lavender.solvers.certify import CERTIFICATE_ROWS, find_certificate_by_linear_program
 from lavender.solvers.costs import RATES, Cost, estimate_import_cost, estimate_matrix_setup_cost
 from lavender.solvers.pivoting import PivotState
 from lavender.solvers.polyhedral import bound_converted_row_count

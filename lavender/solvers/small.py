@@ -20,9 +20,7 @@ from lavender.base.arrays import FloatArray
 from lavender.judge.residuals import get_zero_impulse_reference, judge_impulse
 from lavender.judge.solution import Claim, SolverStage, Status, format_work_count, sum_work_counts
 from lavender.problem import Problem
-from lavender.solvers.costs import (
-    RATES,
-)
+from lavender.solvers.costs import RATES
 from lavender.solvers.decisions import DECISIONS, SMALL_ROWS
 from lavender.solvers.islands import find_islands
 from lavender.solvers.newton_systems import general
@@ -68,19 +66,7 @@ def make_limits(
     step = RATES["entry"], RATES["work"]["velocities"], DECISIONS.factorisations
     row_rates = RATES["velocity row"], RATES["velocity contact row"]
     rows = SMALL_ROWS, MAX_ROWS_ALWAYS_DENSE, DENSE_ROWS_PER_VELOCITY, VELOCITIES_OF_TWO_BODIES
-    return Limits(
-        np.array(
-            [
-                *step,
-                *row_rates,
-                *sweep,
-                general.MAX_MATRIX_ENTRIES,
-                max_cost,
-                *rows,
-                steps,
-            ]
-        )
-    )
+    return Limits(np.array([*step, *row_rates, *sweep, general.MAX_MATRIX_ENTRIES, max_cost, *rows, steps]))
 
 
 def get_small_call(problem: Problem) -> Any:

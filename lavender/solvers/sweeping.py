@@ -105,12 +105,7 @@ class SweepSolver(Solver):
     """A solver with a `SweepState` as its state."""
 
     def run(
-        self,
-        state: Any,
-        impulse: FloatArray,
-        max_iter: int,
-        tol: float,
-        time_limit: float | None = None,
+        self, state: Any, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None = None
     ) -> Claim:
         """Run `max_iter` sweeps in one call of the kernel, fewer if a check ends them; tol = 0 disables the checks."""
         status, done, count = state.sweeps.run(state.watch, impulse, max_iter, tol)

@@ -9,24 +9,12 @@ from __future__ import annotations
 from lavender.base.arrays import FloatArray
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
-from lavender_ext.newton.warm_start import (
-    JUDGED,
-    MAX_WARM_SWEEPS,
-    SOLVED,
-    SWEPT,
-    UNDECIDED,
-    solve_from_guess,
-)
+from lavender_ext.newton.warm_start import JUDGED, MAX_WARM_SWEEPS, SOLVED, SWEPT, UNDECIDED, solve_from_guess
 
 UNDECIDED_RESULT = UNDECIDED, 0, 0
 
 #: Message for each code of the kernel; None if the phase did not solve the problem.
-MESSAGES = {
-    UNDECIDED: None,
-    JUDGED: "as it came",
-    SWEPT: "warm sweeps",
-    SOLVED: "joints solved directly",
-}
+MESSAGES = {UNDECIDED: None, JUDGED: "as it came", SWEPT: "warm sweeps", SOLVED: "joints solved directly"}
 
 
 def make_warm_start_claim(code: int, sweeps: int, factorisations: int) -> Claim | None:

@@ -49,9 +49,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import NEVER, Deadline, format_seconds
 from lavender.base.errors import BREAKDOWN, format_error
-from lavender.judge.residuals import (
-    combine_best_islands,
-)
+from lavender.judge.residuals import combine_best_islands
 from lavender.judge.solution import Claim, Status, sum_work_counts
 from lavender.problem import OPERATORS, Problem
 from lavender.problem.derived import cached_property

@@ -41,10 +41,7 @@ from lavender.judge.solution import (
 )
 from lavender.problem import Problem, check_problem
 from lavender.solvers.certify import check_infeasibility_claim
-from lavender.solvers.costs import (
-    SCIPY_MODULES,
-    estimate_import_cost,
-)
+from lavender.solvers.costs import SCIPY_MODULES, estimate_import_cost
 from lavender.solvers.decisions import SMALL_ROWS
 from lavender.solvers.islands import find_islands
 from lavender.solvers.registry import Solver, SolverSpec, get
@@ -131,10 +128,8 @@ class SetUp:
     __slots__ = ("is_used", "solver", "state")
 
     def __init__(self, solver: Solver, state: Any) -> None:
-        self.solver, self.state = (
-            solver,
-            state,
-        )  # `state` is the result of the solver's `prepare` or `update`.
+        self.solver = solver
+        self.state = state  # Result of the solver's `prepare` or `update`.
         self.is_used = False  # Whether a solve has used the state, so that the next solve has to update it.
 
 
