@@ -298,7 +298,7 @@ def kamino_drops_mimic():
 
 @fact(
     "newton",
-    "newton pxr",
+    "newton pxr newton_usd_schemas",
     "1.8.0",
     "USD: `physics:staticFriction`",
     "Static friction of a material is dropped, and dynamic friction becomes the coefficient of the shape.",
