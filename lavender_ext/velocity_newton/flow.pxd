@@ -34,6 +34,7 @@ cdef struct descent_t:          # state of the Newton steps under one law
     int32_t slack_is_fresh      # s was recomputed from y, not updated along a step
     int32_t needs_matrix        # N must be formed again
     int32_t response_is_known   # lambda and V belong to the present s
+    int32_t is_stiff            # N is not updated by changes of V (`min_theta_for_updates`)
     int32_t center_moved        # the centre has moved since the last step
     double softness             # rho as a fraction of d
     double best_error           # error of `best`, in multiples of the limits

@@ -42,7 +42,8 @@ from lavender_ext.core.line_search cimport begin_line_search, is_reduction_suffi
 from lavender_ext.velocity_newton.flow cimport (UNFORMED, multiply_y_transpose, end_block_of_run, first_block_of_run, clear_rows,
                                                 compute_island_impulses, copy_rows, descent_t, flow_t, measure_impulse_errors,
                                                 paused_t, recompute_slack, end_row_of_run, first_row_of_run)
-from lavender_ext.velocity_newton.normal cimport factor_normal_matrix, form_normal_matrix, is_v_unchanged, solve_step
+from lavender_ext.velocity_newton.normal cimport (FEW_CHANGES, MANY_CHANGES, SAME_V, compare_v, factor_normal_matrix,
+                                                 form_normal_matrix, has_nonzero_v, solve_step)
 from lavender_ext.velocity_newton.soft cimport has_bounded_rows_only, min_relative_compliance
 
 
@@ -53,7 +54,16 @@ cdef enum:                      # stages of a round of Coulomb friction
 
 cdef enum:
     MAX_IDLE_STEPS = 30         # An island is stuck if this many consecutive steps do not lower its lowest error by a tenth.
+    FAR_GRADIENT = 100          # Above this multiple of the limit, |G| has always exceeded what a solved island has.
     MAX_COULOMB_ROUNDS = 12     # Problems that need more rounds are solved faster by other methods.
+
+
+cdef inline double min_theta_for_updates() noexcept nogil:
+    """Return the smallest theta, as a fraction of d, for which N is updated by changes of V.
+
+    If a row with V = 1 / theta becomes fixed, its part of N cancels, up to rounding of 2^-53 d / theta relative to I.
+    """
+    return 1e-7
 
 
 # -- line searches ----------------------------------------------------------------------------------------------
@@ -153,7 +163,7 @@ cdef inline void set_theta_to_maximum(double* theta, int32_t first, int32_t end)
         theta[k] = big
 
 
-cdef inline void set_proximal_terms(const flow_t* f, int32_t island, double softness) noexcept nogil:
+cdef inline void set_proximal_terms(flow_t* f, int32_t island, double softness) noexcept nogil:
     """Compute theta' of (2) with rho = softness d on rows whose own compliance is below `min_relative_compliance` d.
 
     All rows of one friction component get the largest theta' among them.
@@ -166,6 +176,7 @@ cdef inline void set_proximal_terms(const flow_t* f, int32_t island, double soft
     cdef double* rho = f.rho
     cdef double* soft = f.inv_theta
     cdef double x, low
+    cdef bint is_stiff = False
     for a in range(f.iptr[island], f.iptr[island + 1]):
         last = end_block_of_run(f, a)
         for i in range(first_block_of_run(f, a), last):
@@ -187,7 +198,9 @@ cdef inline void set_proximal_terms(const flow_t* f, int32_t island, double soft
             for k in range(j, end):
                 rho[k] = theta[k] - compliance[k]
                 soft[k] = 1.0 / theta[k]
+                is_stiff |= theta[k] < min_theta_for_updates() * d[k]
                 f.sqrt_theta[k] = sqrt(theta[k])
+    f.descent.is_stiff = is_stiff
 
 
 cdef inline bint has_proximal_terms(const flow_t* f, int32_t island) noexcept nogil:
@@ -273,16 +286,25 @@ cdef inline double compute_gradient(flow_t* f) noexcept nogil:
     return sqrt(size) if size > 0.0 else size * 0.0     # Rounding may make h's square negative; NaN stays NaN.
 
 
+cdef inline int32_t end_descent(flow_t* f, int32_t island, bint moves, bint is_far, int32_t outcome) noexcept nogil:
+    """Keep the last iterate in `best` if its error, which is not measured if it `is_far`, is lower; return `outcome`."""
+    cdef double energy
+    if is_far:
+        store_iterate_if_best(f, island, moves, &energy)
+    return outcome
+
+
 cdef inline int32_t descend_island(flow_t* f, int32_t island, double goal) noexcept nogil:
     """Take Newton steps until the error is `goal` times its limits or no step succeeds; MORE: call again to continue.
 
-    The iterate with the lowest error is in `best`. The softness falls if an inner problem lowers the error by less
-    than 0.7. A step is idle if it does not lower the lowest error of this descent: the first step often raises the
-    error of the start.
+    The measured iterate with the lowest error is in `best`. Without proximal terms, errors are measured if |G| is at most
+    FAR_GRADIENT times the limit or V = 0, and at the end: on rows with V != 0, Y G is the slack error (`flow.pxd` (1)).
+    The softness falls if an inner problem lowers the error by less than 0.7. A step is idle if it does not lower the lowest
+    error of this descent: the first step often raises the error of the start.
     """
     cdef descent_t* x = &f.descent
-    cdef int32_t a, c
-    cdef bint square = f.p.law == COULOMB, rigid, moves
+    cdef int32_t a, c, change
+    cdef bint square = f.p.law == COULOMB, rigid, moves, is_far
     cdef double energy = 0.0, t, size, bound, over
     rigid = has_proximal_terms(f, island)
     while True:
@@ -291,7 +313,9 @@ cdef inline int32_t descend_island(flow_t* f, int32_t island, double goal) noexc
         x.response_is_known = 0
         moves = multiply_y_transpose(f, island, f.lam, f.u)
         size = compute_gradient(f)
-        over = store_iterate_if_best(f, island, moves, &energy)
+        is_far = (not rigid and not square and f.steps > 0 and size > FAR_GRADIENT * goal * f.energy_limit > 0.0
+                  and has_nonzero_v(f, island))
+        over = size / f.energy_limit if is_far else store_iterate_if_best(f, island, moves, &energy)
         if over != over:
             return LOST
         if over <= goal:
@@ -302,7 +326,7 @@ cdef inline int32_t descend_island(flow_t* f, int32_t island, double goal) noexc
         x.idle_steps += 1
         x.steps += 1
         if x.idle_steps > MAX_IDLE_STEPS:
-            return STUCK
+            return end_descent(f, island, moves, is_far, STUCK)
         if rigid and (size <= 0.1 * energy and size <= 0.1 * compute_proximal_energy_error(f, island) or size == 0.0):
             # The softened problem is solved well enough: move its centre.
             move_proximal_centre(f, island)
@@ -316,10 +340,11 @@ cdef inline int32_t descend_island(flow_t* f, int32_t island, double goal) noexc
             x.sizes[0] = x.sizes[1] = x.sizes[2] = -1.0
             continue
         f.steps -= 1
-        if x.needs_matrix or not (x.center_moved or is_v_unchanged(f, island)):
-            form_normal_matrix(f, island, square)
+        change = MANY_CHANGES if x.needs_matrix else SAME_V if x.center_moved else compare_v(f, island)
+        if change != SAME_V:
+            form_normal_matrix(f, island, square, change == FEW_CHANGES and not x.is_stiff)
             if not factor_normal_matrix(f, island, square):
-                return BROKEN
+                return end_descent(f, island, moves, is_far, BROKEN)
         x.needs_matrix = x.center_moved = 0
         solve_step(f, island, square)
         if square:
@@ -333,7 +358,7 @@ cdef inline int32_t descend_island(flow_t* f, int32_t island, double goal) noexc
             t = search_line(f, island)
         if t == 0.0:
             if x.slack_is_fresh:
-                return STUCK
+                return end_descent(f, island, moves, is_far, STUCK)
             x.slack_is_fresh = x.needs_matrix = 1       # Recompute s once: its rounding may have caused the failure.
             recompute_slack(f, island)
             continue
@@ -496,6 +521,18 @@ cdef inline bint is_island_inactive(flow_t* f, int32_t island, double* impulse) 
     return True
 
 
+cdef inline bint is_zero_island_impulse(const flow_t* f, int32_t island) noexcept nogil:
+    """Return whether the island's impulse `lam` is the zero impulse, which is 0 within all bounds."""
+    cdef int32_t a, k
+    if not f.is_zero:
+        return False
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        for k in range(first_row_of_run(f, a), end_row_of_run(f, a)):
+            if clip_zero_to_row_bounds(&f.p, k) != 0.0:
+                return False
+    return True
+
+
 cdef inline int32_t solve_island(flow_t* f, int32_t island, double* impulse) noexcept nogil:
     """Solve one island from `impulse`, or continue a paused island, into `impulse`; return the outcome."""
     cdef int32_t end
@@ -509,7 +546,9 @@ cdef inline int32_t solve_island(flow_t* f, int32_t island, double* impulse) noe
         clear_normal_shift(f, island)
         f.paused.stage, f.paused.rounds = NEXT_ROUND, 0
         f.paused.best_error = f.paused.island_error = 1.0 / 0.0
-        if not keep_impulse_if_better(f, island, impulse, not f.is_zero):
+        if f.law != COULOMB and f.tol > 0.0 and f.energy_limit > 0.0 and is_zero_island_impulse(f, island):
+            f.paused.best_error = 1.0 / f.tol           # the error that the limits refer to
+        elif not keep_impulse_if_better(f, island, impulse, not f.is_zero):
             return LOST
         if f.paused.best_error <= 1.0:
             return REACHED

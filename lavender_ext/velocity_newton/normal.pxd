@@ -62,14 +62,13 @@ cdef inline void add_row_3(double* out, const double* x, const double* y, const 
         out[i] += (f * x[i] + g * y[i]) + h * z[i]
 
 
-cdef inline int32_t multiply_block_by_v(const flow_t* f, int32_t i, int32_t row, int32_t nc, const double* y,
+cdef inline int32_t multiply_block_by_v(const flow_t* f, const double* v, int32_t i, int32_t row, int32_t nc, const double* y,
                                         int32_t n) noexcept nogil:
-    """Append the non-zero rows of V Y of block i to the n rows of `weighted_y`; return the new number of rows.
+    """Append the non-zero rows of V Y of block i, with V in v, to the n rows of `weighted_y`; return the new number of rows.
 
     `row` is the block's first row within its panel. `line` receives, after its columns, the row of Y of each appended row.
     """
     cdef int32_t j = f.p.ptr[i], size = f.p.ptr[i + 1] - j, r, c
-    cdef const double* v = f.v + f.vptr[i]
     cdef double* out
     cdef bint any_
     if has_bounded_rows_only(&f.p, i):
@@ -172,15 +171,32 @@ cdef inline void add_panel_to_dense_matrix(const flow_t* f, int32_t panel, int32
             row[-local[cols[b]]] += line[b]
 
 
-cdef inline bint is_v_unchanged(const flow_t* f, int32_t island) noexcept nogil:
-    """Return whether N was formed with the present V."""
+cdef enum:                      # results of `compare_v`
+    SAME_V = 0
+    FEW_CHANGES = 1
+    MANY_CHANGES = 2
+
+
+cdef inline int32_t compare_v(const flow_t* f, int32_t island) noexcept nogil:
+    """Compare V with the V with which N was formed: return SAME_V, FEW_CHANGES if fewer entries changed than are not 0."""
+    cdef int32_t a, k, end, changed = 0, used = 0
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        end = f.vptr[end_block_of_run(f, a)]
+        for k in range(f.vptr[first_block_of_run(f, a)], end):
+            changed += f.v[k] != f.factored_v[k]
+            used += f.v[k] != 0.0
+    return SAME_V if changed == 0 else FEW_CHANGES if changed < used else MANY_CHANGES
+
+
+cdef inline bint has_nonzero_v(const flow_t* f, int32_t island) noexcept nogil:
+    """Return whether some entry of V is not 0, so that a step changes an impulse."""
     cdef int32_t a, k, end
     for a in range(f.iptr[island], f.iptr[island + 1]):
         end = f.vptr[end_block_of_run(f, a)]
         for k in range(f.vptr[first_block_of_run(f, a)], end):
-            if f.v[k] != f.factored_v[k]:
-                return False
-    return True
+            if f.v[k] != 0.0:
+                return True
+    return False
 
 
 cdef inline void store_v(const flow_t* f, int32_t island) noexcept nogil:
@@ -190,6 +206,15 @@ cdef inline void store_v(const flow_t* f, int32_t island) noexcept nogil:
         end = f.vptr[end_block_of_run(f, a)]
         for k in range(f.vptr[first_block_of_run(f, a)], end):
             f.factored_v[k] = f.v[k]
+
+
+cdef inline void replace_stored_v_by_change(const flow_t* f, int32_t island) noexcept nogil:
+    """Replace the stored V by the difference of V from it."""
+    cdef int32_t a, k, end
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        end = f.vptr[end_block_of_run(f, a)]
+        for k in range(f.vptr[first_block_of_run(f, a)], end):
+            f.factored_v[k] = f.v[k] - f.factored_v[k]
 
 
 # -- over rows: S of (1), or I + A V of (3) ---------------------------------------------------------------------------------
@@ -275,27 +300,38 @@ cdef inline void solve_row_step(flow_t* f) noexcept nogil:
 # -- N -----------------------------------------------------------------------------------------------------------
 
 
-cdef inline void form_normal_matrix(flow_t* f, int32_t island, bint square) noexcept nogil:
-    """Form N with the present V, or the matrix over rows."""
-    cdef int32_t a, b, i, n, nc, size = f.cptr[island + 1] - f.cptr[island], end, last
+cdef inline void set_identity(const flow_t* f, int32_t island, bint square) noexcept nogil:
+    """Set N = I."""
+    cdef int32_t a, b, n = 0, size = f.cptr[island + 1] - f.cptr[island]
     cdef double* normal = f.normal
-    cdef const double* y
-    store_v(f, island)
-    if f.is_over_rows:
-        form_row_matrix(f)
-        return
     if square:
         for a in range(size):
             for b in range(size):
                 normal[b] = 0.0
             normal[a] = 1.0
             normal += size
+        return
+    n = f.lptr[f.cptr[island + 1]] - f.lptr[f.cptr[island]]
+    for a in range(n):
+        normal[a] = 0.0
+    for a in range(n, n + size):
+        normal[a] = 1.0
+
+
+cdef inline void form_normal_matrix(flow_t* f, int32_t island, bint square, bint updates) noexcept nogil:
+    """Form N with the present V, or the matrix over rows; `updates`: add Y^T dV Y of the change of V to the last N."""
+    cdef int32_t a, b, i, n, nc, size = f.cptr[island + 1] - f.cptr[island], end, last
+    cdef const double* y
+    cdef const double* v = f.v
+    if f.is_over_rows:
+        store_v(f, island)
+        form_row_matrix(f)
+        return
+    if updates:
+        replace_stored_v_by_change(f, island)
+        v = f.factored_v
     else:
-        n = f.lptr[f.cptr[island + 1]] - f.lptr[f.cptr[island]]
-        for a in range(n):
-            normal[a] = 0.0
-        for a in range(n, n + size):
-            normal[a] = 1.0
+        set_identity(f, island, square)
     for a in range(f.iptr[island], f.iptr[island + 1]):
         end = f.run[2 * a + 1]
         for b in range(f.run[2 * a], end):
@@ -304,11 +340,12 @@ cdef inline void form_normal_matrix(flow_t* f, int32_t island, bint square) noex
             n = 0
             last = f.pblock[b + 1]
             for i in range(f.pblock[b], last):
-                n = multiply_block_by_v(f, i, f.p.ptr[i] - f.g.prow[b], nc, y, n)
+                n = multiply_block_by_v(f, v + f.vptr[i], i, f.p.ptr[i] - f.g.prow[b], nc, y, n)
             if n > 0 and square:
                 add_panel_to_dense_matrix(f, b, n, size)
             elif n > 0:
                 add_panel_to_sparse_matrix(f, b, n, size)
+    store_v(f, island)
 
 
 cdef inline bint factor_normal_matrix(flow_t* f, int32_t island, bint square) noexcept nogil:
