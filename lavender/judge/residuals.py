@@ -240,7 +240,7 @@ class Residual:
     @property
     def energy_rhs(self) -> float:
         """Energy norm of b [sqrt J]."""
-        return float(measure.compute_rhs_norms(self._problem.disk.metric)[0])
+        return float(measure.compute_rhs_energy(self._problem.disk.metric))
 
     @property
     def worst_name(self) -> str:

@@ -29,7 +29,7 @@ from lavender_ext.batch.world cimport (BAD, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, 
                                        worlds_t)
 from lavender_ext.judge.measure cimport set_zero_impulse, make_judged, count_judge_scratch
 from lavender_ext.judge.rounding cimport float32_floor_of_score, compute_squared_float32_rounding
-from lavender_ext.judge.tally cimport rhs_energy_and_velocity_norms
+from lavender_ext.judge.tally cimport compute_rhs_energy_norm
 from lavender_ext.velocity_newton.soft cimport needs_no_proximal_terms
 
 cdef object new = np.empty
@@ -426,7 +426,6 @@ cdef class Worlds:
         cdef small_problem_t s
         cdef int32_t k, code = self.convert_world(i, &h.scratch, &h.slack_error, &h.made, &j), m = j.p.n_rows
         cdef bint had_derived = j.has_derived
-        cdef double size
         cdef double* x
         if code != READY:
             return code
@@ -462,7 +461,7 @@ cdef class Worlds:
                                                  &j.above_floor)
         if code == READY:
             self.store_result(i, &j, &h.scratch)
-            rhs_energy_and_velocity_norms(&j.p, &self.number[RHS_ENERGY * (self.w.n + 1) + i], &size)
+            self.number[RHS_ENERGY * (self.w.n + 1) + i] = compute_rhs_energy_norm(&j.p)
         if j.general and not had_derived:
             h.made = j.made
         return code

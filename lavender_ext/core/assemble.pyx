@@ -265,24 +265,14 @@ def dense_to_csr(const double[:, ::1] a, double sign=1.0):
     return all_indices[:n + 1], all_indices[n + 1:n + 1 + nnz], values[:nnz]
 
 
-def transpose_csr_arrays(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] data, int n):
-    """Return (indptr, indices, data) of the transpose of a matrix (m, n) in compressed rows."""
-    cdef Py_ssize_t nnz = indices.shape[0]
-    ptr_array, row_array, value_array = np.empty(n + 2, np.int32), np.empty(max(nnz, 1), np.int32), np.empty(max(nnz, 1))
-    cdef int32_t[::1] ptr = ptr_array, row = row_array
-    cdef double[::1] value = value_array
-    transpose_csr(<int32_t>indptr.shape[0] - 1, n, &indptr[0], &indices[0] if nnz else NULL, &data[0] if nnz else NULL,
-               &ptr[0], &row[0], &value[0])
-    return ptr_array[:n + 1], row_array[:nnz], value_array[:nnz]
-
-
 def mirror_lower_triangle(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] data):
     """Return (indptr, indices, data) of a symmetric matrix from its lower triangle, with the diagonal entry last in each row."""
     cdef Py_ssize_t n = indptr.shape[0] - 1, nnz = indices.shape[0]
     cdef Py_ssize_t i, q, k = 0
-    upper = transpose_csr_arrays(indptr, indices, data, n)
-    cdef const int32_t[::1] above = upper[0], column = upper[1]
-    cdef const double[::1] upper_value = upper[2]
+    cdef int32_t[::1] above = np.empty(n + 2, np.int32), column = np.empty(nnz + 1, np.int32)
+    cdef double[::1] upper_value = np.empty(nnz + 1)
+    if n:
+        transpose_csr(<int32_t>n, <int32_t>n, &indptr[0], &indices[0], &data[0], &above[0], &column[0], &upper_value[0])
     ptr_array, index_array, value_array = np.zeros(n + 1, np.int32), np.empty(2 * nnz - n, np.int32), np.empty(2 * nnz - n)
     cdef int32_t[::1] ptr = ptr_array, index = index_array
     cdef double[::1] value = value_array

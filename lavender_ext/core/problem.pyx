@@ -16,7 +16,7 @@ cimport cython
 import numpy as np
 
 from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles
-from lavender_ext.core.arrays cimport as_double_pointer, as_int_pointer
+from lavender_ext.core.arrays cimport as_double_pointer, as_int_pointer, make_read_only
 from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.validate cimport find_invalid_number, min_magnitude
 from lavender_ext.core.dot cimport dot
@@ -339,7 +339,7 @@ cdef class Data:
         self._numbers, self._arrays = numbers_, [None, None, None]
         self.empty = _NONE
         if n_empty:
-            self.empty = _read_only(np.array([i for i in range(m) if empty[i]], np.intp))
+            self.empty = make_read_only(np.array([i for i in range(m) if empty[i]], np.intp))
 
     def __dealloc__(self):
         free(self.derived.marks)
@@ -391,7 +391,7 @@ cdef class Data:
         cdef int32_t m = self.blocks.n_rows, i
         empty = _NONE
         if derived.n_empty:
-            empty = _read_only(np.array([i for i in range(m) if derived.empty[i]], np.intp))
+            empty = make_read_only(np.array([i for i in range(m) if derived.empty[i]], np.intp))
         with cython.critical_section(self):
             if self.ready:
                 free(derived.marks)
@@ -409,7 +409,7 @@ cdef class Data:
             out = new(m) if self.is_general else self._numbers[at:at + m]
             if self.is_general:
                 memcpy(as_double_pointer(out, m), self.blocks.d + at, m * sizeof(double))
-            self._arrays[which] = _read_only(out)
+            self._arrays[which] = make_read_only(out)
         return self._arrays[which]
 
     @property
@@ -455,7 +455,7 @@ cdef class Data:
     def weight(self):
         """Weight sqrt(nu d) (m,) [1/kg]: velocity error of a row per N s of e."""
         if self._weight is None:
-            self._weight = _read_only(np.sqrt(self.nu) * np.sqrt(self.d))
+            self._weight = make_read_only(np.sqrt(self.nu) * np.sqrt(self.d))
         return self._weight
 
     @property
@@ -585,16 +585,10 @@ def clip_zero_to_bounds(const double[::1] lower, const double[::1] upper):
             x[i] = lower[i]
         elif upper[i] < 0.0:
             x[i] = upper[i]
-    return _read_only(out)
+    return make_read_only(out)
 
 
-_NONE = np.empty(0, np.intp)
-_NONE.flags.writeable = False
-
-
-def _read_only(x):
-    x.flags.writeable = False
-    return x
+_NONE = make_read_only(np.empty(0, np.intp))
 
 
 def multiply_body_jacobian(Data p, const double[:, ::1] v, double[::1] out):

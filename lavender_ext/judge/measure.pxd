@@ -1,11 +1,12 @@
 """The judge for other modules: the pass is compiled once, in `measure.pyx`."""
 from libc.stdint cimport int32_t, int64_t
 
+from lavender_ext.core cimport validate
 from lavender_ext.core.block_types cimport blocks_t, islands_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.start cimport clip_zero_to_row_bounds
 from lavender_ext.core.view cimport generalized_t, view_t
-from lavender_ext.judge.score cimport zero_if_at_floor, all_finite_numbers, floor_hides_residual, relative_residual, score_t
+from lavender_ext.judge.score cimport zero_if_at_floor, floor_hides_residual, relative_residual, score_t
 
 
 cdef inline int64_t count_judge_scratch(const view_t* v) noexcept nogil:
@@ -53,7 +54,8 @@ cdef inline double relative_residual_of_score(const score_t* s, const double* w,
     cdef double now, floor
     if s.relative >= 0.0:
         return s.relative
-    if m > 0 and not all_finite_numbers(w, m):
+    # A bound can hide an overflowed slack, which has no meaningful sign.
+    if m > 0 and not validate.all_finite(w, m):
         return 1.0 / 0.0
     if not s.finite:
         return relative_residual(1.0 / 0.0, 1.0 / 0.0, reference_energy, reference_velocity)

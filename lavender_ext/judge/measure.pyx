@@ -23,9 +23,9 @@ from lavender_ext.judge.measure cimport (residual_above_floor, set_zero_impulse,
 from lavender_ext.judge.reference cimport reference_needs_islands, compute_reference
 from lavender_ext.judge.refine cimport estimate_factor_loss, min_reported_loss, refine_generalized_slack
 from lavender_ext.judge.rounding cimport mass_t, relative_size_of_change, compute_squared_float32_rounding
-from lavender_ext.judge.score cimport all_finite_numbers, is_at_floor, make_empty_score, relative_residual, score_t
+from lavender_ext.judge.score cimport is_at_floor, make_empty_score, relative_residual, score_t
 from lavender_ext.judge.slack cimport compute_generalized_slack, compute_body_slack
-from lavender_ext.judge.tally cimport rhs_energy_and_velocity_norms, make_empty_tally, score_all_blocks, add_block_error, tally_t
+from lavender_ext.judge.tally cimport compute_rhs_energy_norm, make_empty_tally, score_all_blocks, add_block_error, tally_t
 
 
 cdef void judge_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, bint floor,
@@ -155,7 +155,7 @@ def judge_impulse(Data p, const double[::1] lam, double[::1] w, double[::1] e, b
     scratch = np.empty(count_judge_scratch(&v) + 1)
     with nogil:
         judge_view(&v, &lam[0], &w[0], &e[0], &scratch[0], floor, &s)
-    if not s.finite or not all_finite_numbers(&w[0], p.blocks.n_rows):
+    if not s.finite or not validate.all_finite(&w[0], p.blocks.n_rows):
         return np.inf, np.inf, np.inf, np.inf
     now = relative_residual_of_score(&s, &w[0], p.blocks.n_rows, p.reference_energy, p.reference_velocity)
     above = residual_above_floor(&s, now, relative_floor_of_score(&s, p.reference_energy, p.reference_velocity)) if floor else now
@@ -270,12 +270,9 @@ def all_finite(const double[::1] x):
     return validate.all_finite(&x[0], x.shape[0]) if x.shape[0] else True
 
 
-def compute_rhs_norms(Data p):
-    """Return the energy norm [sqrt J] and the velocity norm [m/s] of b."""
-    cdef double energy, velocity
-    with nogil:
-        rhs_energy_and_velocity_norms(&p.blocks, &energy, &velocity)
-    return energy, velocity
+def compute_rhs_energy(Data p):
+    """Return the energy norm of b [sqrt J]."""
+    return compute_rhs_energy_norm(&p.blocks)
 
 
 def are_bit_identical(const double[::1] x, const double[::1] y):

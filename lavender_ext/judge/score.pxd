@@ -36,15 +36,6 @@ cdef inline double unit_roundoff() noexcept nogil:
     return 1.1102230246251565e-16
 
 
-cdef inline int32_t all_finite_numbers(const double* x, int32_t n) noexcept nogil:
-    """Return whether x holds neither NaN nor infinity. A bound can hide an overflowed slack, which has no meaningful sign."""
-    cdef int32_t i
-    cdef double s = 0.0                                 # This stays 0, or becomes NaN.
-    for i in range(n):
-        s += 0.0 * x[i]
-    return s == 0.0
-
-
 cdef inline double ratio_to_reference(double x, double reference) noexcept nogil:
     """Return x / reference: 0 if x is 0, inf if x is not finite or the reference is not positive."""
     if x == 0.0:

@@ -126,29 +126,13 @@ cdef inline void write_score_norms(const blocks_t* p, const double* e, const tal
             out.worst = s.worst
 
 
-cdef inline void rhs_energy_and_velocity_norms(const blocks_t* p, double* energy, double* velocity) noexcept nogil:
-    """Compute sqrt(sum b^2 / d) and max |b| sqrt(nu / d); two rows of a group count by their norm."""
-    cdef int32_t i, j, k, g
-    cdef double t, pair, sum_ = 0.0, fast = 0.0
-    cdef friction_components_t q
-    for i in range(p.n_blocks):
-        j = p.ptr[i]
-        for k in range(j, p.ptr[i + 1]):
-            t = (p.b[k] / p.d[k]) * p.b[k]
-            sum_ += t
-            t = t * p.nu[k]
-            if t > fast:
-                fast = t
-        get_row_groups(p, i, &q)
-        for g in range(q.n):
-            if q.size[g] == 2:
-                k = j + q.first[g]
-                pair = (p.b[k] / p.d[k]) * p.b[k] + (p.b[k + 1] / p.d[k + 1]) * p.b[k + 1]
-                pair = pair * p.nu[k]
-                if pair > fast:
-                    fast = pair
-    energy[0] = sqrt(sum_)
-    velocity[0] = sqrt(fast)
+cdef inline double compute_rhs_energy_norm(const blocks_t* p) noexcept nogil:
+    """Return sqrt(sum b^2 / d) [sqrt J]."""
+    cdef int32_t k
+    cdef double sum_ = 0.0
+    for k in range(p.n_rows):
+        sum_ += (p.b[k] / p.d[k]) * p.b[k]
+    return sqrt(sum_)
 
 
 cdef inline floor_t make_empty_floor() noexcept nogil:
