@@ -26,6 +26,7 @@ the error of `impulse`.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -100,25 +101,19 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
             step, kept.codes, kept.first_operator, MASS_TOLERANCE, SUM_TOLERANCE, MIN_INDEPENDENT_AXIS_FRACTION,
             COMPLIANCE_TOLERANCE, MAX_SAFE_ENTRY,
         )  # fmt: skip
-    build: Any = Problem._from_engine_arrays
+    is_usual = True
     if parts is not None:
         blocks, key, operator, rhs, compliance, v_free = parts
         general = Generalized.from_operator(operator, v_free)
     else:
         blocks, key, general, rhs, compliance, is_usual = _convert_step(step, data)
-        build = build if is_usual else Problem
     m = step.m
-    return build(
-        b=rhs,
-        cones=Cones._from_blocks(blocks),
-        generalized=general,
-        compliance=compliance,
-        friction="cone",
-        key=key,
-        names=Names(blocks.n_blocks, lambda: _make_block_names(kept.mj, model, blocks.ints[2 * m + 1 :], m)),
-        name=f"{name} (noslip)" if step.has_noslip else name,
-        copy=False,
-    )
+    fields = {
+        "b": rhs, "cones": Cones._from_blocks(blocks), "generalized": general, "compliance": compliance,
+        "friction": "cone", "key": key, "name": f"{name} (noslip)" if step.has_noslip else name,
+        "names": Names(blocks.n_blocks, partial(_make_block_names, kept.mj, model, blocks.ints, m, 2 * m + 1)),
+    }  # fmt: skip
+    return Problem._from_engine_arrays(fields) if is_usual else Problem(**fields, copy=False)
 
 
 def _convert_step(step: Step, data: Any) -> tuple[Any, Any, Generalized, FloatArray, FloatArray, bool]:
@@ -367,21 +362,23 @@ def _make_blocks(step: Step, data: Any) -> tuple[Any, FloatArray, Any]:
             f"constraint row {result} of {step.m} is of type {kind} and belongs to number {which} of "
             f"{count}{dim}, which does not exist or has fewer rows. {CHANGED_ADVICE}"
         )
-    if result[0] is None:
+    blocks, key = result
+    if blocks.fault:
         raise InputError(
             f"efc_frictionloss, or the friction of a contact, is negative or not finite. {CHANGED_ADVICE}"
         )
-    return result
+    return blocks, blocks.numbers[5 * step.m : 6 * step.m], key
 
 
 def _make_block_names(
-    mj: Any, model: Any, ints: IntArray, m: int, joined: int = mujoco_rows.MAX_EQUALITY_ROWS
+    mj: Any, model: Any, ints: IntArray, m: int, first: int = 0, joined: int = mujoco_rows.MAX_EQUALITY_ROWS
 ) -> list[str]:
     """Return the names of the blocks of m rows.
 
-    `ints` holds efc_type (m,), efc_id (m,), and dim (c,) and geom (c, 2) of the contacts. An equality of more than
-    `joined` rows has a block for each row.
+    From index `first`, `ints` holds efc_type (m,), efc_id (m,), and dim (c,) and geom (c, 2) of the contacts. An
+    equality of more than `joined` rows has a block for each row.
     """
+    ints = ints[first:]
     types, ids, contacts = ints[:m].tolist(), ints[m : 2 * m].tolist(), (len(ints) - 2 * m) // 3
     dim, geom = ints[2 * m : 2 * m + contacts], ints[2 * m + contacts :].reshape(-1, 2)
     kinds = mj.mjtConstraint

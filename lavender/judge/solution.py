@@ -15,6 +15,7 @@ from lavender.base.errors import SolveFailed, require_packages
 from lavender.base.lazy_import import import_module_lazily
 from lavender.judge.residuals import Residual, residual
 from lavender.problem import Problem
+from lavender_ext.core.checks import make_instance
 
 if TYPE_CHECKING:
     from lavender.judge.states import State, States
@@ -296,8 +297,7 @@ class Solution:
     @classmethod
     def from_fields(cls, values: dict[str, Any]) -> Solution:
         """Build a solution from all its fields by name, without copying or checking them."""
-        solution: Solution = object.__new__(cls)
-        solution.__dict__.update(values)
+        solution: Solution = make_instance(cls, values)
         return solution
 
     @classmethod
@@ -314,12 +314,10 @@ class Solution:
 
         `rest` is a function and its arguments; the function returns the fields by name.
         """
-        solution: Solution = object.__new__(cls)
-        attributes = solution.__dict__
-        attributes["impulse"], attributes["status"], attributes["tol"] = impulse, status, tol
-        attributes["setup_time"], attributes["solve_time"] = setup_time, solve_time
-        attributes["_rest"] = rest
-        return solution
+        return cls.from_fields({
+            "impulse": impulse, "status": status, "tol": tol, "setup_time": setup_time, "solve_time": solve_time,
+            "_rest": rest,
+        })  # fmt: skip
 
     def with_fields(self, **values: Any) -> Solution:
         """Return a copy with other values of these fields. Postponed fields of the copy stay postponed."""

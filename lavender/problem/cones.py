@@ -51,7 +51,7 @@ from lavender.problem.friction import (
     project_impulse,
 )
 from lavender_ext.core import blocks as kernels
-from lavender_ext.core.checks import FAULT_NAMES, are_pointers_valid
+from lavender_ext.core.checks import FAULT_NAMES, are_pointers_valid, make_instance
 
 __all__ = [
     "CONTACT",
@@ -151,9 +151,6 @@ class Cones:
             blocks = kernels.make_blocks_from_copied_arrays(*fields)
             if blocks.fault:
                 _raise_fault(FAULT_NAMES[blocks.fault], int(blocks.index), fields)
-        self._set_blocks(blocks)
-
-    def _set_blocks(self, blocks: kernels.Blocks) -> None:
         self.__dict__.clear()
         self.__dict__["_blocks"] = blocks
 
@@ -168,9 +165,7 @@ class Cones:
 
     @classmethod
     def _from_blocks(cls, blocks: kernels.Blocks) -> Cones:
-        cones = object.__new__(cls)
-        cones._set_blocks(blocks)
-        return cones
+        return make_instance(cls, {"_blocks": blocks})
 
     @classmethod
     def _concatenate(cls, cones: Iterable[Cones]) -> Cones:

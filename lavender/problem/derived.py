@@ -22,23 +22,25 @@ class Derived:
 
     Attributes
     ----------
-    lock : RLock
-        Held while a `computed_once` property is computed in the process `process`.
     view : Data or None
         Arrays that kernels read in generalised coordinates; set when the problem is created.
     start : (m,) or None, N s
         The zero impulse clipped to the bounds.
     cache : dict
-        Values of other modules; each key begins with the name of its module.
+        Values of other modules; each key begins with the name of its module. The key of the lock is the process.
     """
 
-    __slots__ = ("cache", "lock", "process", "start", "view")
+    __slots__ = ("cache", "start", "view")
 
-    def __init__(self) -> None:
-        self.lock, self.process = RLock(), _process
-        self.view: Data | None = None
+    def __init__(self, view: Data | None = None) -> None:
+        self.view = view
         self.start: FloatArray | None = None
-        self.cache: dict[str, Any] = {}
+        self.cache: dict[Any, Any] = {}
+
+    @property
+    def lock(self) -> Any:
+        """Lock that a thread of this process holds while it computes a `computed_once` property."""
+        return self.cache.get(_process) or self.cache.setdefault(_process, RLock())
 
 
 # Identity of this process. A forked process gets a new object and then new locks, because threads that hold the old
@@ -87,10 +89,8 @@ class computed_once(cached_property[T]):
         """Compute the property under the lock of the object, unless another thread has done so."""
         if instance is None:
             return self
-        attributes, derived = instance.__dict__, instance.derived
-        if derived.process is not _process:
-            derived.lock, derived.process = RLock(), _process
-        with derived.lock:
+        attributes = instance.__dict__
+        with instance.derived.lock:
             if self.name not in attributes:
                 attributes[self.name] = self.function(instance)
             return attributes[self.name]

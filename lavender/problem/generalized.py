@@ -32,7 +32,7 @@ from lavender.base.lazy_import import sparse as sp
 from lavender.problem.derived import cached_property
 from lavender_ext.core import generalized as kernels
 from lavender_ext.core.assemble import dense_to_csr, mirror_lower_triangle, stack_csr_matrices
-from lavender_ext.core.checks import MIN_MAGNITUDE, as_plain_array
+from lavender_ext.core.checks import MIN_MAGNITUDE, as_plain_array, make_instance
 from lavender_ext.factor.graph import order_for_elimination
 
 # M is rejected if |M_ij - M_ji| exceeds this fraction of sqrt(M_ii M_jj); rounding of sums in float64 causes less.
@@ -128,9 +128,8 @@ class Generalized:
     @classmethod
     def from_operator(cls, operator: kernels.Operator, v_free: FloatArray) -> Generalized:
         """Build the object from a factored operator in the original order of velocities and a checked v* (nv,)."""
-        new = object.__new__(cls)
-        new.__dict__.update(v_free=v_free, names=None, order=None, operator=operator)
-        return new
+        attributes = {"v_free": v_free, "names": None, "order": None, "operator": operator}
+        return make_instance(cls, attributes)
 
     @classmethod
     def from_validated(cls, jac: Compressed, mass: Compressed) -> Generalized:
@@ -146,10 +145,9 @@ class Generalized:
     def with_jacobian(self, jac: Any = None, v_free: Any = None) -> Generalized:
         """Return a copy with another J or v*; None keeps the present one. M and its factor are shared."""
         if jac is None:
-            new = object.__new__(Generalized)
             free = self.v_free if v_free is None else v_free
-            new.__dict__.update(self.__dict__, v_free=as_array("v_free", free, (self.nv,), unit="m/s, rad/s"))
-            return new
+            free = as_array("v_free", free, (self.nv,), unit="m/s, rad/s")
+            return make_instance(Generalized, self.__dict__ | {"v_free": free})
         if self.order is not None:
             return Generalized(jac, self.mass, self.v_free if v_free is None else v_free, self.names)
         velocity = (
@@ -167,11 +165,10 @@ class Generalized:
         if not is_nonzero.all():  # Remove entries that underflowed to zero when they were scaled.
             indptr = np.append(0, np.cumsum(is_nonzero))[indptr].astype(np.int32)
             indices, data = indices[is_nonzero], data[is_nonzero]
-        new = object.__new__(Generalized)
         operator = kernels.Operator(indptr, indices, mark_read_only(data), *self.operator.mass, self.operator)
         operator.share_factor(self.operator)
-        new.__dict__.update(v_free=self.v_free, names=self.names, order=self.order, operator=operator)
-        return new
+        attributes = {"v_free": self.v_free, "names": self.names, "order": self.order, "operator": operator}
+        return make_instance(Generalized, attributes)
 
     def with_diagonal_shift(self, d: FloatArray, momentum: FloatArray | None = None) -> Generalized:
         """Return a copy with M + diag(d), d (nv,), in the same order of elimination.

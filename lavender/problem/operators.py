@@ -14,7 +14,7 @@ from lavender.problem.data import ProblemData
 from lavender.problem.derived import Derived, cached_property, computed_once
 from lavender_ext.core import assemble
 from lavender_ext.core.assemble import dense_to_csr
-from lavender_ext.core.checks import MAX_MAGNITUDE, max_abs_of_array
+from lavender_ext.core.checks import MAX_MAGNITUDE, make_instance, max_abs_of_array
 from lavender_ext.core.problem import LAWS as FRICTION_NUMBER
 from lavender_ext.core.problem import Data, clip_zero_to_bounds, make_generalized_data
 from lavender_ext.factor import sparse
@@ -38,19 +38,17 @@ class Operators(ProblemData):
             self.metric  # noqa: B018 - raises the error now, not in a solve
 
     @classmethod
-    def _from_engine_arrays(cls, **fields: Any) -> Any:
+    def _from_engine_arrays(cls, fields: dict[str, Any]) -> Any:
         """Build a problem over J and M without copies, from fields that `lavender_ext.io.mujoco_rows` has checked.
 
         The arrays are read-only, and no entry of J and M^-1 exceeds `MAX_SAFE_ENTRY`.
         """
-        problem, derived = object.__new__(cls), Derived()
-        fields["derived"], fields["precision"], fields["copy"] = derived, "float64", True
-        derived.view = make_generalized_data(
+        view = make_generalized_data(
             fields["cones"]._blocks, fields["b"], fields["generalized"].operator, fields["compliance"],
             FRICTION_NUMBER[fields["friction"]],
         )  # fmt: skip
-        object.__setattr__(problem, "__dict__", fields)
-        return problem
+        fields["derived"], fields["precision"], fields["copy"] = Derived(view), "float64", True
+        return make_instance(cls, fields)
 
     def _share_operator(self, other: Operators) -> None:
         """Give the same problem with another friction law the arrays of this one that do not depend on the law."""

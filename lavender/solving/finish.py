@@ -137,20 +137,13 @@ def finish(run: FinishedRun) -> Solution:
     if claim is not run.claim or impulse is not run.impulse:
         run = run._replace(claim=claim, impulse=impulse)
     impulse.setflags(write=False)
-    solution: Solution = object.__new__(Solution)
     if claim.status is CONVERGED and judged.relative <= tol and not run.refutation:
-        # The other fields are computed when one of them is first read.
-        solution.__dict__.update(
-            impulse=impulse, status=CONVERGED, tol=tol, setup_time=run.setup_time, solve_time=run.solve_time,
-            _rest=(make_fields, (run, judged)),
-        )  # fmt: skip
-        return solution
+        status, rest = CONVERGED, (make_fields, (run, judged))
+        return Solution.with_late_fields(impulse, status, tol, run.solve_time, rest, run.setup_time)
     verdict = check_claim(run, make_residual(problem, judged))
-    solution.__dict__.update(
-        make_fields(run, judged, verdict),
-        impulse=impulse, status=verdict.status, tol=tol, setup_time=run.setup_time, solve_time=run.solve_time,
-    )  # fmt: skip
-    return solution
+    values = {"impulse": impulse, "status": verdict.status, "tol": tol}
+    values |= {"setup_time": run.setup_time, "solve_time": run.solve_time}
+    return Solution.from_fields(make_fields(run, judged, verdict) | values)
 
 
 def make_fields(run: FinishedRun, judged: Judged, verdict: Verdict | None = None) -> dict[str, Any]:

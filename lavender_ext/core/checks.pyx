@@ -1,6 +1,6 @@
-"""Fast checks of the usual arrays: contiguous float64 of the expected shape.
+"""Fast checks of the usual arrays, contiguous float64 of the expected shape, and objects from checked attributes.
 
-These functions report no reasons. If a check fails, the caller validates again in detail, decides, and writes the message.
+The checks report no reasons. If a check fails, the caller validates again in detail, decides, and writes the message.
 """
 from libc.stdint cimport int32_t, int64_t
 
@@ -11,6 +11,15 @@ from lavender_ext.core.faults cimport (NO_FAULT, body_tolerances_t, find_body_fa
 from lavender_ext.core.validate cimport find_invalid_magnitude, has_invalid_number, max_magnitude, min_magnitude
 from lavender_ext.core.view cimport rows_t
 
+cdef extern from "Python.h":
+    """
+    #define lav_make_object(cls, none) PyBaseObject_Type.tp_new((PyTypeObject*)(cls), none, NULL)
+    """
+    object lav_make_object(object cls, tuple none)
+    int PyObject_GenericSetDict(object, object, void*) except -1
+
+cdef tuple NO_ARGUMENTS = ()
+
 #: Names of the faults of core/faults.pxd, by number.
 FAULT_NAMES = (
     "", "pointers", "kind", "mu", "patch_radius", "spin", "rolling", "bounds", "lower", "upper", "mass", "inertia_size",
@@ -19,6 +28,13 @@ FAULT_NAMES = (
 )
 #: The largest and the smallest nonzero magnitude of a number of a problem.
 MAX_MAGNITUDE, MIN_MAGNITUDE = max_magnitude(), min_magnitude()
+
+
+def make_instance(cls, dict attributes):
+    """Return an object of the Python class `cls` with these attributes, without calling `__init__` or `__setattr__`."""
+    made = lav_make_object(cls, NO_ARGUMENTS)
+    PyObject_GenericSetDict(made, attributes, NULL)
+    return made
 
 
 def as_plain_array(value, tuple shape, bint finite, bint copy):

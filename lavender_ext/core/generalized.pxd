@@ -8,13 +8,14 @@ A row of Y has entries in the columns of its row of J and in their ancestors in 
 with the same columns form a panel: one list of columns, values stored row by row. `whiten.pxd` computes Y.
 """
 from libc.math cimport fabs
-from libc.stdint cimport int32_t
+from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.tree_solve cimport solve_tree_factor
 from lavender_ext.core.view cimport generalized_t
 
 
 cdef enum:
+    MAX_INDEX = 2147483647      # largest number of entries of L with 32-bit indices
     # The entries of x on the columns of a panel are copied to a contiguous array if the panel has at most this many columns
     # and more than two rows.
     MAX_GATHERED_COLUMNS = 64
@@ -199,4 +200,7 @@ cdef class Operator:
     cdef readonly object mass           # (indptr, indices, data) of the lower triangle of M
     cdef list keep
 
+    cdef int set_arrays(self, tuple jac, tuple mass, Operator like, int64_t max_entries) except -1
+    cpdef factor(self)
+    cpdef bint has_entry_above(self, double bound)
     cdef bint has_pattern(self, int32_t n, const int32_t* mptr, const int32_t* midx)

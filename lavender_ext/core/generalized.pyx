@@ -15,8 +15,6 @@ from lavender_ext.core.tree cimport find_tree_factor_pattern
 
 cdef object new = np.empty, I4 = np.dtype(np.int32)
 
-cdef int64_t MAX_INDEX = 2**31 - 1      # largest number of entries of L with 32-bit indices
-
 
 cdef object allocate_factor_pattern(int32_t n, const int32_t* mptr, const int32_t* midx, int64_t max_entries=MAX_INDEX):
     """Return an array with the pattern of L: lptr (n + 1), parent (n), 3 n integers of scratch, then lidx; int32."""
@@ -58,12 +56,16 @@ cdef class Operator:
     is positive definite.
     """
 
-    def __init__(self, jptr_, jidx_, jval_, mptr_, midx_, mval_, Operator like=None, int64_t max_entries=MAX_INDEX):
+    def __init__(self, jptr, jidx, jval, mptr, midx, mval, Operator like=None, int64_t max_entries=MAX_INDEX):
+        self.set_arrays((jptr, jidx, jval), (mptr, midx, mval), like, max_entries)
+
+    cdef int set_arrays(self, tuple jac, tuple mass, Operator like, int64_t max_entries) except -1:
+        """Set the arrays of J and M, and the pattern of L."""
+        jptr_, jidx_, jval_ = self.jac = jac
+        mptr_, midx_, mval_ = self.mass = mass
         cdef int32_t m = <int32_t>len(jptr_) - 1, n = <int32_t>len(mptr_) - 1
         cdef const int32_t* mptr = as_int_pointer(mptr_, n + 1)
         cdef const int32_t* midx = as_int_pointer(midx_, len(midx_))
-        self.jac = (jptr_, jidx_, jval_)
-        self.mass = (mptr_, midx_, mval_)
         self.g.mptr, self.g.midx, self.g.mval = mptr, midx, as_double_pointer(mval_, len(mval_))
         self.g.n = n
         self.g.m = m
@@ -81,8 +83,9 @@ cdef class Operator:
             self.g.parent = self.g.lptr + n + 1
             self.g.lidx = self.g.parent + 4 * n
         self.keep, self.failed = [marks], -1
+        return 0
 
-    def factor(self):
+    cpdef factor(self):
         """Compute L and D, and estimate the condition of M."""
         cdef int32_t n = self.g.n
         cdef int64_t used = 2 * <int64_t>n + self.g.lptr[n] + 1, size = used + 2 * <int64_t>n
@@ -136,7 +139,7 @@ cdef class Operator:
             smallest = min(smallest, 1.0 / (self.g.inv_pivot[i] * mval[mptr[i + 1] - 1]))
         return smallest
 
-    def has_entry_above(self, double bound):
+    cpdef bint has_entry_above(self, double bound):
         """Return whether any |J_ij|, |M_ij|, |L_ij| or 1 / D_i is above `bound` or NaN."""
         return (any_magnitude_above(self.g.jval, self.g.jptr[self.g.m], bound)
                 or any_magnitude_above(self.g.mval, self.g.mptr[self.g.n], bound)

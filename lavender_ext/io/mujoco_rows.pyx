@@ -17,7 +17,8 @@ from lavender_ext.core.arrays cimport as_double_pointer, as_int_pointer, make_re
 from lavender_ext.core.blocks cimport Blocks, allocate_blocks
 from lavender_ext.core.validate cimport is_valid_number, is_valid_magnitude, update_max_abs
 from lavender_ext.core.block_types cimport ROW, blocks_t, choose_contact_kind, write_contact_bounds
-from lavender_ext.core.generalized cimport Operator
+from lavender_ext.core.faults cimport NO_FAULT
+from lavender_ext.core.generalized cimport MAX_INDEX, Operator
 from lavender_ext.core.problem cimport Workspace, allocate_bytes
 from lavender_ext.io.mujoco_step cimport Step, step_t
 
@@ -268,22 +269,28 @@ cdef inline double max_ignoring_nan(double maximum, double x) noexcept nogil:
     return x if x > maximum else maximum
 
 
-cpdef make_blocks(Step step, codes):
-    """Return (blocks, scale, key), or the number of a row with an unknown type or an invalid id.
+cdef inline double* get_row_scales(Blocks blocks) noexcept:
+    """Return the factor of each row (m)."""
+    return <double*>blocks.at.rolling + blocks.at.n_rows
 
-    blocks is None if a bound is not a valid number. Its `ints` hold type, id, dim and geom from index 2 m + 1.
+
+cpdef make_blocks(Step step, codes):
+    """Return (blocks, keys), or the number of a row with an unknown type or an invalid id.
+
+    The blocks have a fault if a bound is not a valid number. Their `ints` hold type, id, dim and geom from index 2 m + 1, their
+    `numbers` the factor of each row from index 5 m.
     """
     cdef const step_t* s = &step.at
     cdef int32_t m = <int32_t>s.m, c = <int32_t>s.contacts, k, i
     cdef int32_t limits[CODES]
-    cdef Blocks made = allocate_blocks(m, m, 2 * m + 3 * c, m + 5 * c)
+    cdef Blocks made = allocate_blocks(m, m, 2 * m + 3 * c, 2 * m + 5 * c)
     cdef blocks_t* p = &made.at
     cdef int32_t* held = <int32_t*>p.kind + m
-    cdef double* scale = <double*>p.rolling + m
+    cdef double* scale = get_row_scales(made)
     cdef double* x = scale + m
+    cdef uint64_t* key = <uint64_t*>(x + 5 * c)
     for k in range(CODES):
         limits[k] = step.object_counts[k] if k < 5 else c
-    keys = new(m, U8)
     if m:
         memcpy(held, s.efc_type, m * sizeof(int32_t))
         memcpy(held + m, s.efc_id, m * sizeof(int32_t))
@@ -294,26 +301,32 @@ cpdef make_blocks(Step step, codes):
         memcpy(&x[5 * i], s.friction + i * s.stride, 5 * sizeof(double))
     k = lav_export_blocks(m, held, held + m, as_int_pointer(codes, CODES), limits, held + 2 * m, x,
                           held + 2 * m + c, s.efc_frictionloss, s.dt, <int32_t*>p.ptr, <int32_t*>p.kind,
-                          <double*>p.lower, <double*>p.upper, <double*>p.mu, scale, <uint64_t*>(<ndarray>keys).data)
+                          <double*>p.lower, <double*>p.upper, <double*>p.mu, scale, key)
     if k < 0:
         return -1 - k
     p.n_blocks = k
-    fits = made.validate()
+    made.validate()
     write_contact_bounds(&made.at)
-    return made if fits else None, made.numbers[5 * m:6 * m], make_read_only(keys if k == m else keys[:k])
+    keys = new(k, U8)
+    memcpy((<ndarray>keys).data, key, k * sizeof(uint64_t))
+    return made, make_read_only(keys)
 
 
-cpdef read_jacobian(Step step, scale_):
-    """Return (indptr, indices, data) of J, each row times `scale_` (m,); a row's number if its indices are invalid.
+def read_jacobian(Step step, scale):
+    """Return (indptr, indices, data) of J, each row times `scale` (m,); a row's number if its indices are invalid.
 
     The result is None if columns do not ascend, and -1 if efc_J has fewer entries than a dense J.
     """
+    return compress_jacobian(step, as_double_pointer(scale, step.at.m))
+
+
+cdef compress_jacobian(Step step, const double* scale):
+    """Return the result of `read_jacobian`."""
     cdef const step_t* s = &step.at
     cdef int32_t i, j, is_invalid, m = <int32_t>s.m, n = s.n
     cdef int64_t q, begin, end, at = 0, total = 0
     cdef double x, factor
     cdef bint ascend = True
-    cdef const double* scale = as_double_pointer(scale_, m)
     cdef const double* value = s.efc_J
     cdef const int32_t* column = s.efc_J_colind
     cdef const int32_t* count = s.efc_J_rownnz
@@ -370,7 +383,7 @@ cpdef read_jacobian(Step step, scale_):
     return (indptr_, indices_, data_) if at == total else (indptr_, indices_[:at], data_[:at])
 
 
-cpdef extract_lower_triangle_of_mass(Step step, double bound, tuple like):
+cpdef tuple extract_lower_triangle_of_mass(Step step, double bound, tuple like):
     """Return the lower triangle of M as (indptr, indices, data), and max |M x - y| over max (|M| |x| + |y|).
 
     x and y are qacc_smooth and qfrc_smooth. The second number is max |M x - y| / max |y| instead, if that is at most
@@ -451,7 +464,7 @@ cpdef find_velocity_before(Step step, double tolerance, double alike):
     return v
 
 
-cpdef compute_problem_numbers(Step step, tuple jac, scale_, v_, double usual):
+def compute_problem_numbers(Step step, tuple jac, scale, v, double usual):
     """Return (b, compliance, v*, whether they are valid and usual, max |efc_R efc_D - 1|, gaps) of J with scaled rows.
 
         b = dt (aref - J a0),   v* = v + dt a0,   a0 = qacc_smooth
@@ -464,13 +477,20 @@ cpdef compute_problem_numbers(Step step, tuple jac, scale_, v_, double usual):
     The size of terms is |J_i|_1 |x|_max for (1) and (2), max |J|^T |f| for (3). The fourth gap is NaN if a is not finite.
     Compliances up to `usual` count as usual.
     """
+    cdef double[5] gap
+    cdef bint is_usual
+    rhs, compliance, free = multiply_problem_numbers(step, jac, as_double_pointer(scale, step.at.m), v, usual, gap, &is_usual)
+    return rhs, compliance, free, is_usual, gap[0], (gap[1], gap[2], gap[3], gap[4])
+
+
+cdef tuple multiply_problem_numbers(Step step, tuple jac, const double* scale, v_, double usual, double* gap, bint* is_usual):
+    """Return (b, compliance, v*) of `compute_problem_numbers`; store its other results in gap (5) and `is_usual`."""
     cdef const step_t* p = &step.at
     cdef int32_t i, j, m = <int32_t>p.m, n = p.n
     cdef Py_ssize_t q
     cdef const int32_t* jptr = as_int_pointer(jac[0], m + 1)
     cdef const int32_t* jidx = as_int_pointer(jac[1], jptr[m])
     cdef const double* jval = as_double_pointer(jac[2], jptr[m])
-    cdef const double* scale = as_double_pointer(scale_, m)
     cdef const double* v = p.qvel if v_ is None else as_double_pointer(v_, n)
     cdef double dt = p.dt, c, size, s_v, s_free, f, finite = 0.0, gap_0 = 0.0, gap_1 = 0.0, gap_2 = 0.0, gap_3 = 0.0
     cdef double big_1 = 0.0, big_2 = 0.0, big_3 = 0.0, stored_1 = 0.0, stored_2 = 0.0, stored_3 = 0.0
@@ -522,10 +542,12 @@ cpdef compute_problem_numbers(Step step, tuple jac, scale_, v_, double usual):
         big_3 = update_max_abs(big_3, force_sum[n + j] + fabs(p.qfrc_constraint[j]))
     if p.has_moving_surfaces:                           # efc_vel contains the velocities of surfaces, too.
         stored_1 = 0.0
-    return make_read_only(rhs_), make_read_only(compliance_), make_read_only(free_), sound and is_valid_magnitude(top_b), gap_0, (
-        gap_1 / big_1 if stored_1 != 0.0 and big_1 != 0.0 else 0.0,
-        gap_2 / big_2 if stored_2 != 0.0 and big_2 != 0.0 else 0.0,
-        gap_3 / big_3 if stored_3 != 0.0 and big_3 != 0.0 else 0.0, finite)
+    is_usual[0] = sound and is_valid_magnitude(top_b)
+    gap[0], gap[4] = gap_0, finite
+    gap[1] = gap_1 / big_1 if stored_1 != 0.0 and big_1 != 0.0 else 0.0
+    gap[2] = gap_2 / big_2 if stored_2 != 0.0 and big_2 != 0.0 else 0.0
+    gap[3] = gap_3 / big_3 if stored_3 != 0.0 and big_3 != 0.0 else 0.0
+    return make_read_only(rhs_), make_read_only(compliance_), make_read_only(free_)
 
 
 def convert_regular_step(Step step, codes, Operator like, double mass_tolerance, double tolerance, double alike,
@@ -535,29 +557,39 @@ def convert_regular_step(Step step, codes, Operator like, double mass_tolerance,
     The functions above describe the arguments. M must have the pattern of `like`, and all entries must be at most `usual`.
     """
     cdef Operator operator
+    cdef Blocks blocks
+    cdef double[5] gap
+    cdef bint is_usual
     if not 0.0 < step.at.dt < 1.0 / 0.0 or step.at.is_discrete or not step.has_mass:
         return None
-    mass = extract_lower_triangle_of_mass(step, mass_tolerance, like.mass[:2])
-    if mass is None or not mass[1] <= mass_tolerance or mass[0][0] is not like.mass[0]:
+    result = extract_lower_triangle_of_mass(step, mass_tolerance, like.mass)
+    if result is None:
+        return None
+    mass, difference = result
+    if not difference <= mass_tolerance or mass[0] is not like.mass[0]:
         return None
     made = make_blocks(step, codes)
-    if type(made) is int or made[0] is None:
+    if type(made) is int:
         return None
-    jac = read_jacobian(step, made[1])
+    blocks, keys = made
+    if blocks.fault != NO_FAULT:
+        return None
+    jac = compress_jacobian(step, get_row_scales(blocks))
     v = find_velocity_before(step, tolerance, alike)
     if type(jac) is not tuple or type(v) is int:
         return None
-    rhs, compliance, v_free, is_usual, gap, gaps = compute_problem_numbers(step, jac, made[1], v, usual)
-    if not is_usual or not gap <= compliance_tolerance or gaps[3] != 0.0:
+    rhs, compliance, v_free = multiply_problem_numbers(step, jac, get_row_scales(blocks), v, usual, gap, &is_usual)
+    if not is_usual or not gap[0] <= compliance_tolerance or gap[4] != 0.0:
         return None
-    for i in range(3):
-        if not gaps[i] <= tolerance:
+    for i in range(1, 4):
+        if not gap[i] <= tolerance:
             return None
-    operator = Operator(*jac, *mass[0], like)
+    operator = Operator.__new__(Operator)
+    operator.set_arrays(jac, mass, like, MAX_INDEX)
     operator.factor()
     if operator.failed >= 0 or operator.has_entry_above(usual):
         return None
-    return made[0], made[2], operator, rhs, compliance, v_free
+    return blocks, keys, operator, rhs, compliance, v_free
 
 
 def copy_rows(Step step):
