@@ -162,8 +162,7 @@ def _solve_reference(problem: Problem, impulse: FloatArray) -> FloatArray:
     cache = problem.derived.cache
     if __name__ not in cache:
         best = raise_if_interrupted(solve(problem, impulse=problem.start(), tol=REFERENCE_TOL)).impulse
-        with problem.derived.lock:
-            cache.setdefault(__name__, best)
+        cache.setdefault(__name__, best)
     stored: FloatArray = cache[__name__]
     return stored
 

@@ -314,10 +314,11 @@ class Solution:
 
         `rest` is a function and its arguments; the function returns the fields by name.
         """
-        return cls.from_fields({
+        solution: Solution = make_instance(cls, {
             "impulse": impulse, "status": status, "tol": tol, "setup_time": setup_time, "solve_time": solve_time,
             "_rest": rest,
         })  # fmt: skip
+        return solution
 
     def with_fields(self, **values: Any) -> Solution:
         """Return a copy with other values of these fields. Postponed fields of the copy stay postponed."""

@@ -27,7 +27,8 @@ class Derived:
     start : (m,) or None, N s
         The zero impulse clipped to the bounds.
     cache : dict
-        Values of other modules; each key begins with the name of its module. The key of the lock is the process.
+        Values of other modules; each key begins with the name of its module. The key of the lock, which is held while
+        a `computed_once` property is computed, is `_process`.
     """
 
     __slots__ = ("cache", "start", "view")
@@ -36,11 +37,6 @@ class Derived:
         self.view = view
         self.start: FloatArray | None = None
         self.cache: dict[Any, Any] = {}
-
-    @property
-    def lock(self) -> Any:
-        """Lock that a thread of this process holds while it computes a `computed_once` property."""
-        return self.cache.get(_process) or self.cache.setdefault(_process, RLock())
 
 
 # Identity of this process. A forked process gets a new object and then new locks, because threads that hold the old
@@ -89,8 +85,8 @@ class computed_once(cached_property[T]):
         """Compute the property under the lock of the object, unless another thread has done so."""
         if instance is None:
             return self
-        attributes = instance.__dict__
-        with instance.derived.lock:
+        attributes, cache = instance.__dict__, instance.derived.cache
+        with cache.get(_process) or cache.setdefault(_process, RLock()):
             if self.name not in attributes:
                 attributes[self.name] = self.function(instance)
             return attributes[self.name]

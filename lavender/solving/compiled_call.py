@@ -70,16 +70,11 @@ def solve_small(
         Work counts of a call that did not solve the problem. None if the first result is a solution or no call was
         made; empty if the time limit leaves no time for a call.
     """
-    small = spec.small
-    if (
-        small is None
-        or not isinstance(tol, float)
-        or not 0.0 < tol < math.inf
-        or (problem.qp is not None and problem.qp.is_singular)
-    ):
+    small: Any = spec.small
+    if not isinstance(tol, float) or not 0.0 < tol < math.inf or problem.cones._blocks.has_ellipse:
         return None, None
-    if problem.cones._blocks.has_ellipse or (len(problem.b) > SMALL_ROWS and problem.generalized is None):
-        # Islands may take long, so `Prepared` solves them between checks of the clock.
+    # Islands of larger problems may take long, so `Prepared` solves them between checks of the clock.
+    if problem.derived.view is None and (len(problem.b) > SMALL_ROWS or problem.has_singular_program):
         return None, None
     fraction = 1.0
     if limit < math.inf:
@@ -105,9 +100,9 @@ def solve_small(
             # `Prepared` continues: time remains, or the impulses are so large that rounding hides b.
             return None, counts
         status, judged = TIME_LIMIT, select_best_impulse(problem, judged, first, tol)
+        judged.impulse.setflags(write=False)
     # Copy the start, because the caller may change the array later.
     start_point = first if first is None or impulse is None else first.copy()
-    judged.impulse.setflags(write=False)
     solution = Solution.with_late_fields(
         judged.impulse,
         status,

@@ -46,6 +46,7 @@ from lavender.judge.solution import (
 from lavender.problem import Problem
 from lavender.problem.cones import project_impulse
 from lavender.solvers.registry import SolverSpec, list_not_resumable
+from lavender_ext.core.checks import make_instance
 from lavender_ext.judge.measure import Judged, all_finite, are_bit_identical
 
 # End of the message of a solution that is its start, unchanged.
@@ -137,13 +138,15 @@ def finish(run: FinishedRun) -> Solution:
     if claim is not run.claim or impulse is not run.impulse:
         run = run._replace(claim=claim, impulse=impulse)
     impulse.setflags(write=False)
+    values = {"impulse": impulse, "tol": tol, "setup_time": run.setup_time, "solve_time": run.solve_time}
     if claim.status is CONVERGED and judged.relative <= tol and not run.refutation:
-        status, rest = CONVERGED, (make_fields, (run, judged))
-        return Solution.with_late_fields(impulse, status, tol, run.solve_time, rest, run.setup_time)
-    verdict = check_claim(run, make_residual(problem, judged))
-    values = {"impulse": impulse, "status": verdict.status, "tol": tol}
-    values |= {"setup_time": run.setup_time, "solve_time": run.solve_time}
-    return Solution.from_fields(make_fields(run, judged, verdict) | values)
+        # The other fields are computed when one of them is first read.
+        values |= {"status": CONVERGED, "_rest": (make_fields, (run, judged))}
+    else:
+        verdict = check_claim(run, make_residual(problem, judged))
+        values = make_fields(run, judged, verdict) | values | {"status": verdict.status}
+    solution: Solution = make_instance(Solution, values)
+    return solution
 
 
 def make_fields(run: FinishedRun, judged: Judged, verdict: Verdict | None = None) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from libc.string cimport memcpy
 
 import numpy as np
 
-from lavender_ext.core.arrays cimport as_double_pointer, as_int_pointer, ndarray
+from lavender_ext.core.arrays cimport as_double_pointer, as_int_pointer, make_read_only, ndarray
 from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.method cimport workspace_t
 from lavender_ext.core.problem cimport Data, bind_body_arrays, derived_t
@@ -135,8 +135,8 @@ def solve_new_generalized_problem(Data p, start, double tol, Limits limits, doub
     cdef workspace_t workspace = workspace_t(0, 0, NULL, NULL, 0, 0, 0, 0.0), islands = workspace
     cdef Py_ssize_t m = p.blocks.n_rows
     cdef bint had_derived = p.ready
-    impulse, results = new(m), new(2 * m + 1)
-    set_task_from_data(&j, p, start, as_double_pointer(impulse, m), as_double_pointer(results, 2 * m + 1))
+    impulse, results = make_read_only(new(m)), new(2 * m + 1)
+    set_task_from_data(&j, p, start, <double*>(<ndarray>impulse).data, <double*>(<ndarray>results).data)
     j.cost_limit = max_cost
     with nogil:
         solve_task(&j, &workspace, &islands, &limits.at, tol)

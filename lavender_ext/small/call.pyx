@@ -18,7 +18,7 @@ cimport cython
 import numpy as np
 
 from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles, take_integers
-from lavender_ext.core.arrays cimport as_double_pointer
+from lavender_ext.core.arrays cimport as_double_pointer, make_read_only, ndarray
 from lavender_ext.core.csr cimport measure_asymmetry_and_bandwidth
 from lavender_ext.core.block_types cimport (CONE, CONTACT_ROLLING, N_FRICTION_ARRAYS, ROUND, blocks_t, get_friction_arrays,
                                             has_independent_rows, bind_friction_arrays)
@@ -480,20 +480,21 @@ cdef class Small:
         cdef solve_workspaces_t workspaces
         cdef int32_t counts[N_COUNTS]
         cdef Py_ssize_t m = s.v.p.n_rows
-        cdef double[::1] own = new(m), both = new(2 * m + 1)
+        cdef ndarray answer = make_read_only(new(m)), both = new(2 * m + 1)
+        cdef double* own = <double*>answer.data
         cdef int32_t code
         memset(&workspaces, 0, sizeof(workspaces))
         self.exchange_kept_workspace(&workspaces.work)
         if impulse is not None:
-            memcpy(&own[0], as_double_pointer(impulse, m), m * sizeof(double))
+            memcpy(own, as_double_pointer(impulse, m), m * sizeof(double))
         try:
-            code = self.run_kernel(&s, &rules.at, &own[0], impulse is None, tol, max_cost, &both[0], &workspaces, counts)
+            code = self.run_kernel(&s, &rules.at, own, impulse is None, tol, max_cost, <double*>both.data, &workspaces, counts)
         finally:
             if workspaces.work.n_real <= MAX_KEPT_DOUBLES:
                 self.exchange_kept_workspace(&workspaces.work)
             free_workspace(&workspaces.work)
             free_workspace(&workspaces.more)
-        judged = make_judged(self.data, own.base, both.base, &s.score, s.relative, s.floor) if code != RESULT_FAILED else None
+        judged = make_judged(self.data, answer, both, &s.score, s.relative, s.floor) if code != RESULT_FAILED else None
         return judged, None if code == RESULT_IS_START else tuple([counts[i] for i in range(N_COUNTS)])
 
     cdef int32_t run_kernel(self, small_problem_t* s, const small_rules_t* rules, double* own, bint cold, double tol,

@@ -100,12 +100,13 @@ def test_a_process_forked_while_a_thread_works_solves_the_same_problem():
         import os, signal, threading
         import numpy as np
         import lavender as lv
+        from lavender.problem import derived
 
         problem = lv.Problem.contact(np.eye(6), [-1.0, 0.5, 0.0] * 2, 0.5)
         held, leave = threading.Event(), threading.Event()
 
         def work():
-            with problem.derived.lock:
+            with problem.derived.cache.setdefault(derived._process, threading.RLock()):
                 held.set()
                 leave.wait(600)
 
