@@ -334,7 +334,7 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
     def name_blocks_of_world(i: int) -> Any:
         row_ints, contact_ints = ints[ptr[i] : ptr[i + 1]], contacts[contact_ptr[i] : contact_ptr[i + 1]]
         whole = [*row_ints.T, contact_ints[:, 1], contact_ints[:, 2:].ravel()]
-        return single._make_block_names(mj, model, np.concatenate(whole), len(row_ints), joined=1)
+        return single._make_block_names(mj, model, np.concatenate(whole), len(row_ints), 1)
 
     batch.names_of = name_blocks_of_world
     world = np.repeat(np.arange(n), np.diff(contact_ptr))

@@ -40,6 +40,7 @@ from lavender.problem import Names, Problem
 from lavender.problem.cones import Cones
 from lavender.problem.generalized import MIN_TREE_ORDERING_VELOCITIES, Generalized
 from lavender.problem.operators import MAX_SAFE_ENTRY
+from lavender_ext.core.problem import LAWS, make_generalized_data
 from lavender_ext.io import mujoco_rows
 from lavender_ext.io.mujoco_step import Step
 
@@ -101,22 +102,34 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
             step, kept.codes, kept.first_operator, MASS_TOLERANCE, SUM_TOLERANCE, MIN_INDEPENDENT_AXIS_FRACTION,
             COMPLIANCE_TOLERANCE, MAX_SAFE_ENTRY,
         )  # fmt: skip
-    is_usual = True
-    if parts is not None:
-        blocks, key, operator, rhs, compliance, v_free = parts
-        general = Generalized.from_operator(operator, v_free)
-    else:
-        blocks, key, general, rhs, compliance, is_usual = _convert_step(step, data)
-    m = step.m
-    fields = {
-        "b": rhs, "cones": Cones._from_blocks(blocks), "generalized": general, "compliance": compliance,
-        "friction": "cone", "key": key, "name": f"{name} (noslip)" if step.has_noslip else name,
-        "names": Names(blocks.n_blocks, partial(_make_block_names, kept.mj, model, blocks.ints, m, 2 * m + 1)),
+    if step.has_noslip:
+        name += " (noslip)"
+    if parts is None:
+        parts, is_usual = _convert_step(step, data)
+        if not is_usual:
+            return Problem(**_make_fields(kept, model, parts), friction="cone", name=name, copy=False)
+    view = make_generalized_data(*parts[:4], LAWS["cone"])
+    problem: Problem = Problem._from_checked_data(view, "cone", name, _make_fields, (kept, model, parts))
+    return problem
+
+
+def _make_fields(kept: Any, model: Any, parts: tuple[Any, ...]) -> dict[str, Any]:
+    """Return the fields of a problem that are made when one of them is first read.
+
+    `parts` is a result of `convert_regular_step`, or of `_convert_step`, with the `Generalized` in place of v*.
+    """
+    blocks, rhs, operator, compliance, general, key = parts
+    m = blocks.n_rows
+    if not isinstance(general, Generalized):
+        general = Generalized.from_operator(operator, general)
+    names = partial(_make_block_names, kept.mj, model, blocks.ints[2 * m + 1 :], m)
+    return {
+        "b": rhs, "cones": Cones._from_blocks(blocks), "generalized": general, "compliance": compliance, "key": key,
+        "names": Names(blocks.n_blocks, names),
     }  # fmt: skip
-    return Problem._from_engine_arrays(fields) if is_usual else Problem(**fields, copy=False)
 
 
-def _convert_step(step: Step, data: Any) -> tuple[Any, Any, Generalized, FloatArray, FloatArray, bool]:
+def _convert_step(step: Step, data: Any) -> tuple[tuple[Any, ...], bool]:
     """Convert a step whose data are unusual or invalid, or the first step of a model; see `convert_regular_step`."""
     kept = step.cache
     like, dt = kept.first_operator, _get_timestep(step)
@@ -136,14 +149,8 @@ def _convert_step(step: Step, data: Any) -> tuple[Any, Any, Generalized, FloatAr
     if change is not None:  # MuJoCo's own a0 is as accurate as opt.tolerance only.
         rhs = mark_read_only(rhs - dt * general.velocity_of(change))
         general = general.with_jacobian(v_free=v_free + dt * change)
-    return (
-        blocks,
-        key,
-        general,
-        rhs,
-        compliance,
-        is_usual and not general.operator.has_entry_above(MAX_SAFE_ENTRY),
-    )
+    is_usual = is_usual and not general.operator.has_entry_above(MAX_SAFE_ENTRY)
+    return (blocks, rhs, general.operator, compliance, general, key), is_usual
 
 
 @np.errstate(over="ignore", invalid="ignore")
@@ -371,14 +378,13 @@ def _make_blocks(step: Step, data: Any) -> tuple[Any, FloatArray, Any]:
 
 
 def _make_block_names(
-    mj: Any, model: Any, ints: IntArray, m: int, first: int = 0, joined: int = mujoco_rows.MAX_EQUALITY_ROWS
+    mj: Any, model: Any, ints: IntArray, m: int, joined: int = mujoco_rows.MAX_EQUALITY_ROWS
 ) -> list[str]:
     """Return the names of the blocks of m rows.
 
-    From index `first`, `ints` holds efc_type (m,), efc_id (m,), and dim (c,) and geom (c, 2) of the contacts. An
-    equality of more than `joined` rows has a block for each row.
+    `ints` holds efc_type (m,), efc_id (m,), and dim (c,) and geom (c, 2) of the contacts. An equality of more than
+    `joined` rows has a block for each row.
     """
-    ints = ints[first:]
     types, ids, contacts = ints[:m].tolist(), ints[m : 2 * m].tolist(), (len(ints) - 2 * m) // 3
     dim, geom = ints[2 * m : 2 * m + contacts], ints[2 * m + contacts :].reshape(-1, 2)
     kinds = mj.mjtConstraint

@@ -15,6 +15,7 @@ from lavender.base.errors import SolveFailed, require_packages
 from lavender.base.lazy_import import import_module_lazily
 from lavender.judge.residuals import Residual, residual
 from lavender.problem import Problem
+from lavender.problem.derived import LateFields
 from lavender_ext.core.checks import make_instance
 
 if TYPE_CHECKING:
@@ -217,7 +218,7 @@ class SolverRun:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Solution:
+class Solution(LateFields):
     """Result of `solve` for every status. `str()` is a summary in one line.
 
     Parameters
@@ -323,23 +324,6 @@ class Solution:
     def with_fields(self, **values: Any) -> Solution:
         """Return a copy with other values of these fields. Postponed fields of the copy stay postponed."""
         return Solution.from_fields(self.__dict__ | values)
-
-    if not TYPE_CHECKING:  # Hide `__getattr__` from type checkers, so that they report unknown names.
-
-        def __getattr__(self, name: str) -> Any:
-            # Python calls this only for names that are missing: fields that `late` postponed, or unknown attributes.
-            attributes = self.__dict__
-            rest = attributes.get("_rest")
-            if rest is not None:
-                function, arguments = rest
-                # Two threads may compute these fields at once; they get equal values. `with_fields` may have set some.
-                attributes.update(function(*arguments) | attributes)
-                attributes.pop("_rest", None)
-            if name in attributes:
-                return attributes[name]
-            raise AttributeError(
-                f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self
-            )
 
     def __reduce__(self) -> tuple[Any, ...]:
         # `work` is a read-only view of a dict, which cannot be pickled: store a dict.

@@ -16,7 +16,7 @@ from lavender_ext.core import assemble
 from lavender_ext.core.assemble import dense_to_csr
 from lavender_ext.core.checks import MAX_MAGNITUDE, make_instance, max_abs_of_array
 from lavender_ext.core.problem import LAWS as FRICTION_NUMBER
-from lavender_ext.core.problem import Data, clip_zero_to_bounds, make_generalized_data
+from lavender_ext.core.problem import Data, clip_zero_to_bounds
 from lavender_ext.factor import sparse
 from lavender_ext.factor.linear import LinearSystem
 from lavender_ext.judge import measure
@@ -38,17 +38,15 @@ class Operators(ProblemData):
             self.metric  # noqa: B018 - raises the error now, not in a solve
 
     @classmethod
-    def _from_engine_arrays(cls, fields: dict[str, Any]) -> Any:
-        """Build a problem over J and M without copies, from fields that `lavender_ext.io.mujoco_rows` has checked.
+    def _from_checked_data(cls, view: Data, friction: str, name: str, *rest: Any) -> Any:
+        """Build a problem over J and M without copies, from data that `lavender_ext.io.mujoco_rows` has checked.
 
-        The arrays are read-only, and no entry of J and M^-1 exceeds `MAX_SAFE_ENTRY`.
+        The arrays are read-only, and no entry of J and M^-1 exceeds `MAX_SAFE_ENTRY`. `rest` is a function and its
+        arguments; the function returns b, cones, generalized, compliance, key and names when one of them is first read.
         """
-        view = make_generalized_data(
-            fields["cones"]._blocks, fields["b"], fields["generalized"].operator, fields["compliance"],
-            FRICTION_NUMBER[fields["friction"]],
-        )  # fmt: skip
-        fields["derived"], fields["precision"], fields["copy"] = Derived(view), "float64", True
-        return make_instance(cls, fields)
+        return make_instance(cls, {
+            "derived": Derived(view), "friction": friction, "precision": "float64", "name": name, "_rest": rest,
+        })  # fmt: skip
 
     def _share_operator(self, other: Operators) -> None:
         """Give the same problem with another friction law the arrays of this one that do not depend on the law."""

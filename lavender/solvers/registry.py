@@ -312,7 +312,7 @@ class SolverSpec:
         small = self.small
         if small is None or not self.builtin or type(problem) is not Problem:
             return False
-        if problem.generalized is not None:
+        if problem.derived.view is not None:
             return small.limits is not None
         return small.pivots if problem.law in ("linear", "lcp") else small.hands_over
 

@@ -179,12 +179,12 @@ class SmallCall:
             (judged result, work counts). The result is None if the call did not converge; the counts are () if no call
             was made.
         """
-        if not tol > 0.0 or not len(problem.b):
+        view = problem.derived.view
+        if not tol > 0.0 or not (view.n_rows if view is not None else len(problem.b)):
             return None, ()
-        if problem.generalized is not None:
-            result: tuple[Any, Any] = solve_new_generalized_problem(
-                problem.derived.view, impulse, tol, self.limits, max_cost
-            )
+        result: tuple[Any, Any]
+        if view is not None:
+            result = solve_new_generalized_problem(view, impulse, tol, self.limits, max_cost)
             return result
         small = problem.derived.cache.get(COMPILED_CALL_KEY)
         if small is None and (problem.m <= SMALL_ROWS or self.hands_over):

@@ -71,10 +71,15 @@ def solve_small(
         made; empty if the time limit leaves no time for a call.
     """
     small: Any = spec.small
-    if not isinstance(tol, float) or not 0.0 < tol < math.inf or problem.cones._blocks.has_ellipse:
+    if not isinstance(tol, float) or not 0.0 < tol < math.inf:
         return None, None
-    # Islands of larger problems may take long, so `Prepared` solves them between checks of the clock.
-    if problem.derived.view is None and (len(problem.b) > SMALL_ROWS or problem.has_singular_program):
+    view = problem.derived.view
+    if view is None:
+        # Islands of larger problems may take long, so `Prepared` solves them between checks of the clock.
+        if len(problem.b) > SMALL_ROWS or problem.has_singular_program:
+            return None, None
+        view = problem.cones._blocks
+    if view.has_ellipse:
         return None, None
     fraction = 1.0
     if limit < math.inf:

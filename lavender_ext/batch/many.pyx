@@ -196,12 +196,14 @@ def list_problem_data(list problems, kind):
         problem = problems[i]
         p = problem.derived.view
         rows[i] = problem.m if p is None else (<Data>p).blocks.n_rows
-        if type(problem) is not kind or (<Blocks>problem.cones._blocks).has_ellipse:
+        if type(problem) is not kind:
             continue
         if p is None:
-            if problem.has_singular_program:
+            if (<Blocks>problem.cones._blocks).has_ellipse or problem.has_singular_program:
                 continue
             p = problem.__dict__.get("data", True)
+        elif p.has_ellipse:
+            continue
         data[i] = p
     return data, sizes
 

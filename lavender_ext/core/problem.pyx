@@ -20,6 +20,7 @@ from lavender_ext.core.arrays cimport as_double_pointer, as_int_pointer, make_re
 from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.validate cimport find_invalid_number, min_magnitude
 from lavender_ext.core.dot cimport dot
+from lavender_ext.core.faults cimport CONTACT_ELLIPSE
 from lavender_ext.core.generalized cimport Operator
 from lavender_ext.core.block_types cimport (CONE, COULOMB, MAX_FRICTION_COMPONENTS, blocks_t, is_box_friction_contact, islands_t,
                                             count_tangent_rows,
@@ -344,6 +345,20 @@ cdef class Data:
     def __dealloc__(self):
         free(self.derived.marks)
         free(self.derived.numbers)
+
+    @property
+    def n_rows(self):
+        """Number of rows."""
+        return self.blocks.n_rows
+
+    @property
+    def has_ellipse(self):
+        """Whether some contact bounds its two tangents by an ellipse."""
+        cdef int32_t i
+        for i in range(self.blocks.n_blocks):
+            if self.blocks.kind[i] == CONTACT_ELLIPSE:
+                return True
+        return False
 
     def with_law(self, int law):
         """Return data of the same problem under another friction law (a value of `LAWS`), with the same arrays."""

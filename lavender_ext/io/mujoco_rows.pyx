@@ -552,7 +552,7 @@ cdef tuple multiply_problem_numbers(Step step, tuple jac, const double* scale, v
 
 def convert_regular_step(Step step, codes, Operator like, double mass_tolerance, double tolerance, double alike,
                          double compliance_tolerance, double usual):
-    """Return (blocks, key, operator, b, compliance, v*) with the factor of M; None if one of the checks needs its own message.
+    """Return (blocks, b, operator, compliance, v*, key) with the factor of M; None if one of the checks needs its own message.
 
     The functions above describe the arguments. M must have the pattern of `like`, and all entries must be at most `usual`.
     """
@@ -589,7 +589,7 @@ def convert_regular_step(Step step, codes, Operator like, double mass_tolerance,
     operator.factor()
     if operator.failed >= 0 or operator.has_entry_above(usual):
         return None
-    return blocks, keys, operator, rhs, compliance, v_free
+    return blocks, rhs, operator, compliance, v_free, keys
 
 
 def copy_rows(Step step):

@@ -377,6 +377,19 @@ def test_of_a_model_only_what_cannot_change_is_kept_and_it_is_let_go():
     assert alive() is None
 
 
+def test_solve_of_an_imported_step_leaves_its_fields_postponed():
+    model, data = state()
+    adapter.from_mujoco(model, data)  # Later steps share the pattern of the first.
+    problem, other = adapter.from_mujoco(model, data), adapter.from_mujoco(model, data)
+    assert lv.solve(problem).impulse.tobytes() == lv.solve(other).impulse.tobytes()
+    assert {"b", "cones", "generalized", "compliance", "key", "names"}.isdisjoint(vars(problem))
+    assert problem.names[0] == other.names[0]
+    assert problem == copy.copy(other)
+    assert "_rest" not in vars(problem)
+    with pytest.raises(AttributeError, match="no attribute 'keys'"):
+        _ = problem.keys
+
+
 @pytest.mark.parametrize("jacobian", ["dense", "sparse"])
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
 def test_from_mujoco_without_a_description_of_structs_reads_attributes(monkeypatch, cone, jacobian):
