@@ -519,7 +519,7 @@ class Audit:
                 PageSection("Worlds that diverged", [self.table_of_diverged], short=2, note=DIVERGED_NOTE),
                 PageSection("Worst rows", [self.table_of_rows], short=3,
                         note="Rows that were the worst of a step that stopped before convergence or is wrong."),
-                PageSection("The worst worlds", [self.table_of_worst], short=N_WORST_WORLDS, note=FILES_NOTE),
+                PageSection("The worst worlds", [self.table_of_worst], short=len(self.worst), note=FILES_NOTE),
             ],
             self.totals,
             stopped=self.stopped,

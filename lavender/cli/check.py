@@ -61,6 +61,9 @@ def check(
     each answer from it is printed. A solution stored in a file is judged, too: it is at the floor of its precision,
     close enough (--threshold), or its solver stopped early.
 
+    Each solver stops at its default number of iterations (pgs: 1000 sweeps), with the status MAX_ITERATIONS. In a
+    report, solvers that can stop after any iteration run until --time-limit instead.
+
     Exit code 1: a claim is contradicted; a solver named by --solvers accepts a problem but does not solve it; without
     this option, no solver solves a problem; none of the solvers accepts a problem; a file in a folder cannot be read;
     or, with --precision or --threshold, a stored solution is neither at its floor nor close enough.

@@ -165,11 +165,8 @@ def show_progress() -> Iterator[Callable[[Event], None]]:
     """Yield a callback that shows progress on stderr: on a terminal in one line, else in a line every few seconds."""
     console = make_console(stderr=True)
     interval = REDRAW_INTERVAL if console.is_terminal else PROGRESS_INTERVAL
-    phase, began, reused_until = (
-        "",
-        time.monotonic(),
-        0,
-    )  # The time of a phase, without results that were reused.
+    # The time of a phase, without results that were reused.
+    phase, began, reused_until = "", time.monotonic(), 0
     printed = -math.inf if console.is_terminal else began
 
     def show_line(text: str) -> None:

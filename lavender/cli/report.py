@@ -40,12 +40,10 @@ from lavender.io.stored import lock_output, write_text
 @click.option(
     "--out", type=PATH, default=Path("lavender-report"), show_default=True, help="Folder of the report."
 )
-@click.option(
-    "--sequence/--no-sequence",
-    default=None,
-    help="Treat each FOLDER as consecutive steps of a simulation, and carry impulses from step to step. Default: only "
-    "folders that `lavender run --record` wrote.",
-)
+@click.option("--sequence/--no-sequence", default=None,
+              help="Treat each FOLDER as consecutive steps of a simulation, and carry impulses from step to step. "
+              "Default: only folders of recorded steps, as `lavender run --record` and `lavender record` write them.",
+)  # fmt: skip
 @click.option(
     "--workers",
     type=int,
@@ -173,9 +171,7 @@ def _reject_unused_options(
 ) -> None:
     """Raise InputError for each option that would be ignored."""
     if any(f.endswith(".jsonl") for f in files):
-        used = {
-            "files", "out", "compare", "time_budgets", "tables", "no_figures", "solvers"
-        }  # fmt: skip
+        used = {"files", "out", "compare", "time_budgets", "tables", "no_figures", "solvers"}
         unused = [p.name for p in context.command.params if p.name and p.name not in used]
         reject_unused_options(context, unused, "if records are shown again, since nothing is solved")
     elif is_campaign(context):

@@ -167,7 +167,7 @@ def resolve_sources(sources: Source | Iterable[Source], sequences: bool | None =
                 if str(source).removeprefix("@") == "sequences"
                 else selected
             )
-    return _append_numbers_to_equal_names(items)
+    return _make_names_differ(items)
 
 
 def resolve_item(source: str | Problem, name: str, reason: str) -> Item:
@@ -380,8 +380,21 @@ def _make_item_of_file(path: Path) -> Item:
     return Item(path.stem, str(path), load, load_stored=partial(io.load_solution, path))
 
 
-def _append_numbers_to_equal_names(items: list[Item]) -> list[Item]:
-    """Append numbers to equal names; figures are files named after cases, so case-insensitive names must differ."""
+def _make_names_differ(items: list[Item]) -> list[Item]:
+    """Prefix equal names of files with the folders that differ, and append numbers to names that are still equal.
+
+    Figures are files named after cases, so case-insensitive names must differ.
+    """
+    files: dict[str, list[Item]] = {}
+    for item in items:
+        if item.in_memory is None and not item.sequence and is_path(item.source):
+            files.setdefault(make_file_name(item.name).lower(), []).append(item)
+    for same in files.values():
+        folders = [Path(item.source).resolve().parent.parts for item in same]
+        first, last = min(folders), max(folders)
+        n = next((i for i, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), len(first))
+        for item, parts in zip(same, folders, strict=True):
+            item.name = escape_unprintable("/".join([*parts[n:], item.name]))
     used_names: set[str] = set()
     for item in items:
         name, n = item.name, 1

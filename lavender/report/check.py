@@ -72,9 +72,8 @@ class CrossCheckRow:
     distance: float | None = None  # [sqrt J] |Delta|_A to the reference.
     allowed: float | None = None  # [sqrt J] Largest distance that (1) and (2) allow.
     slack: float | None = None  # [m/s] Largest difference of a row's slack from the reference's.
-    objective: float | None = (
-        None  # [J] 1/2 l.A l - b.l of the solver's impulse l, minus the reference's value.
-    )
+    # [J] 1/2 l.A l - b.l of the solver's impulse l, minus the reference's value.
+    objective: float | None = None
     time: float | None = None  # [s] Set-up and solve.
     note: str = ""  # Operator form, message and reason.
     ran: str = ""  # Name of the bounded variant that was run instead, if the solver accepts only free rows.

@@ -28,8 +28,7 @@ from lavender.solvers.registry import get, known, specs
 from lavender.solving.solve import solve
 from lavender_ext.sweep import serial
 
-#: Expected hash of each part of the self-test. The data are exact in binary and kernels round equally on every
-#: machine.
+#: Expected hash of each part of the self-test: data are exact in binary, and kernels round equally on every machine.
 HASHES = {
     "pgs, coulomb": "4d51c4d5ba92212c",
     "block_gauss_seidel, coulomb": "c08c92ae0a6354d6",
@@ -49,23 +48,16 @@ def run_self_test() -> dict[str, str]:
     library.
     """
     results = {}
-    for name, law in (
-        ("pgs", "coulomb"),
-        ("block_gauss_seidel", "coulomb"),
-        ("nncg", "coulomb"),
-        ("anderson", "cone"),
-    ):
+    for name in ("pgs", "block_gauss_seidel", "nncg", "anderson"):
+        law = "cone" if name == "anderson" else "coulomb"
         results[f"{name}, {law}"] = solve(_build_test_contacts(law), name, tol=0.0, max_iter=12).impulse
     for name in ("sequential_impulses", "anderson"):
         results[f"{name}, bodies"] = solve(_build_test_bodies(), name, tol=0.0, max_iter=12).impulse
     results["stack, 60 steps"] = simulate_positions("stack", 60)
-    # The initial positions of scenes are hashed, too. A pile's rotations are drawn by NumPy and may depend on its
-    # libm.
-    gallery_scenes = [
-        name for name, build in SCENES.items() if build.__module__ == "lavender.sim.scene.gallery"
-    ]
+    # The initial positions of scenes are hashed, too. NumPy draws a pile's rotations, which may depend on its libm.
+    gallery = [name for name, build in SCENES.items() if build.__module__ == "lavender.sim.scene.gallery"]
     results["gallery, 5 steps"] = np.concatenate(
-        [simulate_positions(name, 5) for name in sorted(gallery_scenes) if name != "pile"]
+        [simulate_positions(name, 5) for name in sorted(gallery) if name != "pile"]
     )
     return {
         name: hashlib.sha256(np.ascontiguousarray(x).tobytes()).hexdigest()[:16]
@@ -127,9 +119,8 @@ def _build_test_contacts(law: str) -> Problem:
     """Build eight contacts of three rows from integers and halves only, so that no library rounds the start."""
     m = 24
     i, j = np.indices((m, m))
-    a = np.where(i == j, 4.0, np.where(np.abs(i - j) <= 3, -0.5, 0.0)) + np.where(
-        (i + j) % 7 == 0, 0.125, 0.0
-    )
+    band = np.where(np.abs(i - j) <= 3, -0.5, 0.0)
+    a = np.where(i == j, 4.0, band) + np.where((i + j) % 7 == 0, 0.125, 0.0)
     b = ((np.arange(m) * 37) % 11 - 5) / 4.0
     b[::3] = 1.0 + np.arange(m // 3) / 8.0
     return Problem.contact(a, b, mu=np.full(m // 3, 0.5), friction=law)

@@ -75,8 +75,9 @@ class EngineAnswers:
         if not cases or answers["seconds"].isna().any() or len(answers) < len(cases):
             return None
         is_solved = answers["relative"] <= tolerance
+        found = {"solver": self.solver, "solved": int(is_solved.sum()), "cases": len(cases)}
         mean = float(compute_mean(answers["seconds"].where(is_solved, limit)))
-        return {"solver": self.solver, "solved": int(is_solved.sum()), "cases": len(cases), "mean": mean}
+        return found | {"mean": mean, "solved_mean": float(compute_mean(answers["seconds"][is_solved]))}
 
 
 def read_engine_answers(sources: Sequence[str], records: Records) -> list[EngineAnswers]:

@@ -63,11 +63,8 @@ def get_memory_per_process(processes: int = 1) -> int:
     It is half of the memory of the machine or container divided among them, but at least 2 GiB; 0 if the memory of the
     machine is unknown.
     """
-    return (
-        max(MIN_BACKEND_MEMORY, int(BACKEND_MEMORY_FRACTION * get_total_memory() / max(1, processes)))
-        if get_total_memory()
-        else 0
-    )
+    total = get_total_memory()
+    return max(MIN_BACKEND_MEMORY, int(BACKEND_MEMORY_FRACTION * total / max(1, processes))) if total else 0
 
 
 def get_versions(packages: Iterable[str] = (), base: Iterable[str] = BASE_PACKAGES) -> dict[str, str]:

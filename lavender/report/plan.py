@@ -74,10 +74,7 @@ class Plan:
         for value in self.tolerances:
             check_float("tolerance", value, above=0.0)
         if not self.tolerances and not self.budgets:
-            raise InputError(
-                "the plan has no tolerances and no budgets, so there is nothing to run: give at least one "
-                "of the two"
-            )
+            raise InputError("without tolerances and budgets there is nothing to run: give one of the two")
         check_int("repeats", self.repeats, 1)
         check_int("cap", self.cap, 1)
         check_float("time_limit", self.time_limit, above=0.0)
@@ -127,9 +124,8 @@ class Plan:
         for start in starts:
             for tolerance in self.tolerances[-1:] if spec.exact else self.tolerances:
                 record = measure_one("tol", tolerance, max_iterations, start)
-                if not record.relative <= tolerance and (
-                    spec.resumable or _rules_out_tighter_tolerances(record)
-                ):
+                is_last = spec.resumable or _rules_out_tighter_tolerances(record)
+                if is_last and not record.relative <= tolerance:
                     break
             if spec.resumable and not spec.exact:
                 for n in self.budgets:

@@ -26,10 +26,8 @@ PLUG_IN_COLORS = ("#000000", "#B000B0", "#C03040")  # No solver of lavender has 
 DASHES = ("-", "--", ":", "-.")  # Line styles of matplotlib.
 MARKERS = ("o", "s", "^", "D", "X", "*", "v")
 GREY = "#b0b0b0"  # Grid and tolerances.
-WIDTH, HEIGHT = (
-    5.6,
-    3.9,
-)  # [inches] Size of a figure without its legend; legible on a phone and on half of a screen.
+# [inches] Size of a figure without its legend; legible on a phone and on half of a screen.
+WIDTH, HEIGHT = 5.6, 3.9
 LEFT, RIGHT, TOP, BOTTOM = 0.75, 0.12, 0.3, 0.5  # [inches] Margins of the axes.
 LEGEND_ROW_HEIGHT = 0.21  # [inches]
 LEGEND_COLUMNS = 2

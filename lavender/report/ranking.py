@@ -11,9 +11,8 @@ import pandas as pd
 from lavender.judge.solution import CONTRADICTED
 
 Frame: TypeAlias = pd.DataFrame
-MEAN_TIME_SHIFT = (
-    1e-5  # [s] Added to times in geometric means. In shorter calls, the overhead of Python dominates.
-)
+# [s] Added to times in geometric means. In shorter calls, the overhead of Python dominates.
+MEAN_TIME_SHIFT = 1e-5
 # Times within noise count as equal. Noise is twice the difference of median and minimum of the repetitions, relative to
 # the minimum, and within these bounds.
 MIN_NOISE, MAX_NOISE = 0.05, 0.25
@@ -60,9 +59,9 @@ def group_cases_by_structure(frame: Frame) -> dict[str, list[str]]:
     return {**groups, **{f"sequence {name}": members for name, members in steps.items()}}
 
 
-def compute_mean(times: Any, axis: int = -1) -> Any:
-    """Compute the geometric mean of times [s], shifted by `MEAN_TIME_SHIFT`."""
-    return np.exp(np.log(np.asarray(times) + MEAN_TIME_SHIFT).mean(axis=axis)) - MEAN_TIME_SHIFT
+def compute_mean(times: Any, axis: int = 0) -> Any:
+    """Compute the geometric mean of times [s], shifted by `MEAN_TIME_SHIFT`; of a frame or series without nan."""
+    return np.exp(np.log(np.add(times, MEAN_TIME_SHIFT)).mean(axis=axis)) - MEAN_TIME_SHIFT
 
 
 def get_times(frame: Frame, tolerance: float) -> Frame:
@@ -87,7 +86,8 @@ def rank_solvers(frame: Frame, tolerance: float, limit: float) -> Frame:
     Returns
     -------
     DataFrame
-        By solver: `solved`, `cases`, `mean` [s] (a miss counts as `limit` [s]), `worst` [s], `hardest` (case), `tie`.
+        By solver: `solved`, `cases`, `mean` [s] (a miss counts as `limit` [s]), `solved_mean` [s] (without misses),
+        `worst` [s], `hardest` (case), `tie`.
     """
     runs = select_ranked_runs(frame)
     times = _get_times_of_runs(runs, tolerance)
@@ -95,7 +95,7 @@ def rank_solvers(frame: Frame, tolerance: float, limit: float) -> Frame:
     false = frame.loc[frame["claim_check"] == CONTRADICTED, "solver"].unique()
     ranking = pd.DataFrame({
         "solved": times.notna().sum(axis=1), "cases": times.shape[1], "worst": times.max(axis=1),
-        "mean": compute_mean(times.fillna(limit)) if len(times.columns) else math.nan,
+        "mean": compute_mean(times.fillna(limit), axis=1), "solved_mean": compute_mean(times, axis=1),
         "hardest": times.fillna(-1.0).idxmax(axis=1) if len(times.columns) else "",
         "false": times.index.isin(false), "noise": (2.0 * ratio).reindex(times.index).clip(MIN_NOISE, MAX_NOISE),
     }, index=times.index)  # fmt: skip

@@ -83,31 +83,39 @@ def _recommend_for(report: Contents, frame: pd.DataFrame) -> Statement:
     solver, first = str(ranking.index[0]), ranking.iloc[0]
     runs = select_ranked_runs(frame)
     own = runs[(runs["solver"] == solver) & (runs[["tol", "relative"]].max(axis=1) <= report.tolerance)]
-    start = "warm from the previous step" if (own["start"] == "carried").any() else "cold"
     missed, unreached = _list_unsolved_cases(report, runs, cases, solver)
     solved = f"{first['solved']} of " if missed or unreached else ""
-    time = format_seconds(first["mean"]) + (" on average" if first["cases"] > 1 else "")
-    if missed or unreached:
-        time += f" ({'each other' if unreached else 'a miss'} counted as {format_seconds(report.limit)})"
-    elif first["worst"] > 3.0 * first["mean"]:
+    time = format_seconds(first["solved_mean"]) + (" on average" if first["solved"] > 1 else "")
+    if first["worst"] > 3.0 * first["solved_mean"]:
         time += f" ({format_seconds(first['worst'])} at worst, {first['hardest']})"
+    loosest = own[own["tol"] == own["tol"].max()]
     use = f"Stopped: {solver} solves" if report.is_stopped else f"Use {solver}: it solves"
-    sentences = [f"{use} {solved}{named} in {time}, {start}, {reached}."]
+    sentences = [f"{use} {solved}{named} in {time}, {_describe_start(frame, loosest)}, {reached}."]
     if report.unfinished:
         sentences.append(f"Not measured to the end: {_shorten_list(report.unfinished)}.")
-    ties = [f"{s} ({format_seconds(t)})" for s, t in ranking.loc[ranking["tie"], "mean"].iloc[1:].items()]
-    if ties:
-        sentences.append(f"As fast within the noise of the repetitions: {_shorten_list(ties)}.")
+    ties = ranking.loc[ranking["tie"], "solved_mean"].iloc[1:]
+    if len(ties):
+        names = _shorten_list([f"{name} ({format_seconds(t)})" for name, t in ties.items()])
+        sentences.append(f"As fast within the noise of the repetitions: {names}.")
     if missed:
         sentences.append(f"It misses {_shorten_list(missed)}.")
     if unreached:
         steps = format_count(unreached, "step")
         sentences.append(f"Not reached within the time of a pass (--sequence-time-limit): {steps}.")
     sentences += _describe_plug_ins(ranking, solver)
-    loosest = own[own["tol"] == own["tol"].max()]
     call = SimpleNamespace(**loosest.loc[loosest["iterations"].idxmax()].to_dict())
     guessed = any(report.records.cases[c].guess for c in cases)
     return Statement(_add_engine(" ".join(sentences), engine, first), format_call(call, guessed))
+
+
+def _describe_start(frame: pd.DataFrame, runs: pd.DataFrame) -> str:
+    """Describe the start of runs; of carried impulses, count the runs that differ from the cold ones."""
+    if not (runs["start"] == "carried").any():
+        return "cold"
+    names = ["case", "solver", "tol", "iterations", "solution_hash"]
+    cold = set(frame.loc[frame["start"] == "cold", names].itertuples(index=False, name=None))
+    n = sum(run not in cold for run in runs[names].itertuples(index=False, name=None))
+    return f"with the impulses of the previous recorded step as start (it changed {n} of {len(runs)} solves)"
 
 
 def _list_unsolved_cases(
@@ -134,7 +142,7 @@ def _describe_plug_ins(ranking: pd.DataFrame, first: str) -> list[str]:
     """Return the sentence on place and time of plug-ins other than the recommended solver."""
     texts = [
         f"{name}: place {place} of {len(ranking)}, {row['solved']} of {row['cases']} solved"
-        + (f" in {format_seconds(row['mean'])}" if row["solved"] else "")
+        + (f" in {format_seconds(row['solved_mean'])}" if row["solved"] else "")
         for place, (name, row) in enumerate(ranking.iterrows(), 1)
         if is_plug_in(str(name)) and name != first
     ]
@@ -175,7 +183,9 @@ def _add_engine(text: str, engine: Any, first: Any) -> str:
         return text
     if not engine["solved"]:
         return f"{text} The engine's own {engine['solver']} solves none of them to that tolerance."
-    solves = f"solves {engine['solved']} of {engine['cases']} in {format_seconds(engine['mean'])}, {INSIDE}"
+    missed = f" (misses {engine['cases'] - engine['solved']})" if engine["solved"] < engine["cases"] else ""
+    time = format_seconds(engine["solved_mean"]) + (" on average" if engine["solved"] > 1 else "")
+    solves = f"solves {engine['solved']} of {engine['cases']}{missed} in {time}, {INSIDE}"
     if first is None or (-engine["solved"], engine["mean"]) < (-first["solved"], first["mean"]):
         return f"First is the engine's own {engine['solver']}: it {solves}. {text}"
     return f"{text} The engine's own {engine['solver']} {solves}."

@@ -191,13 +191,11 @@ class Record(_PrintableEntry):
     form: str = ""
     message: str = ""
     times: tuple[float, ...] = ()  # [s] Time of each repetition of the call; empty if no times are measured.
-    setup_time: float = (
-        math.nan
-    )  # [s] Of the last repetition, without judge and checks, as the next field is.
+    # [s] Of the last repetition, without judge and checks, as the next field is.
+    setup_time: float = math.nan
     solve_time: float = math.nan
-    calibration_time: float | None = (
-        None  # [s] Time of a loop of fixed work, which measures the machine's speed.
-    )
+    # [s] Time of a loop of fixed work, which measures the machine's speed.
+    calibration_time: float | None = None
     load: float | None = None  # Number of runnable processes when the record was made, including this one.
     solution_hash: str = ""  # Hash of the answer: equal for answers with equal bits.
 

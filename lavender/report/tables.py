@@ -27,15 +27,12 @@ if TYPE_CHECKING:
 
 Frame: TypeAlias = pd.DataFrame
 SERVED_RESIDUAL = 0.5  # A case is served if at most this fraction of the start's residual remains.
-SERVED_QUANTILE = (
-    0.9  # A solver is recommended for a time or budget if it serves at least this share of the cases.
-)
+# A solver is recommended for a time or budget if it serves at least this share of the cases.
+SERVED_QUANTILE = 0.9
 RESIDUAL_NOISE_FACTOR = 2.0  # Residuals within this factor count as equal.
 DEATHS = ("ERROR", "KILLED", "CRASHED")
-MIN_FIT_CASES, MIN_FIT_SIZE_RATIO = (
-    4,
-    4.0,
-)  # An exponent is fitted to at least so many cases and ratio of rows.
+# An exponent is fitted to at least so many cases and ratio of rows.
+MIN_FIT_CASES, MIN_FIT_SIZE_RATIO = 4, 4.0
 
 
 def count_solved(solved: int, cases: int) -> str:
@@ -144,7 +141,9 @@ def tabulate_claims(report: Contents) -> Frame:
     })  # fmt: skip
     table = counts.groupby("solver").sum().reset_index()
     claims = table["claims"].where(table["claims"] > 0)
-    table.insert(2, "correct rate [%]", (1e3 * (1.0 - table["contradicted"] / claims) // 1.0) / 10.0)
+    rate = 100.0 * (claims - table["contradicted"]) / claims
+    rounded = rate.round(1).clip(0.1, 99.9)  # Only exact rates are 0 % or 100 %.
+    table.insert(2, "correct rate [%]", rounded.where((rate > 0.0) & (rate < 100.0), rate))
     return table
 
 
@@ -259,12 +258,12 @@ def tabulate_engines(report: Contents) -> Frame:
             "recorded": Path(e.folder).name, "steps": len(e.lines), "not recorded": e.left_out,
             "rows": e.lines["rows"].median(),
             "engine's own": f"{e.solver}{'' if engine is None else count_solved(engine['solved'], len(cases))}",
-            f"own {target} [s]": math.nan if engine is None or not engine["solved"] else engine["mean"],
+            f"own {target} [s]": math.nan if engine is None else engine["solved_mean"],
             "residual, median [-]": relative.median(), "worst [-]": relative.max(),
             "above floor": e.above_floor, "stopped early": e.unconverged,
             "velocity error [m/s]": worst["velocity"], "worst row": worst["worst"],
-            "first here": "none" if first is None else ranking.index[0],
-            f"first {target} [s]": math.nan if first is None else first["mean"],
+            "first here": "none" if first is None else f"{ranking.index[0]}{count_solved(first['solved'], len(cases))}",
+            f"first {target} [s]": math.nan if first is None else first["solved_mean"],
         })  # fmt: skip
     return pd.DataFrame(rows)
 

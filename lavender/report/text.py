@@ -115,11 +115,10 @@ def format_left_out_count(lost: int) -> str:
 
 
 def format_percent(part: int, whole: int, digits: int = 0) -> str:
-    """Return a percentage with at least `digits` decimals, rounded down.
+    """Return a rounded percentage with at least `digits` decimals.
 
     More decimals are used if necessary, so that only part = whole gives 100 % and only part = 0 gives 0 %.
     """
-    while 0 < 100 * 10**digits * part < whole:
+    while 0 < part < whole and round(100.0 * part / whole, digits) in (0.0, 100.0):
         digits += 1
-    tenths = 100 * 10**digits * part // whole
-    return f"{tenths / 10**digits:.{digits}f} %"
+    return f"{100.0 * part / whole:.{digits}f} %"

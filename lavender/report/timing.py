@@ -33,9 +33,8 @@ from lavender.solving.solve import solve
 
 LONG_TIME = 0.05  # [s] A call that took longer is not repeated: caches and the clock hardly affect its time.
 CLAIM_STATUSES = (Status.CONVERGED, Status.ROUNDOFF_LIMIT, Status.INFEASIBLE)
-COLD_PROBLEM = (
-    "problem = dataclasses.replace(problem, guess=None)"  # Line that removes a guess from a problem.
-)
+# Line that removes a guess from a problem.
+COLD_PROBLEM = "problem = dataclasses.replace(problem, guess=None)"
 CARRIED_START = (
     "before, impulse = problems[0], problems[0].start()",
     "for problem in problems:",

@@ -1,5 +1,6 @@
 """Every step of many worlds judged: MuJoCo's own answers, which stopped before convergence, and the worst states."""
 
+import io
 from dataclasses import replace
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from calls import BOXES
 from calls import EARLY_BOXES as EARLY
 from mujoco_scene import mj, whole_mass
+from rich.console import Console
 
 import lavender as lv
 from lavender.audit import audit as module
@@ -268,9 +270,9 @@ def test_a_world_that_diverges_in_its_last_step_is_counted(tmp_path, monkeypatch
 def test_shares_are_never_rounded_to_nothing(boxes):
     found = audit(boxes(), worlds=1, steps=3, workers=1)
     verdict = np.zeros((10, 320), np.int8)
-    verdict[0, :3] = AUDIT_VERDICTS.index("stopped before convergence")
+    verdict[0, 0] = AUDIT_VERDICTS.index("stopped before convergence")
     many = replace(found, verdict=verdict, numbers=np.zeros((4, 10, 320)), rows=verdict, contacts=verdict + 1)
-    assert "3 of 3200 steps judged in 10 worlds stopped before convergence (0.09 %)" in many.summary_text
+    assert "1 of 3200 steps judged in 10 worlds stopped before convergence (0.03 %)" in many.summary_text
 
 
 def test_rows_and_contacts_are_those_of_the_run(boxes):
@@ -515,6 +517,9 @@ def test_audit_with_keep_has_the_worst_steps_of_a_world(boxes, tmp_path):
     assert [w.step for w in found.worst] == np.argsort(-speeds, kind="stable")[:7].tolist()
     found.write(tmp_path)
     assert len(np.load(tmp_path / "states.npz")["state"]) == 7
+    terminal = Console(file=io.StringIO(), width=200)
+    found.summary_page.print_short(terminal)
+    assert [f"worst_{i}.npz" in terminal.file.getvalue() for i in range(1, 9)] == [True] * 7 + [False]
 
 
 def test_audit_keeps_states_before_steps_with_contact(boxes, tmp_path, monkeypatch):

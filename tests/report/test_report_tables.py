@@ -13,6 +13,7 @@ from lavender.report import Report, ranking, tables
 from lavender.report.engine import read_engine_answers
 from lavender.report.recommendation import recommend
 from lavender.report.table import Cell, Table
+from lavender.report.text import format_percent
 from tests.report.synthetic import BUDGET, FALSE_CLAIM, record, records_of, shown
 
 
@@ -115,6 +116,27 @@ def test_tabulate_claims_counts_contradicted_claims_and_deaths():
     }  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    ("runs", "false", "rate"),
+    [(3, 1, 66.7), (2, 0, 100.0), (2100, 1, 99.9), (2, 2, 0.0)],
+)
+def test_tabulate_claims_rounds_rates_and_keeps_0_and_100_for_exact_ones(runs, false, rate):
+    made = [record(f"c{i}", "pgs", 1.0, 1e-8, **(FALSE_CLAIM if i < false else {})) for i in range(runs)]
+    assert list(tables.tabulate_claims(Report(records_of(*made)))["correct rate [%]"]) == [rate]
+
+
+@pytest.mark.parametrize(
+    ("part", "whole", "digits", "text"),
+    [
+        (130, 150, 1, "86.7 %"), (25, 150, 1, "16.7 %"), (546, 900, 1, "60.7 %"), (2, 3, 0, "67 %"),
+        (0, 7, 1, "0.0 %"), (7, 7, 0, "100 %"), (1, 3000, 1, "0.03 %"), (2999, 3000, 1, "99.97 %"),
+        (999, 1000, 0, "99.9 %"), (1, 1000, 0, "0.1 %"),
+    ],
+)  # fmt: skip
+def test_format_percent_rounds_and_keeps_0_and_100_for_exact_shares(part, whole, digits, text):
+    assert format_percent(part, whole, digits) == text
+
+
 def test_tabulate_failures_lists_misses_above_the_floor_with_their_reason():
     made = [
         record("a", "good", 1.0, 1e-8), record("a", "floor", 1.0, 1e-5, roundoff_floor=1e-5),
@@ -140,8 +162,20 @@ def test_tabulate_sequences_compares_cold_with_carried():
     (row,) = tables.tabulate_sequences(report).to_dict("records")
     assert (row["sequence"], row["steps, cold"], row["iterations, carried"]) == ("walk", 4, 12)
     assert row["time, cold [s]"] == pytest.approx(8e-3) and row["cold / carried"] == 2.0
-    assert recommend(report)[0].text.startswith(
-        "Use auto: it solves the 4 steps of walk in 1.00 ms on average, warm"
+
+
+@pytest.mark.parametrize(("changes", "count"), [({}, 0), ({"iterations": 2}, 3), ({"solution_hash": "x"}, 3)])
+def test_recommend_counts_the_solves_that_a_carried_start_changed(changes, count):
+    made = [record(f"walk[{k}]", "auto", 2e-3, 1e-8, step=k, iterations=3) for k in range(4)]
+    made += [
+        dataclasses.replace(r, start="carried", times=(1e-3,), **(changes if r.step else {})) for r in made
+    ]
+    found = records_of(*made)
+    for step in range(4):
+        found.add(dataclasses.replace(found.cases[f"walk[{step}]"], sequence="walk", step=step))
+    assert recommend(Report(found))[0].text.startswith(
+        "Use auto: it solves the 4 steps of walk in 1.00 ms on average, with the impulses of the previous recorded "
+        f"step as start (it changed {count} of 4 solves), down to"
     )
 
 
@@ -246,11 +280,9 @@ def test_recommend_names_worst_case_ties_misses_and_the_call():
     made = [record(c, s, t, 1e-8) for c in "abc" for s, t in (("auto", 1e-3), ("direct", 1.0001e-3))]
     made += [record("d", s, 1.0, 1e-2) for s in ("auto", "direct")]
     (statement,) = recommend(Report(records_of(*made)))
-    mean = format_seconds(ranking.compute_mean([1e-3, 1e-3, 1e-3, 2.0]))
     assert statement.text == (
-        f"Use auto: it solves 3 of your 4 stacks in {mean} on average (a miss counted as 2.00 s), cold, down to 1e-6 "
-        f"of the error of the zero impulse. As fast within the noise of the repetitions: direct ({mean}). It misses d "
-        "(residual 1.0e-2)."
+        "Use auto: it solves 3 of your 4 stacks in 1.00 ms on average, cold, down to 1e-6 of the error of the zero "
+        "impulse. As fast within the noise of the repetitions: direct (1.00 ms). It misses d (residual 1.0e-2)."
     )
     assert statement.call_line == 'lv.solve(problem, "auto", tol=1e-6)'
     slow = [record(c, "pgs", t, 1e-8) for c, t in (("a", 1e-4), ("b", 1e-4), ("c", 1e-1))]
@@ -311,14 +343,15 @@ def test_recommend_engine_is_ranked_by_the_same_rule(tmp_path, answers, first):
     text = recommend(report)[0].text
     assert text.startswith("First is the engine's own Newton") == first
     solved = sum(x <= 1e-6 for _, x in answers)
-    mean = ranking.compute_mean([t if x <= 1e-6 else 2.0 for t, x in answers])
-    expected = f"solves {solved} of 2 in {format_seconds(mean)}" if solved else "solves none of them"
+    missed = "" if solved == 2 else f" (misses {2 - solved})"
+    mean = ranking.compute_mean([t for t, x in answers if x <= 1e-6]) if solved else math.nan
+    expected = f"solves {solved} of 2{missed} in {format_seconds(mean)}" if solved else "solves none of them"
     assert expected in text
     (row,) = tables.tabulate_engines(report).to_dict("records")
     assert row["first here"] == "auto" and row["first to 1e-6 [s]"] == pytest.approx(
         ranking.compute_mean([4e-5, 8e-5])
     )
-    assert math.isnan(row["own to 1e-6 [s]"]) == (solved == 0)
+    assert row["own to 1e-6 [s]"] == pytest.approx(mean, nan_ok=True)
 
 
 # -- texts of tables ---------------------------------------------------------------------------------------

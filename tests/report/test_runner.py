@@ -581,6 +581,18 @@ def test_resolve_sources_recorded_steps_are_sequences_and_folders_are_searched(t
         report.run([stack(3)], ["pgz"])
 
 
+def test_resolve_sources_files_of_one_name_are_named_after_the_folders_that_differ(tmp_path):
+    files = [tmp_path / folder / "step_01.npz" for folder in ("a", "b/worst", "c/worst")]
+    for path in files:
+        path.parent.mkdir(parents=True)
+        lv.io.save(stack(4), path)
+    names = [item.name for item in report.resolve_sources([*files, "stack(n=2)"])]
+    assert names == ["a/step_01", "b/worst/step_01", "c/worst/step_01", "stack(n=2)"]
+    lv.io.save(stack(4), tmp_path / "step_01.npz")
+    names = [item.name for item in report.resolve_sources([tmp_path / "step_01.npz", *files[:1], *files[:1]])]
+    assert names == ["step_01", "a/step_01", "a/step_01 #2"]
+
+
 @pytest.mark.parametrize("names", [("s_1", "s_2", "s_02"), ("a_1", "a_2", "b_1", "b_2")])
 def test_list_steps_two_recordings_in_a_folder_are_rejected(tmp_path, names):
     for name in names:
