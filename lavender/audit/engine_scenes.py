@@ -273,10 +273,8 @@ class NewtonScene:
     def set_state(self, state: EngineState) -> None:
         """Set the state of all worlds, arrays (n, ...), and clear the solver's warm start."""
         if not self._has_equal_worlds:
-            raise InputError(
-                "the worlds of this scene have different bodies or joints, so states cannot be set in one "
-                "array for all worlds: leave states out"
-            )
+            reason = "states cannot be set in one array for all worlds: leave states out"
+            raise InputError(f"the worlds of this scene have different bodies or joints, so {reason}")
         given = [group for group in NEWTON_GROUPS if all(name in state for name in group)]
         if not given:
             raise InputError(
@@ -304,10 +302,8 @@ class NewtonScene:
         values = velocity.numpy().copy()
         by_world = values.reshape(self.n, -1) if self._has_equal_worlds else None
         if by_world is None:
-            raise InputError(
-                "the worlds of this scene have different bodies or joints, so noise cannot be added to "
-                "their velocities: give spread=0"
-            )
+            reason = "noise cannot be added to their velocities: give spread=0"
+            raise InputError(f"the worlds of this scene have different bodies or joints, so {reason}")
         for world in range(first, self.n):
             by_world[world] += spread * np.random.default_rng([seed, world]).standard_normal(
                 by_world.shape[1]

@@ -26,6 +26,9 @@ class Setting:
 
     options: tuple[tuple[str, Any], ...] = ()
     is_default: bool = field(default=False, compare=False)  # Whether these are the engine's default options.
+    iterations: int = field(
+        default=0, compare=False
+    )  # Iteration limit, also if it is the present one; 0: unknown.
 
     @property
     def option_line(self) -> str:
@@ -61,7 +64,10 @@ class MujocoSetting(Setting):
     def from_options(cls, mj: Any, model: Any, **options: Any) -> MujocoSetting:
         """Create the setting of the options that differ from the model's, in the order of `OPTIONS`."""
         has = {name: get_option_value(mj, model, name) for name in (*OPTIONS, *PROBLEM_OPTIONS)}
-        return cls(tuple((name, options[name]) for name in has if options.get(name, has[name]) != has[name]))
+        return cls(
+            tuple((name, options[name]) for name in has if options.get(name, has[name]) != has[name]),
+            iterations=options.get("iterations", has["iterations"]),
+        )
 
     @property
     def name(self) -> str:

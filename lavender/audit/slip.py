@@ -124,6 +124,8 @@ class SlipExplanation:
         Settings that were simulated, if the model is known and this is its state with the fastest contact.
     n_states : int
         Number of states from which the settings were simulated.
+    state : int
+        Index of the state among the given ones.
     """
 
     contacts: tuple[str, ...]
@@ -132,6 +134,7 @@ class SlipExplanation:
     friction_use: FloatArray | None = None
     remedies: tuple[Remedy, ...] = ()
     n_states: int = 0
+    state: int = 0
 
     def __str__(self) -> str:
         rows = [self.table.heads, *self.table.rows]
@@ -172,9 +175,7 @@ class SlipExplanation:
     def remedies_table(self) -> Table:
         """Slip of the fastest contact with each setting [m/s], in the explained step and later."""
         heads = ["setting", "slip [m/s]", f"mean of the next {REMEDY_STEPS} steps [m/s]"]
-        columns = [
-            format_sizes([get(r) for r in self.remedies]) for get in (attrgetter("slip"), attrgetter("later"))
-        ]
+        columns = [format_sizes([getattr(r, name) for r in self.remedies]) for name in ("slip", "later")]
         rows = [
             [r.setting, *(text.replace(NONE, "no contact") for text in texts)]
             for r, *texts in zip(self.remedies, *columns, strict=True)
@@ -202,9 +203,8 @@ class SlipExplanation:
                 is_braked = self.variants[-1].speeds[i] < before
                 lines.append(SLIDING_STATES[not is_braked])
         if self.friction_use is not None:
-            lines.append(
-                f"Its friction force is {100.0 * self.friction_use[i]:.0f} % of mu times the normal force."
-            )
+            use = f"{100.0 * self.friction_use[i]:.0f} % of mu times the normal force"
+            lines.append(f"In the engine's answer its friction force is {use}.")
         return lines + [
             f"Variant {v.name!r}: {v.note}."
             for v in self.variants
@@ -224,10 +224,8 @@ class SlipExplanation:
         if not helpful:
             return [f"None of these settings reduces the slip {time} by more than 10 %."]
         head = f"Settings that help (mean slip {time}, {format_size(before)} m/s as it is):"
-        return [
-            head,
-            *(f"  {r.setting}: {format_size(get_slip(r))} m/s" for r in sorted(helpful, key=get_slip)),
-        ]
+        helpful.sort(key=get_slip)
+        return [head, *(f"  {r.setting}: {format_size(get_slip(r))} m/s" for r in helpful)]
 
 
 def explain_slip(
@@ -310,13 +308,8 @@ def explain_slip(
 
     start = solve_and_add_variant("solved", problem, answer)
     own_disk = measured if disk is not None else _as_disk(problem)
-    is_same_shape = own_disk is problem
-    start = solve_and_add_variant(
-        "disk",
-        own_disk,
-        start if own_disk.m == problem.m else None,
-        "cones are round" if is_same_shape else "",
-    )
+    same = start if own_disk.m == problem.m else None
+    start = solve_and_add_variant("disk", own_disk, same, "cones are round" if own_disk is problem else "")
     hard, has_soft_friction = _replace_soft_friction(own_disk, surface)
     start = solve_and_add_variant("hard", hard, start, "" if has_soft_friction else "friction rows are hard")
     law_note = "the law is Coulomb's" if hard.friction == "coulomb" else (
@@ -357,16 +350,14 @@ def _choose_contacts(problem: Problem, contacts: Any) -> list[int]:
             if not fitting:
                 known = ", ".join(problem.block_name(k) for k in sliding[:8])
                 raise InputError(
-                    f"contacts names {entry!r}, but no contact's name contains it; the contacts are {known}"
+                    f"contacts names {entry!r}, but no contact's name contains it; they are {known}"
                 )
             chosen += fitting
         elif entry in sliding:
             chosen.append(int(entry))
         else:
-            raise InputError(
-                f"contacts names {entry!r}, which is not a contact with tangents; give one of the blocks "
-                f"{sliding[:20]}"
-            )
+            known = f"give one of the blocks {sliding[:20]}"
+            raise InputError(f"contacts names {entry!r}, which is not a contact with tangents; {known}")
     return list(dict.fromkeys(chosen))
 
 

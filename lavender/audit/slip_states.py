@@ -72,7 +72,7 @@ def explain_slip_of_states(
     vectors = [None] if states is None else list(read_states(mj, model, states).vectors)
     explanations: list[SlipExplanation] = []
     starts = []  # State vector of each explanation.
-    for vector in vectors:
+    for i, vector in enumerate(vectors):
         mj.mj_resetData(model, data)
         if vector is not None:
             mj.mj_setState(model, data, vector, mj.mjtState.mjSTATE_INTEGRATION)
@@ -86,18 +86,17 @@ def explain_slip_of_states(
         names = [measured.block_name(k) for k in blocks]
         touching = [entry for entry in entries if any(entry in name for name in names)]
         if touching or (names and not entries):
+            answer = adapter.impulse(model, data)
             explanation = explain_slip(
-                problem,
-                adapter.impulse(model, data),
-                contacts=touching or None,
-                disk=disk,
-                surface_velocity=surface,
+                problem, answer, contacts=touching or None, disk=disk, surface_velocity=surface
             )
             chosen = [blocks[names.index(name)] for name in explanation.contacts]
             slips = compute_slip(measured, chosen, data.qvel, surface)
             use = [_compute_friction_use(mj, model, data, name) for name in explanation.contacts]
             speeds = np.array([np.linalg.norm(v) for v in slips])
-            explanations.append(replace(explanation, speeds_before=speeds, friction_use=np.array(use)))
+            explanations.append(
+                replace(explanation, speeds_before=speeds, friction_use=np.array(use), state=i)
+            )
             starts.append(before.copy())
     fastest = max(range(len(explanations)), key=lambda k: _find_fastest(explanations[k])[0], default=-1)
     if fastest >= 0 and _find_fastest(explanations[fastest])[0] > MIN_EXPLAINED_SLIP:
@@ -107,9 +106,7 @@ def explain_slip_of_states(
         ]
         chosen_starts = [starts[k] for _, k in sorted(sliding, reverse=True)[:MAX_REMEDY_STATES]]
         remedies = tuple(
-            Remedy(
-                text, *np.mean([_simulate_slip(mj, changed, start, pair) for start in chosen_starts], axis=0)
-            )
+            Remedy(text, *np.mean([_simulate_slip(mj, changed, x, pair) for x in chosen_starts], axis=0))
             for text, changed in _change_settings(mj, model, pair)
         )
         explanations[fastest] = replace(explanations[fastest], remedies=remedies, n_states=len(chosen_starts))
@@ -169,7 +166,7 @@ def _change_settings(mj: Any, model: Any, geoms: str) -> Iterator[tuple[str, Any
         changed = copy.deepcopy(model)
         for solref in (changed.geom_solref, changed.pair_solref):
             solref[solref[:, 0] > shortest] = shortest, 1.0
-        yield f'<geom solref="{shortest:g} 1"/>', changed
+        yield f'solref="{shortest:g} 1" of all geoms', changed
 
     numbers = [mj.mj_name2id(model, mj.mjtObj.mjOBJ_GEOM, name) for name in geoms.split(", ")]
     if len(numbers) == 2 and min(numbers) >= 0:

@@ -55,11 +55,11 @@ class UnknownName(LavenderError, KeyError):
         known = sorted(set(known))
         by_lower_case = {word.lower(): word for word in reversed(known)}
         lower_case = str(name).lower()
-        matches = difflib.get_close_matches(lower_case, by_lower_case, n=3, cutoff=0.5)
+        matches = difflib.get_close_matches(lower_case, by_lower_case, n=3, cutoff=0.6)
         matches = [lower_case] if lower_case in by_lower_case else matches
         similar = [by_lower_case[match] for match in matches]
         hint = f"known: {', '.join(known) or 'none'}"
-        if similar:
+        if similar and isinstance(name, str):
             hint = f"did you mean {' or '.join(map(repr, similar))}?"
         noun, of, owner = kind.partition(" of ")
         self.message = f"unknown {noun} {name!r}{of}{owner}; {hint}"

@@ -157,5 +157,5 @@ def _describe_distances(item: Item, comparison: CrossCheck) -> str | None:
         if row.solution is not None:
             found = row.solution.impulse if unique else row.solution.slack
             distances.append(f"{row.solver} {format_residual(np.abs(found - exact).max())}")
-    what = "impulses [N s]" if unique else "slacks [m/s]"
-    return f"distance of the {what} from the exact solution ({reference.source}): {', '.join(distances)}"
+    quantity = "impulses [N s]" if unique else "slacks [m/s]"
+    return f"distance of the {quantity} from the exact solution ({reference.source}): {', '.join(distances)}"

@@ -68,7 +68,7 @@ def slip(model: Path, states: str | None, steps: int, contacts: tuple[str, ...],
     )
     worst = max(range(n), key=lambda k: explanations[k].variants[0].speeds.max(initial=0.0))
     if n > 1:
-        print_escaped(f"\nState {worst + 1} of these has the fastest contact:")
+        print_escaped(f"\nState {explanations[worst].state} (counted from 0) has the fastest contact:")
     print_escaped("\n".join(explanations[worst].sentences))
     if explanations[worst].remedies:
         print_escaped(

@@ -110,7 +110,7 @@ def require_problems_are_solved(spec: SolverSpec, problem: Problem) -> str:
 
 @check("all solvers", lambda spec: True, count=1)
 def require_options_match_the_spec(spec: SolverSpec, problem: Problem) -> str:
-    """Require that the factory accepts the options of the spec, and that other options raise an error."""
+    """Require that the factory accepts the options of the spec, and other options raise an error."""
     wrong = sorted(set(inspect.signature(spec.load()).parameters) ^ spec.accepts)
     if wrong:
         return f"the options {', '.join(wrong)} are in the spec or in the factory, not in both"

@@ -402,11 +402,12 @@ def _make_block_names(
     i = 0
     while i < m:
         row_type, which = types[i], ids[i]
-        size, has_edges = 1, False
+        size, has_edges, part = 1, False, "edge"
         if row_type == kinds.mjCNSTR_EQUALITY:
             while i + size < m and types[i + size] == row_type and ids[i + size] == which:
                 size += 1
             name, has_edges = get_name("equality", which), size > joined
+            part = "edge" if size > mujoco_rows.MAX_EQUALITY_ROWS else "axis"  # of a flex, or of a weld
         elif row_type == kinds.mjCNSTR_FRICTION_DOF:
             joint = int(model.dof_jntid[which])
             axis = which - int(model.jnt_dofadr[joint])
@@ -425,6 +426,6 @@ def _make_block_names(
             )
             if row_type != kinds.mjCNSTR_CONTACT_FRICTIONLESS:
                 size = 2 * (int(dim[which]) - 1) if has_edges else int(dim[which])
-        names += [f"{name}, edge {edge}" for edge in range(size)] if has_edges else [name]
+        names += [f"{name}, {part} {k}" for k in range(size)] if has_edges else [name]
         i += size
     return names

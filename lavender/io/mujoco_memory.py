@@ -1,4 +1,4 @@
-"""Find the members of MuJoCo's C structs that `lavender_ext.io.mujoco_step` reads, and keep what does not change."""
+"""Find the members of MuJoCo's C structs that `lavender_ext.io.mujoco_step` reads, and keep constant data."""
 
 from __future__ import annotations
 

@@ -431,11 +431,10 @@ def extract_lower_triangle(
     )
     if asymmetry > max_asymmetry:
         entries: Any = sp.csr_array(array) if sparse else array
-        index = f"({i}, {j})" if names is None else f"({names[i]}, {names[j]})"
-        above, below = float(entries[i, j]), float(entries[j, i])
+        row, column = (i, j) if names is None else (names[i], names[j])
+        at, mirrored = float(entries[i, j]), float(entries[j, i])
         raise InputError(
-            f"{name} is not symmetric: at {index} it is {above} above and {below} below the diagonal, or the other way "
-            f"round; {hint}"
+            f"{name} is not symmetric: it is {at} at ({row}, {column}) and {mirrored} at ({column}, {row}); {hint}"
         )
     return lower
 

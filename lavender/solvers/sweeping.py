@@ -159,7 +159,7 @@ class Sweeping(SweepSolver):
         return SweepState(problem, problem.csr_data, order)
 
 
-# Capabilities that sweeps share; the specs of the solvers replace what differs.
+# Capabilities that sweeps share; the specs of the solvers replace fields.
 SWEEPS = SolverSpec(
     name="sweeps",
     factory=Sweeping,

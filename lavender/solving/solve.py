@@ -85,7 +85,7 @@ def solve(
     CapabilityError
         The solver does not accept this problem or option; the message says why.
     InputError
-        `impulse`, `tol`, `velocity_tol`, `max_iter` or `time_limit` is not valid; `tol` and `velocity_tol` are given.
+        `impulse`, `tol`, `velocity_tol`, `max_iter` or `time_limit` is not valid; `velocity_tol` and another `tol`.
     """
     begun = 0.0 if time_limit is None else perf_counter()
     if type(problem) is not Problem:  # Check this first, because a frequent error is to pass A and b.

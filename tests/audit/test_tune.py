@@ -68,7 +68,13 @@ def test_a_line_means_in_a_model_what_was_measured(options):
 
 
 def measured(time, error, **options):
-    return Measured(Setting(tuple(options.items())), "Newton", np.full(100, error), np.zeros(10), np.full(3, time))
+    return Measured(
+        Setting(tuple(options.items()), iterations=options.get("iterations", 0)),
+        "Newton",
+        np.full(100, error),
+        np.zeros(10),
+        np.full(3, time),
+    )
 
 
 def chosen(*some, held=(), threshold=1e-6):
@@ -97,6 +103,17 @@ def test_what_is_chosen():
     assert found.faster is quick and found.closer is exact
     assert found.pareto_front == [loose, quick, exact, slow]
     assert '<option iterations="9"/>' in found.lines[0]
+
+
+def test_of_equally_fast_settings_the_largest_iteration_limit_is_recommended():
+    now, few, many, slow = (
+        measured(10.0, 1e-3, iterations=15), measured(7.0, 3e-16, iterations=3),
+        measured(7.2, 4e-16, iterations=10), measured(8.0, 1e-17, iterations=99),
+    )  # fmt: skip
+    found = chosen(now, few, many, slow)
+    assert found.faster is many and found.closer is None
+    assert "not needed, 4.0e-16 m/s is within 1e-06" in found.lines[-1]
+    assert chosen(now, few, measured(7.2, 2e-6, iterations=10)).faster is few
 
 
 def test_a_smaller_worst_error_does_not_hide_a_larger_median():

@@ -98,23 +98,45 @@ class Tuning:
 
     @cached_property
     def faster(self) -> Measured | None:
-        """Fastest setting that is accurate enough and faster than the present setting; None if there is none."""
-        now = self.present_result
+        """Fastest setting that is accurate enough and faster than the present setting; None if there is none.
+
+        Of settings that take the same time within noise, the one with the smallest error above the threshold is
+        returned, and of these the one with the largest iteration limit: a limit that no step reaches takes no time.
+        """
+        now, threshold = self.present_result, self.threshold
         good = [
             m
             for m in self._same_problem
-            if m.worst_error <= max(now.worst_error, self.threshold) and self._is_accurate_enough(m)
+            if m.worst_error <= max(now.worst_error, threshold)
+            and m.mean_step_time < (1.0 - TIME_NOISE_FRACTION) * now.mean_step_time
+            and self._is_accurate_enough(m)
         ]
-        best = min(good, key=lambda m: m.mean_step_time)
-        return best if best.mean_step_time < (1.0 - TIME_NOISE_FRACTION) * now.mean_step_time else None
+        return min(
+            self._list_ties(good),
+            key=lambda m: (
+                max(self._compute_largest_error(m), threshold),
+                -m.setting.iterations,
+                m.mean_step_time,
+            ),
+            default=None,
+        )
+
+    @staticmethod
+    def _list_ties(settings: list[Measured]) -> list[Measured]:
+        """List the settings whose time equals that of the fastest within noise."""
+        fastest = min((m.mean_step_time for m in settings), default=0.0)
+        return [m for m in settings if (1.0 - TIME_NOISE_FRACTION) * m.mean_step_time <= fastest]
 
     @cached_property
     def closer(self) -> Measured | None:
         """Most accurate setting that is as fast as the present one.
 
-        None if no such setting is more accurate, or if the present error is within the threshold.
+        None if no such setting is more accurate, or if the error of the present or of the faster setting is within
+        the threshold.
         """
         now = self.present_result
+        if self.faster is not None and self.faster.worst_error <= self.threshold:
+            return None
         good = [
             m
             for m in self._same_problem
@@ -139,8 +161,7 @@ class Tuning:
             return None
         now = self.present_result
         good = [m for m in self._same_problem if self._compute_largest_error(m) <= self.error_limit]
-        fastest = min((m.mean_step_time for m in good), default=0.0)
-        ties = [m for m in good if (1.0 - TIME_NOISE_FRACTION) * m.mean_step_time <= fastest]
+        ties = self._list_ties(good)
         return (
             now if any(m is now for m in ties) else min(ties, key=self._compute_largest_error, default=None)
         )
@@ -194,10 +215,12 @@ class Tuning:
         if self.reason_without_line:
             return []
         none = f"none of {len(self._same_problem)} settings"
-        enough = (
-            f"not needed, {format_size(self.present_result.worst_error)} m/s is within {self.threshold:g}"
+        small = min(m.worst_error for m in (self.present_result, self.faster) if m is not None)
+        closer = (
+            f"not needed, {format_size(small)} m/s is within {self.threshold:g}"
+            if small <= self.threshold
+            else none
         )
-        closer = enough if self.present_result.worst_error <= self.threshold else none
         lines = self._format_limit_choice()
         for description, m, reason, gains, max_ratio in (
             ("as accurate as now, faster", self.faster, none, "mean_step_time", 1.0 - TIME_NOISE_FRACTION),
@@ -224,9 +247,8 @@ class Tuning:
         goal, m = f"error at most {self.error_limit:g} m/s", self.limit_choice
         lines = []
         if self.within_limit is None:
-            lines = [
-                f"{self._provisional_prefix}{goal}: none of {len(self._same_problem)} settings; the most accurate is"
-            ]
+            count = f"none of {len(self._same_problem)} settings"
+            lines = [f"{self._provisional_prefix}{goal}: {count}; the most accurate is"]
         description = f"{goal}, fastest" if self.within_limit else "most accurate"
         return lines + self._format_choice(m, description, _format_with_largest_error(m, self.present_result))
 
@@ -273,14 +295,8 @@ class Tuning:
             ]
             for m in settings
         ]  # fmt: skip
-        heads = [
-            "setting",
-            "a step",
-            "relative time",
-            "error 99 % [m/s]",
-            "worst",
-            f"motion after {self.horizon} [m]",
-        ]
+        motion = f"motion after {self.horizon} [m]"
+        heads = ["setting", "a step", "relative time", "error 99 % [m/s]", "worst", motion]
         return Table(heads, rows, words=frozenset({"setting"}))
 
     @property
@@ -343,12 +359,9 @@ class Tuning:
             f"have errors above {format_size(now.worst_error)} m/s."
         )
         if self.closer is not None:
-            gain = (
-                format_ratio(now.worst_error / self.closer.worst_error)
-                if self.closer.worst_error
-                else "exact:"
-            )
-            head += f" In the same time the error can be {gain} less on these states."
+            error = self.closer.worst_error
+            gain = f"{format_ratio(now.worst_error / error)} less" if error else "exactly 0"
+            head += f" In the same time the error can be {gain} on these states."
         if self.reason_without_line:
             head += f" {self.reason_without_line}"
         other = [m for m in self.measured if m.setting.changes_problem]
