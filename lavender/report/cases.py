@@ -390,7 +390,7 @@ def _make_names_differ(items: list[Item]) -> list[Item]:
         if item.in_memory is None and not item.sequence and is_path(item.source):
             files.setdefault(make_file_name(item.name).lower(), []).append(item)
     for same in files.values():
-        folders = [Path(item.source).resolve().parent.parts for item in same]
+        folders = [Path(item.source).parent.resolve().parts for item in same]
         first, last = min(folders), max(folders)
         n = next((i for i, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), len(first))
         for item, parts in zip(same, folders, strict=True):
