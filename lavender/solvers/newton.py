@@ -17,11 +17,12 @@
    that changes fastest (Rheinboldt 1986), through folds at which contacts change from stick to slip.
 
 Problems in generalised coordinates are first solved over their velocities (`newton_systems/general.py`), without
-forming A. Methods 1 to 4 over the rows of A are used instead if they are estimated to cost less than a tenth (few rows
-of a soft body), and afterwards if the method over velocities fails, unless form="velocity". If the velocities belong
-to free rigid bodies and every block couples at most two of these, methods 1 to 4 run over the bodies and not over A;
-under Coulomb's law, and if many contacts are rigid, they then replace the method over velocities
-(`SmallCall.cost_limit`).
+forming A. Under Coulomb's law, this kernel runs method 4 over a dense A, unless rows far outnumber velocities, and a
+sparse A is formed if its factor is estimated to cost less. Methods 1 to 4 over the rows of A are also used if they are
+estimated to cost less than a tenth (few rows of a soft body), and afterwards if the method over velocities fails,
+unless form="velocity". If the velocities belong to free rigid bodies and every block couples at most two of these,
+methods 1 to 4 run over the bodies and not over A; under Coulomb's law, and if many contacts are rigid, they then
+replace the method over velocities (`SmallCall.cost_limit`).
 
 Methods 1 to 4 are compiled and run one factorisation at a time; `lavender_ext/newton/plan.pxd` has the table of their
 states. Between factorisations, Python checks the clock, Ctrl-C and certificates. `newton_systems/` builds the linear
@@ -71,6 +72,7 @@ FORMS = ("auto", "velocity", "impulse")
 VELOCITY_MAX_COST_RATIO = 10.0
 # If the velocity form fails, A is formed and the row form continues if A has up to this many rows.
 MAX_FORMED_ROWS = 3000
+SPARSE_WORK_RATIO = 4.0  # Time of a multiply-add of a sparse factor as a multiple of one of a dense factor.
 INTERRUPT_CHECK_INTERVAL = 0.05  # Longest estimated time [s] between two checks for Ctrl-C.
 STAGE_TIME_FRACTION = 0.5  # A single stage may use at most this fraction of the remaining time.
 # Texts of each count of the kernel: "1 exchange" and " exchanges".
@@ -150,7 +152,10 @@ class Newton(Solver):
         """Estimate the cost of `prepare` [ns]."""
         if self.form != "impulse":
             if problem.generalized is not None:
-                return estimate_elimination_cost(problem, "velocity elimination")
+                rows = 0.0
+                if self.form == "auto" and _has_sparse_coulomb_rows(problem):
+                    rows = estimate_matrix_setup_cost(problem) + estimate_analysis_cost(problem)
+                return rows + estimate_elimination_cost(problem, "velocity elimination")
             if problem.rows is not None and problem.rows.n_bodies > 0:
                 return estimate_elimination_cost(problem, "body elimination")
         is_sparse = not uses_dense_rows(problem.max_entries, problem.m, problem.law == "cone")
@@ -201,6 +206,8 @@ class Newton(Solver):
             kernel = general.prepare_islands(
                 problem, (max_cost - fixed) / (estimate_velocity_newton_cost(problem, 1.0) - fixed)
             )
+            if kernel is not None and self.form == "auto" and _is_sparse_matrix_faster(problem, kernel.work):
+                kernel = None
         if self.form != "impulse" and (kernel is None or NEWTON.cost_limit(problem, kernel) == 0.0):
             bodies = find_bodies(problem)  # Interior points over bodies are faster here than the driver.
         if bodies is None and kernel is not None:
@@ -366,6 +373,25 @@ def _estimate_full_matrix_cost(problem: Problem) -> float:
         return inf
     form = estimate_formation_cost(problem, False)
     return estimate_newton_cost(Count("dense", count_dense_work(problem.m), m * m, m, form), problem)
+
+
+def _has_sparse_coulomb_rows(problem: Problem) -> bool:
+    """Return whether J and M under Coulomb's law have a sparse A, on which Newton's method may run."""
+    entries = float(problem.metric.entries_of_matrix)
+    is_supported = problem.law == "coulomb" and not problem.cones.has_round
+    return is_supported and not uses_dense_rows(entries, float(problem.m), False)
+
+
+def _is_sparse_matrix_faster(problem: Problem, work: float) -> bool:
+    """Return whether a factor of a sparse A of J and M takes less than `work` multiply-adds, under Coulomb's law.
+
+    Over rows, Coulomb's law takes a third to a tenth of the steps over velocities. The factor of A without fill takes
+    entries^2 / (3 m) multiply-adds, each `SPARSE_WORK_RATIO` times as long as in a dense factor.
+    """
+    if not _has_sparse_coulomb_rows(problem):
+        return False
+    entries = float(problem.metric.entries_of_matrix)
+    return SPARSE_WORK_RATIO * entries**2 / (3.0 * problem.m) <= work
 
 
 def _run_stages(

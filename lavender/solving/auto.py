@@ -3,9 +3,10 @@
     start            if the start is a solution, nothing runs
     compiled call    one call for small problems, for small islands with friction, and for J and M if Newton's method
                      is estimated to cost no more than the first sweeps (`small.py`); attempted once
-    large problems   under Coulomb's law, from `relaxed_rows` rows on, four stages come first. They solve the convex
-                     relaxation, which has the same solution if no contact slips, and judge each iterate under Coulomb's
-                     law. After each stage, only the islands that it has not solved continue
+    large problems   under Coulomb's law, from `relaxed_rows` rows on, four stages come first (of J and M, if the
+                     velocities belong to free bodies). They solve the convex relaxation, which has the same
+                     solution if no contact slips, and judge each iterate under Coulomb's law. After each stage, only
+                     the islands that it has not solved continue
                      1. `anderson`, which sweeps under the cone law until contacts slip, while it predicts fewer sweeps
                         than the lower bound of the cost of Newton's method pays for
                      2. more sweeps, after an analysis of Newton's matrix: at least `sweep_fraction` of its cost, then
@@ -72,6 +73,7 @@ from lavender.solvers.decisions import DECISIONS, describe_numbers
 from lavender.solvers.direct import SufficientDirect
 from lavender.solvers.islands import get_rows_of_blocks, restrict_to_blocks
 from lavender.solvers.newton import NewtonState
+from lavender.solvers.newton_systems.systems import find_bodies
 from lavender.solvers.registry import Solver, SolverSpec, get
 from lavender.solvers.small import AUTO, NO_TIME_MESSAGE
 from lavender.solving.compiled_call import get_call_time_fraction
@@ -146,9 +148,15 @@ def estimate_cost(name: str, problem: Problem) -> Cost:
 
 
 def starts_relaxed(problem: Problem) -> bool:
-    """Return whether `auto` solves the convex relaxation first: under Coulomb's law, if the problem is large."""
+    """Return whether `auto` solves the convex relaxation first: under Coulomb's law, if the problem is large.
+
+    Of J and M, this requires that the velocities belong to free bodies. Over the rows of a sparse A, Newton's method on
+    Coulomb's law takes fewer steps than on the relaxation.
+    """
     large = problem.law == "coulomb" and problem.m >= DECISIONS.relaxed_rows
-    return large and not problem.cones.has_round and problem.is_symmetric
+    if not large or problem.cones.has_round or not problem.is_symmetric:
+        return False
+    return problem.generalized is None or find_bodies(problem) is not None
 
 
 class Step:

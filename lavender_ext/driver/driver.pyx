@@ -8,6 +8,7 @@ from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport NEWTON
 from lavender_ext.factor.factors cimport has_wide
 from lavender_ext.velocity_newton.method cimport islands_workspace_size, start_islands, advance_islands
+from lavender_ext.newton.rows cimport are_generalized_rows_faster
 from lavender_ext.newton.solve cimport (bodies_workspace_size, start_newton_over_bodies, rows_workspace_size,
                                         start_newton_over_rows, step_newton_system)
 from lavender_ext.velocity_newton.soft cimport needs_no_proximal_terms
@@ -15,7 +16,7 @@ from lavender_ext.velocity_newton.soft cimport needs_no_proximal_terms
 
 cdef inline method_t find_method_functions(const view_t* v) noexcept nogil:
     """Return the functions of the method for the form of the problem."""
-    if v.g != NULL:
+    if v.g != NULL and not are_generalized_rows_faster(v):
         return method_t(islands_workspace_size, start_islands, advance_islands)
     if v.r != NULL:
         return method_t(bodies_workspace_size, start_newton_over_bodies, step_newton_system)

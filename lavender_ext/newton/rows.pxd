@@ -1,19 +1,22 @@
 """The operator H over the rows of A, dense or in compressed rows (`coupled.pxd`): choice of the form, memory, values.
 
-`analyse_row_system` needs the elements and the pattern of A, `form_row_system` its values. Factors of a sparse matrix without
-symmetry may lose pivots, and hosts without another factorisation then use a dense H (`start_newton_over_rows`).
+`analyse_row_system` needs the elements and the pattern of A, `form_row_system` its values, and `form_generalized_matrix`
+forms a dense H from J and M instead. Factors of a sparse matrix without symmetry may lose pivots, and hosts without another
+factorisation then use a dense H (`start_newton_over_rows`).
 """
 from libc.stdint cimport int32_t, int64_t
+from libc.string cimport memset
 
 from lavender_ext.core.arena cimport arena_t, take_doubles, take_integers
-from lavender_ext.core.block_types cimport CONE
-from lavender_ext.core.view cimport csr_t
+from lavender_ext.core.block_types cimport CONE, COULOMB, has_friction
+from lavender_ext.core.view cimport csr_t, generalized_t, view_t
 from lavender_ext.factor.linear cimport NO_FACTOR, analyse_dense, analyse_rows, bind_rows_values
+from lavender_ext.factor.tiles cimport combine_rows
 from lavender_ext.newton.coupled cimport (copy_coupled_entries, coupled_t, list_coupled_rows, list_neighbours, merge_graphs,
                                           transpose_graph)
 from lavender_ext.newton.elements cimport elements_t
 from lavender_ext.newton.run cimport newton_t
-from lavender_ext.newton.scaling cimport form_scaled_matrix, scaled_t
+from lavender_ext.newton.scaling cimport form_scaled_matrix, is_problem_supported, scaled_t
 from lavender_ext.newton.system cimport DENSE, SPARSE
 
 
@@ -160,3 +163,67 @@ cdef inline void form_row_system(newton_t* n, const csr_t* a, int32_t wide) noex
     n.linear.rows.factor.wide, n.linear.tiny, n.linear.shift = wide, pivot_tolerance(), 0.0
     list_unfixed_entries(&n.sc, n.problem.p.n_rows, a, n.linear.swap, &n.s.a)
     n.s.symmetric = copy_coupled_entries(&n.s.coupled, n.sc.e.m, &n.s.a, n.linear.swap)
+
+
+# -- J and M -----------------------------------------------------------------------------------------------------------
+
+
+cdef inline double velocity_steps_per_row_step() noexcept nogil:
+    """Return the work over rows [multiply-adds] up to which it replaces one multiply-add of a step over velocities.
+
+    Under Coulomb's law, steps over velocities (`velocity_newton`) are 3 to 10 times as many. On random problems of 3 to 900
+    rows, steps over rows take less time up to a ratio of 3, and more time from 4 on.
+    """
+    return 3.0
+
+
+cdef inline bint are_generalized_rows_faster(const view_t* v) noexcept nogil:
+    """Return whether J and M are solved over a dense H: under Coulomb's law, unless rows far outnumber velocities.
+
+    A step over velocities forms K^T V K from its panels and factors one matrix for each island, here of equal sizes.
+    """
+    cdef const generalized_t* g = v.g
+    cdef double m = v.p.n_rows, n = g.n, islands = 1 if v.p.islands == NULL else v.p.islands.n, work, nc
+    cdef int32_t b
+    if v.p.law != COULOMB or m * (m + n) > 1e9 or not has_friction(&v.p) or not is_problem_supported(&v.p):
+        return False
+    work = n * n * n / (3.0 * islands * islands)
+    for b in range(g.n_panels):
+        nc = g.pcol[b + 1] - g.pcol[b]
+        work += (g.prow[b + 1] - g.prow[b]) * nc * nc
+    return m * m * m / 3.0 <= velocity_steps_per_row_step() * work
+
+
+cdef inline void form_generalized_matrix(newton_t* n, int32_t wide, double* transpose, int32_t* at) noexcept nogil:
+    """Form a dense H with its compliance from Y = J L^-T of M = L D L^T; up to three doubles after H are lost.
+
+    transpose (nv, m + 4) and at (nv) are scratch. The rows of Y D^-1/2 are multiplied by the columns of its transpose.
+    """
+    cdef const scaled_t* s = &n.sc
+    cdef const generalized_t* g = n.problem.g
+    cdef int32_t b, i, j, c, nc, _pass, m = s.e.m, rows = (m + 3) & ~3
+    cdef const double* y
+    cdef double* h = <double*>n.s.h
+    cdef double* line = transpose + <int64_t>g.n * rows
+    analyse_dense(&n.linear, m)
+    n.s.symmetric, n.linear.wide, n.linear.factored = 1, wide, NO_FACTOR
+    memset(transpose, 0, <int64_t>g.n * rows * sizeof(double))
+    for _pass in range(2):
+        for i in range(s.e.n):
+            b = g.home[s.block[i]]
+            nc = g.pcol[b + 1] - g.pcol[b]
+            for c in range(nc):
+                at[c] = g.cols[g.pcol[b] + c] * rows
+            for j in range(s.e.ptr[i], s.e.ptr[i + 1]):
+                y = g.y + g.pval[b] + <int64_t>(s.keep[j] - g.prow[b]) * nc
+                for c in range(nc):
+                    line[c] = y[c] * s.scale[j]
+                    if _pass == 0:
+                        transpose[at[c] + j] = line[c]
+                if _pass == 1:
+                    combine_rows(wide, rows, nc, transpose, at, line, h + <int64_t>j * m)
+    for i in range(m):
+        for j in range(i):
+            h[<int64_t>j * m + i] = h[<int64_t>i * m + j]
+        h[<int64_t>i * (m + 1)] += s.e.theta[i]
+    memset(<double*>s.e.theta, 0, m * sizeof(double))

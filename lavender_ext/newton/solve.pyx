@@ -33,8 +33,8 @@ from lavender_ext.newton.path cimport path_compliance
 from lavender_ext.newton.plan cimport start_newton_solve, step_newton_solve
 from lavender_ext.newton.run cimport (N_COUNTED, bind_indices, bind_values, convex_residual, newton_t, scale_problem,
                                       set_problem, set_reference, write_certificate, write_impulse)
-from lavender_ext.newton.rows cimport (ANY_FORM, MAX_ALWAYS_DENSE_ROWS, analyse_row_system, bind_row_values, form_row_system,
-                                       has_dense_rows, is_dense_faster)
+from lavender_ext.newton.rows cimport (ANY_FORM, MAX_ALWAYS_DENSE_ROWS, analyse_row_system, bind_row_values, form_generalized_matrix,
+                                       form_row_system, has_dense_rows, is_dense_faster)
 from lavender_ext.newton.scaling cimport index_unfixed_elements, is_problem_supported
 from lavender_ext.newton.steps cimport (begin_interior_point, form_de_saxce_matrices, take_interior_point_step,
                                         multiply_cone_duals, compute_all_normal_shifts)
@@ -117,24 +117,35 @@ cdef int32_t step_newton_system(const view_t* v, const options_t* o, const works
     return how
 
 
+cdef inline void bind_row_indices(newton_t* n, const view_t* v, arena_t* a) noexcept nogil:
+    """Take the state, the integers of `form_generalized_matrix` after it, and those of the elements."""
+    set_problem(n, &v.p, v.a, NULL, v.g)
+    take_integers(a, head())
+    take_integers(a, 0 if v.g == NULL else v.g.n)
+    bind_indices(n, a)
+
+
 cdef int32_t rows_workspace_size(const view_t* v, const options_t* o, workspace_t* r) noexcept nogil:
-    """Write the workspace of a dense A in the largest case; of a sparse A estimate the integers, and `start` finds the rest."""
+    """Write the workspace of a dense A in the largest case; of a sparse A estimate the integers, and `start` finds the rest.
+
+    Of J and M, write the integers.
+    """
     cdef newton_t n
-    cdef int64_t m = v.p.n_rows, entries = v.a.indptr[m]
+    cdef int64_t m = v.p.n_rows
     cdef arena_t a = make_arena(NULL, NULL)
-    set_problem(&n, &v.p, v.a, NULL, NULL)
-    take_integers(&a, head())
-    bind_indices(&n, &a)
-    if m <= MAX_ALWAYS_DENSE_ROWS:
+    bind_row_indices(&n, v, &a)
+    if v.g != NULL:
+        pass
+    elif m <= MAX_ALWAYS_DENSE_ROWS:
         bind_values(&n, 6 * m, False, &a)               # No row is fixed, and all contacts have six rows with friction.
         bind_row_values(&n, m, True, &a)
-    elif not has_dense_rows(entries, m, v.p.law == CONE):
-        take_integers(&a, 60 * m + 11 * entries)
+    elif not has_dense_rows(v.a.indptr[m], m, v.p.law == CONE):
+        take_integers(&a, 60 * m + 11 * v.a.indptr[m])
     r.n_index, r.n_real = a.n_index, a.n_real
     return is_problem_supported(&v.p)
 
 
-cdef inline int32_t analyse_rows_in_workspace(newton_t* n, const view_t* v, workspace_t* r) noexcept nogil:
+cdef inline int32_t analyse_rows_in_workspace(newton_t* n, const view_t* v, const options_t* o, workspace_t* r) noexcept nogil:
     """Find the elements, choose the form of A and analyse a sparse one; return MORE, NEEDS_WORKSPACE or UNFIT."""
     cdef arena_t a = make_arena(NULL, r.index)
     cdef workspace_t need
@@ -144,36 +155,43 @@ cdef inline int32_t analyse_rows_in_workspace(newton_t* n, const view_t* v, work
     if not require_workspace(r, need.n_index, need.n_real):
         return NEEDS_WORKSPACE
     memset(n, 0, sizeof(newton_t))
-    set_problem(n, &v.p, v.a, NULL, NULL)
-    take_integers(&a, head())
-    bind_indices(n, &a)
+    bind_row_indices(n, v, &a)
     index_unfixed_elements(&n.sc, v)
-    if v.p.n_rows > MAX_ALWAYS_DENSE_ROWS and measure_asymmetry_and_bandwidth(v.a, v.p.d, v.p.n_rows, n.linear.swap, bands) > 1e-14:
+    if v.g != NULL:
+        form, n.linear.cost = DENSE, <double>n.sc.e.m * n.sc.e.m * n.sc.e.m / 3.0
+        r.islands = 1 if v.p.islands == NULL else v.p.islands.n
+    elif v.p.n_rows > MAX_ALWAYS_DENSE_ROWS and measure_asymmetry_and_bandwidth(v.a, v.p.d, v.p.n_rows, n.linear.swap, bands) > 1e-14:
         form = DENSE                                    # Factors of a sparse A without symmetry may lose pivots.
     outcome = analyse_row_system(n, v.a, form, r.n_index, &a)
     if outcome == 0:
         r.n_index = a.n_index + v.a.indptr[v.p.n_rows]
         return NEEDS_WORKSPACE
-    r.is_bound = outcome > 0
     r.work = n.linear.cost
+    r.is_bound = outcome > 0 and (v.g == NULL or <double>n.sc.e.m * n.sc.e.m <= o.most and not 0.0 < o.work < r.work)
     return MORE if r.is_bound else UNFIT
 
 
 cdef int32_t start_newton_over_rows(const view_t* v, const options_t* o, workspace_t* r, const double* lam) noexcept nogil:
     cdef newton_t* n = state_of(r)
     cdef arena_t counted = make_arena(NULL, NULL), a = make_arena(r.real, NULL)
-    cdef int32_t how = MORE if r.is_bound else analyse_rows_in_workspace(n, v, r)
+    cdef int32_t how = MORE if r.is_bound else analyse_rows_in_workspace(n, v, o, r)
+    cdef int64_t scratch
     if how != MORE:
         return how
-    set_problem(n, &v.p, v.a, NULL, NULL)
+    set_problem(n, &v.p, v.a, NULL, v.g)
+    scratch = 0 if v.g == NULL else <int64_t>v.g.n * (n.sc.e.m + 4)
     bind_values(n, n.sc.small, False, &counted)
     bind_row_values(n, n.sc.e.m, n.s.form == DENSE, &counted)
+    take_doubles(&counted, scratch)
     if not require_workspace(r, r.n_index, counted.n_real):
         return NEEDS_WORKSPACE
     bind_values(n, n.sc.small, True, &a)
     scale_problem(n, v)
     bind_row_values(n, n.sc.e.m, n.s.form == DENSE, &a)
-    form_row_system(n, v.a, o.wide)
+    if v.g != NULL:
+        form_generalized_matrix(n, o.wide, take_doubles(&a, scratch), r.index + head())
+    else:
+        form_row_system(n, v.a, o.wide)
     return begin(n, o, lam)
 
 

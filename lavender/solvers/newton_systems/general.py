@@ -34,6 +34,7 @@ MIN_TOLERANCE_RATIO = 1e-2
 MAX_MATRIX_ENTRIES = 9e6
 _STATUS = {
     OUTCOMES["reached"]: Status.CONVERGED,
+    OUTCOMES["floor"]: Status.ROUNDOFF_LIMIT,
     OUTCOMES["more"]: Status.MAX_ITERATIONS,
     OUTCOMES["stuck"]: Status.STALLED,
     OUTCOMES["broken"]: Status.NUMERICAL_ERROR,

@@ -8,7 +8,7 @@ import scipy.sparse as sp
 from ball_pile import Pile
 from calls import block_diagonal, dense_h, system_in
 from hypothesis import given
-from random_problems import FORMS, good, random_contact_problem, seeds
+from random_problems import FORMS, as_matrix, good, random_contact_problem, seeds
 from stacks import bricks
 
 import lavender as lv
@@ -259,3 +259,42 @@ def test_the_height_of_a_stack_at_rest_does_not_matter(law):
         assert solution.impulse[::rows] == pytest.approx(0.1 * np.arange(n, 0, -1), rel=1e-5)
         counts.append(solution.work["factorisations"])
     assert max(counts) <= 4
+
+
+# -- Coulomb's law of J and M ---------------------------------------------------------------------
+
+
+def draw_generalized_contacts(seed, nv, contacts, trees=1):
+    """Draw J and M of `trees` kinematic trees of nv velocities; a contact couples a tree and the next one."""
+    rng = np.random.default_rng(seed)
+    blocks = [np.cov(rng.normal(size=(nv, 3 * nv))) for _ in range(trees)]
+    jac = np.zeros((3 * contacts, trees * nv))
+    for k in range(contacts):
+        first = k % trees * nv
+        jac[3 * k : 3 * k + 3, first : first + 2 * nv] = rng.normal(size=jac[:3, first : first + 2 * nv].shape)
+    cones = lv.Cones.contacts(rng.uniform(0.1, 1.0, (contacts, 2)))
+    v_free = rng.normal(size=trees * nv)
+    return lv.Problem.from_jacobian(sp.csr_array(jac), blocks, v_free, cones=cones, compliance=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_newton_coulomb_jacobian_with_few_rows_equals_matrix(seed):
+    problem = draw_generalized_contacts(seed, 20, 6)
+    solution, expected = lv.solve(problem, "newton", tol=1e-10), lv.solve(as_matrix(problem), "newton", tol=1e-10)
+    assert solution.success and expected.success
+    assert "Coulomb rounds" not in solution.work
+    # Both run the same steps on the same matrix, up to rounding.
+    assert solution.work["factorisations"] == expected.work["factorisations"]
+    assert solution.impulse == pytest.approx(expected.impulse, rel=1e-8, abs=1e-8 * abs(expected.impulse).max())
+
+
+def test_newton_coulomb_jacobian_with_many_rows_steps_over_velocities():
+    solution = lv.solve(draw_generalized_contacts(0, 6, 40), "newton")
+    assert solution.success and solution.work["Coulomb rounds"] > 0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_newton_coulomb_jacobian_with_sparse_matrix_steps_over_rows(seed):
+    problem = draw_generalized_contacts(seed, 12, 150, trees=50)
+    solution = lv.solve(problem, "newton", tol=1e-9)
+    assert solution.success and "Coulomb rounds" not in solution.work
