@@ -120,8 +120,7 @@ cdef inline int32_t mix_anderson_iterates(const mixing_t* c, double* u, double m
 
 cdef inline void clear_mixing_memory(const mixing_t* c) noexcept nogil:
     """Forget all stored evaluations and differences."""
-    c.control[N_DIFFERENCES] = 0.0
-    c.control[HAS_PREVIOUS] = 0.0
+    c.control[N_DIFFERENCES] = c.control[HAS_PREVIOUS] = 0.0
 
 
 cdef inline int32_t store_evaluation(const mixing_t* c, int32_t mixed, double* v, const double* g) noexcept nogil:

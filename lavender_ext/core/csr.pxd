@@ -123,8 +123,7 @@ cdef inline double measure_asymmetry_and_bandwidth(const csr_t* a, const double*
     """
     cdef int32_t i, j, q
     cdef double x, gap = 0.0, big = 0.0, scaled = 0.0
-    band[0] = 0
-    band[1] = 0
+    band[0] = band[1] = 0
     for i in range(n):
         cursor[i] = a.indptr[i]
     for i in range(n):

@@ -146,8 +146,7 @@ cdef public int32_t lav_color_blocks_by_matrix(int32_t n_blocks, const int32_t* 
     """
     cdef int32_t i, j, q, c, top = 0
     for i in range(n_blocks):
-        color[i] = -1
-        mark[i] = -1
+        color[i] = mark[i] = -1
     mark[n_blocks] = -1
     for i in range(n_blocks):
         for j in range(block_ptr[i], block_ptr[i + 1]):

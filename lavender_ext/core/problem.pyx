@@ -62,8 +62,7 @@ cdef public int32_t lav_compute_csr_diagonal(const blocks_t* p, const csr_t* a, 
     cdef double eigenvalue[MAX_FRICTION_COMPONENTS]
     cdef friction_components_t part
     for i in range(p.n_rows):
-        diag = 0.0
-        big = 0.0
+        diag = big = 0.0
         for q in range(a.indptr[i], a.indptr[i + 1]):
             x = fabs(a.data[q])
             if x > big:

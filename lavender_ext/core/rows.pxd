@@ -35,8 +35,7 @@ cdef inline void compute_relative_velocity(const double* v, int32_t a, int32_t b
     cdef const double* x
     cdef int32_t k
     for k in range(3):
-        u[k] = 0.0
-        spin[k] = 0.0
+        u[k] = spin[k] = 0.0
     if b >= 0:
         x = v + 6 * b
         u[0] = x[0] + (x[4] * arm_b[2] - x[5] * arm_b[1])

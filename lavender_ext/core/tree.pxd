@@ -62,8 +62,7 @@ cdef inline int32_t find_tree_factor_pattern(int32_t n, const int32_t* mptr, con
     """
     cdef int32_t k, q, c, j, at = workspace, start, end
     for k in range(n):
-        mark[k] = -1
-        first_child[k] = -1
+        mark[k] = first_child[k] = -1
     for k in range(n - 1, -1, -1):
         end = at
         mark[k] = k

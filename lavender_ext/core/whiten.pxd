@@ -55,9 +55,7 @@ cdef inline int32_t find_panel_pattern_by_bits(const generalized_t* g, int32_t n
     cdef const int32_t* parent = g.parent
     cdef uint64_t columns = 0, panel_columns = 0, remaining
     cdef double values = 0.0
-    prow[0] = 0
-    pcol[0] = 0
-    pval[0] = 0
+    prow[0] = pcol[0] = pval[0] = 0
     # each column and its ancestors, which come before it
     for k in range(nv):
         ancestors[k] = <uint64_t>1 << k
@@ -115,9 +113,7 @@ cdef inline int32_t find_panel_pattern(const generalized_t* g, int32_t n_blocks,
     if g.n <= 64:
         return find_panel_pattern_by_bits(g, n_blocks, ptr, <uint64_t*>mark, prow, pcol, pval, cols, workspace, n_cols, n_values)
     n_values[0] = 0.0
-    prow[0] = 0
-    pcol[0] = 0
-    pval[0] = 0
+    prow[0] = pcol[0] = pval[0] = 0
     for i in range(g.n):
         mark[i] = -1
     for i in range(n_blocks):

@@ -86,17 +86,14 @@ cdef inline void compute_joint_geometry(engine_t* e, int32_t i) noexcept nogil:
             for k in range(3):
                 axis[k] = axis[k] / length
         else:
-            axis[0] = 0.0
-            axis[1] = 0.0
+            axis[0] = axis[1] = 0.0
             axis[2] = 1.0
         fill_linear_jacobian_row(e.jac + 12 * row, axis, arm_a, arm_b)
         e.joint_error[row] = length - p[J_LENGTH]
         return
     # ball: the three world axes
     for k in range(3):
-        axis[0] = 0.0
-        axis[1] = 0.0
-        axis[2] = 0.0
+        axis[0] = axis[1] = axis[2] = 0.0
         axis[k] = 1.0
         fill_linear_jacobian_row(e.jac + 12 * (row + k), axis, arm_a, arm_b)
         e.joint_error[row + k] = pb[k] - pa[k]
@@ -129,8 +126,7 @@ cdef inline void build_joint_rows(engine_t* e) noexcept nogil:
         b = e.joint_body[2 * i + 1]
         compute_joint_geometry(e, i)
         e.kind[i] = ROW
-        e.mu[i] = 0.0
-        e.patch_radius[i] = 0.0
+        e.mu[i] = e.patch_radius[i] = 0.0
         if e.size[ROWS_PER_CONTACT] > 4:
             e.rolling[i] = 0.0
         for row in range(e.ptr[i], e.ptr[i + 1]):
@@ -138,8 +134,7 @@ cdef inline void build_joint_rows(engine_t* e) noexcept nogil:
             d = dot12(e.jac + 12 * row, e.minv_jac + 12 * row)
             e.lower[row] = -inf
             e.upper[row] = inf
-            e.compliance[row] = 0.0
-            e.target[row] = 0.0
+            e.compliance[row] = e.target[row] = 0.0
             if e.joint_motor[i] and row == e.ptr[i + 1] - 1:
                 e.lower[row] = -h * p[J_TORQUE]
                 e.upper[row] = h * p[J_TORQUE]

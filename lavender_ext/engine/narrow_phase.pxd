@@ -48,9 +48,7 @@ cdef inline void collide_sphere_sphere(const double* xa, double ra, const double
         for k in range(3):
             m.normal[k] = d[k] / s
     else:                                               # The spheres are concentric: use a fixed normal.
-        s = 0.0
-        m.normal[0] = 0.0
-        m.normal[1] = 0.0
+        s = m.normal[0] = m.normal[1] = 0.0
         m.normal[2] = 1.0
     f = 0.5 * (ra - rb + s)                             # The point is halfway between the surfaces.
     add_scaled3(xa, f, m.normal, m.point)

@@ -24,8 +24,7 @@ cdef struct pivots_t:
 
 cdef inline void clear_pivot_statistics(pivots_t* out) noexcept nogil:
     """Set the statistics of a factorisation without pivots."""
-    out.small = 0
-    out.negative = 0
+    out.small = out.negative = 0
     out.least = 1.0 / 0.0
     out.first_small = -1
 

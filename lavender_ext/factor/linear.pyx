@@ -136,8 +136,7 @@ cdef double analyse_blocks(block_matrix_t* f, int32_t n, int32_t s, const int32_
     work = list_supernode_rows(count, starts, lptr, lind, group, first, supernode_of, row_ptr, row_indices, value_offset,
                                panel_upper_offset)
     p.n, p.supernodes = n * s, count
-    p.order = NULL
-    p.position = NULL
+    p.order = p.position = NULL
     p.first, p.supernode_of, p.row_ptr, p.row_indices = first, supernode_of, row_ptr, row_indices
     p.value_offset, p.upper_offset = value_offset, panel_upper_offset
     f.n, f.s, f.nptr, f.nind, f.lower_offset, f.upper_offset = n, s, nptr, nind, lower_offset, upper_offset

@@ -18,8 +18,7 @@ cdef inline void compute_block_elimination_tree(int32_t n, const int32_t* nptr, 
     for k in range(n):
         parent[k] = -1
         mark[k] = k
-        row_count[k] = 0
-        column_count[k] = 0
+        row_count[k] = column_count[k] = 0
         for q in range(nptr[k], nptr[k + 1]):
             j = nind[q]
             while j < k and mark[j] != k:
@@ -96,8 +95,7 @@ cdef inline void find_elimination_tree(int32_t n, const int32_t* nptr, const int
     """Compute the elimination tree of a lower pattern with path compression (Liu 1986); ancestor (n) is scratch."""
     cdef int32_t k, q, j, above
     for k in range(n):
-        parent[k] = -1
-        ancestor[k] = -1
+        parent[k] = ancestor[k] = -1
         for q in range(nptr[k], nptr[k + 1]):
             j = nind[q]
             while j >= 0 and j < k:
@@ -171,9 +169,7 @@ cdef inline double list_supernode_rows(int32_t supernodes, const int32_t* starts
     """
     cdef int32_t i, j, c, q, k, width, below
     cdef double work = 0.0
-    row_ptr[0] = 0
-    value_offset[0] = 0
-    upper_offset[0] = 0
+    row_ptr[0] = value_offset[0] = upper_offset[0] = 0
     for i in range(supernodes):
         first[i] = starts[group[i]]
         c = row_ptr[i]

@@ -77,8 +77,7 @@ cdef inline void multiply_jacobian_transpose_double_double(const generalized_t* 
     """Compute high + low (n) = J^T lam."""
     cdef int32_t i, q
     for i in range(g.n):
-        high[i] = 0.0
-        low[i] = 0.0
+        high[i] = low[i] = 0.0
     for i in range(g.m):
         if lam[i] != 0.0:
             for q in range(g.jptr[i], g.jptr[i + 1]):

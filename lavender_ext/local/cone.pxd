@@ -49,16 +49,13 @@ cdef inline int32_t solve_cone_disk(const double* W, const double* q, double mu,
     cdef double v[3]
     cdef int32_t _iteration, k, done = 0
     if q[0] >= mu * norm2(q[1], q[2]):
-        lam[0] = 0.0
-        lam[1] = 0.0
-        lam[2] = 0.0
+        lam[0] = lam[1] = lam[2] = 0.0
         return OPEN
     if not W[0] > 0.0:
         return FAILED
     if mu == 0.0:
         lam[0] = -q[0] / W[0]
-        lam[1] = 0.0
-        lam[2] = 0.0
+        lam[1] = lam[2] = 0.0
         return SLIP
     # v(beta) = v0 + beta v1 + beta^2 v2, det(W + beta J) = d0 + d1 beta + d2 beta^2 - mu^2 beta^3
     v0[0] = -((W[4] * W[8] - W[5] * W[7]) * q[0] + (W[2] * W[7] - W[1] * W[8]) * q[1]

@@ -92,17 +92,14 @@ cdef inline int32_t solve_coulomb_disk(const double* g, const double* q, double 
     cdef double y[3]
     cdef int32_t i, _iteration, done = 0
     if q[0] >= 0.0:
-        lam[0] = 0.0
-        lam[1] = 0.0
-        lam[2] = 0.0
+        lam[0] = lam[1] = lam[2] = 0.0
         return OPEN
     if not g[9] > 0.0 or not q[0] < 0.0:
         return FAILED
     a = -q[0] * g[9]
     if mu == 0.0:
         lam[0] = a
-        lam[1] = 0.0
-        lam[2] = 0.0
+        lam[1] = lam[2] = 0.0
         return SLIP
     h0 = g[1] * g[9]
     h1 = g[2] * g[9]
@@ -124,8 +121,7 @@ cdef inline int32_t solve_coulomb_disk(const double* g, const double* q, double 
     elif det == 0.0:
         # Rank one or zero: the shortest lam_t with S lam_t = -r, if r is in the range of S.
         size = g[10] * g[10] + g[11] * g[11] + g[12] * g[12] + g[13] * g[13]
-        x0 = 0.0
-        x1 = 0.0
+        x0 = x1 = 0.0
         if size > 0.0:
             x0 = -(g[10] * r0 + g[12] * r1) / size
             x1 = -(g[11] * r0 + g[13] * r1) / size
@@ -194,9 +190,7 @@ cdef inline int32_t update_coulomb_disk(const double* g, const double* w, double
     cdef double n, x, y, s, f
     q[0] = w[0] - (g[0] * lam[0] + g[1] * lam[1] + g[2] * lam[2])
     if q[0] >= 0.0:
-        lam[0] = 0.0
-        lam[1] = 0.0
-        lam[2] = 0.0
+        lam[0] = lam[1] = lam[2] = 0.0
         return OPEN
     if g[14] > 0.0 and g[9] > 0.0:
         # w = 0 at lam - W^-1 w

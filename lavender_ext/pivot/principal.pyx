@@ -148,10 +148,7 @@ cdef void compute_slack_and_rounding(pivoting_t* s) noexcept nogil:
     for i in range(s.n):
         q = s.a.indptr[i]
         end = s.a.indptr[i + 1]
-        s0 = 0.0
-        s1 = 0.0
-        f0 = 0.0
-        f1 = 0.0
+        s0 = s1 = f0 = f1 = 0.0
         while q + 2 <= end:
             t = val[q] * s.x[idx[q]]
             u = val[q + 1] * s.x[idx[q + 1]]
@@ -370,6 +367,4 @@ cdef void bind_pivoting_arrays(pivoting_t* s, arena_t* a) noexcept nogil:
     s.at, s.place = take_integers(a, n), take_integers(a, n)
     s.linear.by, s.linear.wide = CHOLESKY, has_wide()
     s.linear.d = s.linear.scale = s.size
-    s.outside = NULL
-    s.factor_outside = NULL
-    s.solve_outside = NULL
+    s.outside = s.factor_outside = s.solve_outside = NULL
