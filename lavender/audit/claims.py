@@ -44,9 +44,8 @@ OUTCOMES = (
 RIGHT_OUTCOMES, WRONG_OUTCOMES = (0, 2), (1, 3)
 STATES_FILE = "states.npz"
 N_KEPT_PROBLEMS = 8  # The problems of this many worst answers are written to files.
-NUMBER_PATTERN = re.compile(
-    r"\b\d+\b"
-)  # Numbers of contacts and limits differ between steps and are removed from row names.
+# Numbers of contacts and limits differ between steps and are removed from row names.
+NUMBER_PATTERN = re.compile(r"\b\d+\b")
 CLAIMS_NOTE = (
     "Right: no row has a velocity error above the threshold, or rounding explains it in the engine's precision. A "
     "wrong claim hides an error; a missing claim for a right answer costs iterations, or a needless warning."

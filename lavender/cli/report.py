@@ -252,9 +252,8 @@ def _list_modification_times(path: Path, controls: str, states: str | None) -> l
         from mujoco import FatalError, mju_getXMLDependencies
     except ImportError:  # MuJoCo is missing, or has no such function.
         return times
-    with contextlib.suppress(
-        ValueError, RuntimeError, FatalError
-    ):  # Ignore an invalid model here; reading it raises the error.
+    # Ignore an invalid model here; reading it raises the error.
+    with contextlib.suppress(ValueError, RuntimeError, FatalError):
         others = (*sorted(mju_getXMLDependencies(str(path))), controls, states or "")
         times += [p.stat().st_mtime for p in map(Path, others) if p.is_file()]
     return times

@@ -54,12 +54,10 @@ def _reconstruct_bodies(p: Problem, rows: npt.NDArray[np.intp] | None = None) ->
     push, turn = part[:, :, at].reshape(len(part), 3, -1, 2, 3).transpose(3, 2, 0, 1, 4)
     moment = push.swapaxes(2, 3) @ turn  # The sum of d (r x d)^T is [r]^T.
     on = push.any(axis=(2, 3))
-    k, count, first, last = (
-        np.arange(len(part)),
-        on.sum(axis=0),
-        on.argmax(axis=0),
-        -1 - on[::-1].argmax(axis=0),
-    )
+    k = np.arange(len(part))
+    count = on.sum(axis=0)
+    first = on.argmax(axis=0)
+    last = -1 - on[::-1].argmax(axis=0)
     axes = push[last, k]
     other = push[first, k] + np.where(count == 2, 1.0, -1.0)[:, None, None] * axes
     off = np.abs(axes @ axes.swapaxes(1, 2) - np.eye(3)).max() + np.abs(other).max()
@@ -134,11 +132,7 @@ def diagnose_geometry(p: Problem) -> Iterator[Diagnostic]:
             f"the arms of contact {i} put the centres of bodies {a[i]} and {b[i]} elsewhere than the other "
         )
         yield make_diagnostic(
-            p,
-            "bodies",
-            reason + "contacts do: is a wrong body given?",
-            blocks[wrong],
-            off=float(off.max()),
+            p, "bodies", reason + "contacts do: is a wrong body given?", blocks[wrong], off=float(off.max())
         )
 
 

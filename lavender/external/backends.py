@@ -55,11 +55,8 @@ QTQP = {
 PYQPMAD = {"tolerance": "eps", "max_iter": "max_iter"}
 QPAX = {"solver_tol": "eps"}
 JAXOPT = {"tol": "eps", "maxiter": "max_iter"}
-QPSWIFT = {
-    "RELTOL": "eps",
-    "ABSTOL": "gap",
-    "MAXITER": "max_iter",
-}  # RELTOL limits residuals, ABSTOL the gap.
+# RELTOL limits residuals, ABSTOL the gap.
+QPSWIFT = {"RELTOL": "eps", "ABSTOL": "gap", "MAXITER": "max_iter"}
 QPOASES = {"max_wsr": "max_iter", "time_limit": "time_limit", "terminationTolerance": "eps"}
 SIP = {"eps_abs": "eps", "eps_rel": 0.0, "max_iterations": "max_iter", "time_limit": "time_limit"}
 

@@ -338,11 +338,9 @@ def _build_program_form(scaled: ScaledProblem) -> QP:
     target = root * qp.target[rows] / sigma
     lb, ub = np.full(n_x, -np.inf), np.full(n_x, np.inf)
     is_lower, is_fixed, is_upper = (kind == 1) | (kind == 3), kind == 1, kind == 4
-    lb[at[is_lower]], ub[at[is_fixed]], ub[at[is_upper]] = (
-        target[is_lower],
-        target[is_fixed],
-        -target[is_upper],
-    )
+    lb[at[is_lower]] = target[is_lower]
+    ub[at[is_fixed]] = target[is_fixed]
+    ub[at[is_upper]] = -target[is_upper]
     # The multipliers of rows, then of bounds, in the order of the rows of the problem.
     column = np.where(is_general, np.cumsum(is_general) - 1, r + at) + n_x
     columns = np.concatenate([np.arange(n_shared), column])

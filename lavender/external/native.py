@@ -162,11 +162,9 @@ def call_highs(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]
     model = highspy.HighsModel()
     lower = sp.csc_matrix(sp.tril(qp.P))
     model.hessian_.dim_ = qp.n
-    model.hessian_.start_, model.hessian_.index_, model.hessian_.value_ = (
-        lower.indptr,
-        lower.indices,
-        lower.data,
-    )
+    model.hessian_.start_ = lower.indptr
+    model.hessian_.index_ = lower.indices
+    model.hessian_.value_ = lower.data
     lp, k = model.lp_, HIGHS_SCALE
     lp.num_col_, lp.col_cost_ = qp.n, k * qp.q
     lp.col_lower_ = np.full(qp.n, -np.inf) if qp.lb is None else k * qp.lb

@@ -427,7 +427,5 @@ def _redirect_descriptors_to_null() -> Iterator[None]:
         os.close(null)
 
 
-_redirect_streams, _discard_descriptors = (
-    _SharedContext(_redirect_streams_by_thread),
-    _SharedContext(_redirect_descriptors_to_null),
-)
+_redirect_streams = _SharedContext(_redirect_streams_by_thread)
+_discard_descriptors = _SharedContext(_redirect_descriptors_to_null)

@@ -221,9 +221,8 @@ def compute_free_motion(plant: Any, context: Any, dt: float) -> tuple[FloatArray
     nv = int(plant.num_velocities())
     forces = MultibodyForces_[float](plant)
     plant.CalcForceElementsContribution(context, forces)
-    force = -np.array(
-        plant.CalcInverseDynamics(context, np.zeros(nv), forces)
-    )  # This includes joint damping.
+    # This includes joint damping.
+    force = -np.array(plant.CalcInverseDynamics(context, np.zeros(nv), forces))
     if plant.num_actuators():
         for i in plant.GetJointActuatorIndices():
             actuator = plant.get_joint_actuator(JointActuatorIndex(int(i)))

@@ -150,10 +150,8 @@ def from_efc(
     inv_compliance = as_array("efc_D", efc_D, (n, m), finite=False)
     target = dt * as_array("efc_aref", efc_aref, (n, m), finite=False)
     smooth = as_array("qacc_smooth", qacc_smooth, (n, nv), finite=False)
-    row_type, loss = (
-        _broadcast_numbers_to_rows("efc_type", efc_type, n, m),
-        _broadcast_numbers_to_rows("efc_frictionloss", efc_frictionloss, n, m),
-    )
+    row_type = _broadcast_numbers_to_rows("efc_type", efc_type, n, m)
+    loss = _broadcast_numbers_to_rows("efc_frictionloss", efc_frictionloss, n, m)
     count = np.full(n, m) if nefc is None else check_row_counts("nefc", nefc, n, m)
     used_rows = np.arange(m) < count[:, None]
     _check_rows(

@@ -248,11 +248,9 @@ def _read_file(r: HDF5Reader) -> Contents:
     first_shape = r.read_matrix_shape(f"{group}/{'W' if local else 'H'}")
     more = f"{group}/{'V' if local else 'G'}"
     has_equations = r.has_path(more) or (local and r.has_path(f"{group}/R"))
-    n, m, p = (
-        0 if local else first_shape[0],
-        first_shape[1],
-        r.read_matrix_shape(more)[1] if has_equations else 0,
-    )
+    n = 0 if local else first_shape[0]
+    m = first_shape[1]
+    p = r.read_matrix_shape(more)[1] if has_equations else 0
     if local and first_shape != (m, m):
         raise InputError(f"{group}/W is {first_shape[0]} x {m}; a square matrix is needed")
     if m % spacedim:
@@ -474,9 +472,8 @@ def _write_file(out: Any, file: Contents) -> None:
         info = group.create_group("info")
         for name in ("title", "description", "math_info"):
             text = file.info.get(name, "").encode()
-            write_array(
-                info, name, np.array(text, f"S{len(text) + 1}")
-            )  # FCLIB expects strings that end in a NUL character.
+            # FCLIB expects strings that end in a NUL character.
+            write_array(info, name, np.array(text, f"S{len(text) + 1}"))
     if file.solution:
         _write_point(out.create_group("solution"), file.solution)
     if file.guesses:

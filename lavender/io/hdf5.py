@@ -125,11 +125,9 @@ class HDF5Reader:
         FCLIB's `nz` selects the format: -2 compressed rows, -1 compressed columns, nz >= 0 triplets with columns p and
         rows i.
         """
-        (m, n), nz, nzmax = (
-            self.read_matrix_shape(path),
-            self.read_integer(f"{path}/nz"),
-            self.read_integer(f"{path}/nzmax"),
-        )
+        (m, n) = self.read_matrix_shape(path)
+        nz = self.read_integer(f"{path}/nz")
+        nzmax = self.read_integer(f"{path}/nzmax")
         if nzmax < 0 or nz < -2 or nz > nzmax:
             raise InputError(
                 f"{path}: nz is {nz} and nzmax is {nzmax}; nz must be -2 (compressed rows), -1 (compressed "

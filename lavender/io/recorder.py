@@ -119,10 +119,8 @@ class Recorder:
         replace: bool = False,
     ) -> None:
         self.every = None if every is None else check_int("every", every, 1)
-        self.keep_worst, self.threshold = (
-            check_int("keep_worst", keep_worst),
-            check_float("threshold", threshold, low=0.0),
-        )
+        self.keep_worst = check_int("keep_worst", keep_worst)
+        self.threshold = check_float("threshold", threshold, low=0.0)
         if when is not None and not callable(when):
             raise InputError(f"when is {when!r:.60}; a function of a StepVerdict is needed")
         if self.every is None and not self.keep_worst and when is None:

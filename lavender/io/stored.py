@@ -36,9 +36,8 @@ SUFFIXES = (".npz", *HDF5)  # Suffixes of problem files.
 ENGINE = "engine.jsonl"  # File of the engine's own results, in the folder of recorded problems.
 STATES_FOLDER = "states"  # Folder of the states before recorded steps, in the folder of recorded problems.
 
-MAX_BYTES = (
-    2**31
-)  # Default limit of the memory for the arrays of a file; a file of a megabyte can declare a terabyte.
+# Default limit of the memory for the arrays of a file; a file of a megabyte can declare a terabyte.
+MAX_BYTES = 2**31
 # The name of a temporary file contains this many characters of the final name; names may have 255 bytes, and a
 # character up to four.
 TEMPORARY_NAME_CHARACTERS = 40
@@ -128,9 +127,8 @@ def lock_output(path: str | os.PathLike[str], folder: bool = False) -> Iterator[
     from filelock import FileLock, Timeout  # The import takes 30 ms; commands that write nothing skip it.
 
     path = check_writable(path, folder)
-    target = (
-        _resolve_symlinks(path) if folder else resolve_destination(path)
-    )  # All names of an output share one lock.
+    # All names of an output share one lock.
+    target = _resolve_symlinks(path) if folder else resolve_destination(path)
     is_new = folder and not target.exists()
     if folder:
         make_folder(target)

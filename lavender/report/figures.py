@@ -108,10 +108,8 @@ def build_overall_figure(report: Report, name: str = "error-against-time", law: 
     runs = runs[np.isfinite(runs["relative"]) & (runs["time"] > 0.0)]
     if not len(runs):
         return Figure(name, "", "", "", ())
-    cases, grid = (
-        list(frame["case"].unique()),
-        np.geomspace(runs["time"].min(), runs["time"].max(), GRID_SIZE),
-    )
+    cases = list(frame["case"].unique())
+    grid = np.geomspace(runs["time"].min(), runs["time"].max(), GRID_SIZE)
     number = {case: i for i, case in enumerate(cases)}
     solvers = [str(s) for s in runs["solver"].unique()] if law else select_drawn_solvers(report, frame)
     curves: list[Curve] = []
@@ -127,9 +125,8 @@ def build_overall_figure(report: Report, name: str = "error-against-time", law: 
         bands = np.quantile(
             np.minimum.accumulate(reached, axis=1), (0.25, 0.5, 0.75), axis=0, method="inverted_cdf"
         )
-        first = int(
-            np.searchsorted(-bands[1], -1.0, side="right")
-        )  # From here on, half of the cases have a result.
+        # From here on, half of the cases have a result.
+        first = int(np.searchsorted(-bands[1], -1.0, side="right"))
         if first == GRID_SIZE:
             continue
         across, low, middle, high = (tuple(x[first:].tolist()) for x in (grid, *bands))

@@ -110,9 +110,8 @@ class Run(_PrintableEntry):
     threads: int  # Threads of BLAS and OpenMP while times are measured.
     versions: Mapping[str, str]
     plan: Mapping[str, Any]
-    build: Mapping[str, str] = field(
-        default_factory=dict
-    )  # Commit, hash of the kernels, compiler, BLAS, clock.
+    # Commit, hash of the kernels, compiler, BLAS, clock.
+    build: Mapping[str, str] = field(default_factory=dict)
     load: float | None = None  # Mean number of runnable processes in the minute before the run.
     whole: bool = True  # Whether all measurements of the run were made; False while it runs.
 

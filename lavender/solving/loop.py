@@ -65,9 +65,8 @@ class Loop:
     deadline: Deadline | None = None
     callback: Callback | None = None
     records: list[Record] | None = None  # The history; None if it is not requested.
-    record_solvers: list[str] = field(
-        default_factory=list
-    )  # Solver of each record, if `auto` makes the records.
+    # Solver of each record, if `auto` makes the records.
+    record_solvers: list[str] = field(default_factory=list)
     time: float = 0.0  # [s] Time of the solver, without the judge.
     recording_time: float = 0.0  # [s] Time of the judge for the records.
     done: int = 0  # Number of iterations so far.
@@ -215,9 +214,8 @@ class Loop:
         if self.records is None:
             return None
         solvers = self.record_solvers
-        if (
-            solvers and self.records[-1][0] == self.done
-        ):  # `auto` returns the best impulse of all stages, which may differ from the last record.
+        # `auto` returns the best impulse of all stages, which may differ from the last record.
+        if solvers and self.records[-1][0] == self.done:
             self.records.pop()
         if not self.records or self.records[-1][0] != self.done:
             self._record_residual()

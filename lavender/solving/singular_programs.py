@@ -56,9 +56,8 @@ def run_program_backends(log: SolveLog, impulse: FloatArray) -> Claim:
     claim = log.make_claim()
     impulse[:] = log.impulse if log.best <= tol else best
     if log.best > tol and claim.status is Status.ROUNDOFF_LIMIT:
-        return replace(
-            claim, status=Status.STALLED
-        )  # That status belongs to the impulse with the best residual.
+        # That status belongs to the impulse with the best residual.
+        return replace(claim, status=Status.STALLED)
     return claim
 
 

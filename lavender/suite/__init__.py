@@ -17,14 +17,7 @@ from collections.abc import Iterator
 
 from lavender.base.errors import UnknownName
 from lavender.suite import friction, hard
-from lavender.suite.case import (
-    FAMILIES,
-    MAX_SIZE,
-    Case,
-    Reference,
-    format_parameter_value,
-    parse_case_name,
-)
+from lavender.suite.case import FAMILIES, MAX_SIZE, Case, Reference, format_parameter_value, parse_case_name
 from lavender.suite.families import (
     box_stack,
     boxed_friction,

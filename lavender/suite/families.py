@@ -278,8 +278,7 @@ def chain(n: int = 33, tip_mass: float = 1.0) -> Draft:
     )
     problem = _build_chain(link, tip_mass, 0.02)  # pyright: ignore[reportArgumentType]
     return Draft(
-        problem,
-        "bilateral and banded with little tension: easy for every solver that uses the band",
+        problem, "bilateral and banded with little tension: easy for every solver that uses the band"
     )
 
 
@@ -295,8 +294,7 @@ def hang(n: int = 33, tip_mass: float = 1.0) -> Draft:
     link = np.stack([1e-4 * map_scalar(math.cos, k), 1e-4 * map_scalar(math.sin, 1.7 * k), -1.0 + 0.0 * k], 1)
     problem = _build_chain(link, tip_mass, 1e-4)  # pyright: ignore[reportArgumentType]
     return Draft(
-        problem,
-        "tension through the whole chain: sweeps need n^2 times tip_mass, a band factorisation n",
+        problem, "tension through the whole chain: sweeps need n^2 times tip_mass, a band factorisation n"
     )
 
 
@@ -416,8 +414,7 @@ def random_spd(n: int = 100, condition: float = 1e6, seed: int = 0) -> Draft:
     a = 0.5 * (a + a.T)
     problem = Problem.linear(a, multiply_in_index_order(a, rng.standard_normal(n)))
     return Draft(
-        problem,
-        "no structure, only a condition number, which separates direct from iterative solvers",
+        problem, "no structure, only a condition number, which separates direct from iterative solvers"
     )
 
 
@@ -443,10 +440,7 @@ def boxed_friction(
         raise InputError(f"scene is {scene!r}; box_stack, pyramid or granular is needed")
     add_horizontal_velocity(bodies, sliding)
     problem = _build_boxed_friction_problem(bodies, contacts)
-    return Draft(
-        problem,
-        "friction that every QP solver accepts: a boxed LCP with finite bounds",
-    )
+    return Draft(problem, "friction that every QP solver accepts: a boxed LCP with finite bounds")
 
 
 def _build_boxed_friction_problem(bodies: Bodies, contacts: Contacts) -> Problem:

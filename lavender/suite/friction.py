@@ -77,11 +77,7 @@ def ramp(angle: float = 20.0, mu: float = 0.5) -> Draft:
             "slack",
         )
 
-    return Draft(
-        problem,
-        "sticks below tan angle = mu, slides above, on a redundant face",
-        closed_form,
-    )
+    return Draft(problem, "sticks below tan angle = mu, slides above, on a redundant face", closed_form)
 
 
 @register_family()
@@ -99,11 +95,7 @@ def threshold(above: float = 0.0) -> Draft:
         scale = min(1.0, 0.5 * b[0] / size)
         return Reference(np.array([b[0], scale * b[1], scale * b[2]]), "closed form")
 
-    return Draft(
-        problem,
-        "at the edge of the disk, where the projection is not differentiable",
-        closed_form,
-    )
+    return Draft(problem, "at the edge of the disk, where the projection is not differentiable", closed_form)
 
 
 @register_family()
@@ -183,11 +175,7 @@ def arch(n: int = 9, mu: float = 0.6) -> Draft:
     problem = build_contact_problem(
         bodies, Contacts(np.repeat(pairs, 4, axis=0), point, normal), "coulomb", mu
     )
-    return Draft(
-        problem,
-        "held by friction and thrust alone: errors appear as a sag",
-        expect=EXPECT_EXACT,
-    )
+    return Draft(problem, "held by friction and thrust alone: errors appear as a sag", expect=EXPECT_EXACT)
 
 
 @register_family()

@@ -137,9 +137,8 @@ def four_bar(tilt: float = 0.3) -> Draft:
     """
     anchor = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 1.0], [1.4, 0.0, 1.3], [1.5, 0.0, 0.0]])
     c, s = math.cos(tilt), math.sin(tilt)
-    rotation = np.array(
-        [[c, -s, 0.0], [c * s, c * c, -s], [s * s, s * c, c]]
-    )  # Rotation about z, then about x.
+    # Rotation about z, then about x.
+    rotation = np.array([[c, -s, 0.0], [c * s, c * c, -s], [s * s, s * c, c]])
     anchor = multiply_in_index_order(anchor, rotation.T)
     bodies = Bodies(0.5 * (anchor[1:] + anchor[:-1]), [1.0, 2.0, 1.0], 0.1)
     body = np.array([[-1, 0], [0, 1], [1, 2], [2, -1]])
@@ -175,10 +174,7 @@ def ring(n: int = 8) -> Draft:
     body = np.concatenate([body, [[-1, 0]]])
     at = np.concatenate([anchor[:-1], [anchor[0]]])
     problem = build_joint_problem(bodies, body, compute_ball_joint_jacobian(bodies.position, body, at), 3)
-    return Draft(
-        problem,
-        "a loop of joints: the band of the chain closes on itself",
-    )
+    return Draft(problem, "a loop of joints: the band of the chain closes on itself")
 
 
 # -- geometry -------------------------------------------------------------------------------------

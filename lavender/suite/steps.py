@@ -56,15 +56,11 @@ def walking(n: int = 16, dt: float = 0.1, height: float = 0.8, foot: float = 0.1
     free, by_jerk = np.empty(n), np.zeros((n, n))
     by_each_jerk = np.zeros((3, n))  # Derivative of the state (c, c', c'') by each jerk.
     for k in range(n):
-        state, by_each_jerk = (
-            multiply_in_index_order(transition, state),
-            multiply_in_index_order(transition, by_each_jerk),
-        )
+        state = multiply_in_index_order(transition, state)
+        by_each_jerk = multiply_in_index_order(transition, by_each_jerk)
         by_each_jerk[:, k] = jerk_effect
-        free[k], by_jerk[k] = (
-            multiply_in_index_order(pressure, state),
-            multiply_in_index_order(pressure, by_each_jerk),
-        )
+        free[k] = multiply_in_index_order(pressure, state)
+        by_jerk[k] = multiply_in_index_order(pressure, by_each_jerk)
     foot_centre = 0.2 * ((np.arange(n) + rng.integers(8)) // 8) + rng.normal(scale=0.01, size=n)
     problem = Problem.from_qp(
         multiply_in_index_order(by_jerk.T, by_jerk) + 1e-4 * np.eye(n),

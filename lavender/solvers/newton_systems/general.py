@@ -78,9 +78,8 @@ def run_newton_steps(
     islands = max(1, kernel.islands)
     step = counted = FLOP_TIME * kernel.work
     slow = max(SPARSE_FLOP_TIME * kernel.work, 1e-9)
-    steps = clock = max(
-        1, int(islands * min(MAX_STEPS_PER_CHECK, CHECK_INTERVAL / slow))
-    )  # The kernel applies the step limit to each island separately.
+    # The kernel applies the step limit to each island separately.
+    steps = clock = max(1, int(islands * min(MAX_STEPS_PER_CHECK, CHECK_INTERVAL / slow)))
     if time_limit is not None:
         steps = max(1, int(min(CALL_TIME_FRACTION * time_limit / slow, clock)))
     while counts[0] < max_iter:
