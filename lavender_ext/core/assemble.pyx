@@ -267,8 +267,7 @@ def dense_to_csr(const double[:, ::1] a, double sign=1.0):
 
 def mirror_lower_triangle(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] data):
     """Return (indptr, indices, data) of a symmetric matrix from its lower triangle, with the diagonal entry last in each row."""
-    cdef Py_ssize_t n = indptr.shape[0] - 1, nnz = indices.shape[0]
-    cdef Py_ssize_t i, q, k = 0
+    cdef Py_ssize_t n = indptr.shape[0] - 1, nnz = indices.shape[0], i, q, k = 0
     cdef int32_t[::1] above = np.empty(n + 2, np.int32), column = np.empty(nnz + 1, np.int32)
     cdef double[::1] upper_value = np.empty(nnz + 1)
     if n:

@@ -109,7 +109,6 @@ cdef int32_t run_until_stop(stopping_test_t* s, const view_t* v, const view_t* c
 
 cdef class StoppingTest:
     cdef object keep
-    cdef view_t view
-    cdef view_t other
+    cdef view_t view, other
     cdef const view_t* confirm  # address of `other`, or NULL if no status needs confirmation in another form
     cdef stopping_test_t state
