@@ -118,11 +118,6 @@ class Contents:
         return self.tolerances[len(self.tolerances) // 2]
 
     @cached_property
-    def limit(self) -> float:
-        """Time [s] that a missed tolerance counts with: the time limit."""
-        return float(self.frame["time_limit"].max()) if len(self.frame) else 1.0
-
-    @cached_property
     def time_budgets(self) -> tuple[float, ...]:
         """Time budgets [s] for which a solver is recommended."""
         return tuple(self.times) or choose_time_budgets(get_times(self.frame, self.tolerance))

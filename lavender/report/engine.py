@@ -63,9 +63,7 @@ class EngineAnswers:
         """Return whether the source of a case is a file of the engine's folder."""
         return str(Path(source).parent) == self.folder
 
-    def rank(
-        self, records: Records, cases: Sequence[str], tolerance: float, limit: float
-    ) -> dict[str, Any] | None:
+    def rank(self, records: Records, cases: Sequence[str], tolerance: float) -> dict[str, Any] | None:
         """Return the engine's result on cases as solvers are ranked; None if it did not answer every case."""
         sources = [records.cases[name].source for name in cases]
         timed = (
@@ -75,9 +73,8 @@ class EngineAnswers:
         if not cases or answers["seconds"].isna().any() or len(answers) < len(cases):
             return None
         is_solved = answers["relative"] <= tolerance
-        found = {"solver": self.solver, "solved": int(is_solved.sum()), "cases": len(cases)}
-        mean = float(compute_mean(answers["seconds"].where(is_solved, limit)))
-        return found | {"mean": mean, "solved_mean": float(compute_mean(answers["seconds"][is_solved]))}
+        mean = float(compute_mean(answers["seconds"][is_solved]))
+        return {"solver": self.solver, "solved": int(is_solved.sum()), "cases": len(cases), "mean": mean}
 
 
 def read_engine_answers(sources: Sequence[str], records: Records) -> list[EngineAnswers]:

@@ -88,7 +88,7 @@ def select_drawn_solvers(report: Report, frame: pd.DataFrame) -> list[str]:
     from lavender.report.ranking import rank_solvers
     from lavender.report.recommendation import is_plug_in
 
-    ranking = [str(name) for name in rank_solvers(frame, report.tolerance, report.limit).index]
+    ranking = [str(name) for name in rank_solvers(frame, report.tolerance).index]
     plug_ins = [name for name in ranking if is_plug_in(name)]
     return [*[name for name in ranking if name not in plug_ins][:MAX_CURVES], *plug_ins]
 

@@ -20,8 +20,8 @@ MAX_ROWS = 500  # Largest number of rows of a table on a page and in the summary
 #: Title, meaning of the numbers, and function of each table, in their order.
 SECTIONS: dict[str, tuple[str, str, Callable[[Contents], pd.DataFrame]]] = {
     "structures": ("By structure", (
-        "The solver that solves the largest number of cases to each tolerance, then the fastest, with its mean time. "
-        "Solvers after ≈ tie with it within the noise of the repetitions. A miss counts with the time limit."
+        "The solver that solves the largest number of cases to each tolerance, then the fastest, with the mean time of "
+        "the cases that it solves. Solvers after ≈ tie with it within the noise of the repetitions."
     ), tables.tabulate_fastest),
     "in-time": ("In a time", (
         "The solver with the smallest residual at the 90th percentile of the cases; none if no solver halves the "
@@ -32,7 +32,7 @@ SECTIONS: dict[str, tuple[str, str, Callable[[Contents], pd.DataFrame]]] = {
         "scatter: typical factor between a case and the fit."
     ), tables.tabulate_costs),
     "times": (
-        "By law", "Mean time of each solver to each tolerance, and number of solved cases.", tables.tabulate_times
+        "By law", "Number of cases that each solver solves, and their mean time.", tables.tabulate_times
     ),
     "budgets": (
         "By iterations", "Residual after a fixed number of iterations, over the cases.", tables.tabulate_budgets

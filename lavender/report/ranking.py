@@ -78,7 +78,7 @@ def _get_times_of_runs(runs: Frame, tolerance: float) -> Frame:
     return times.reindex(index=sorted(map(str, runs["solver"].unique())), columns=list(runs["case"].unique()))
 
 
-def rank_solvers(frame: Frame, tolerance: float, limit: float) -> Frame:
+def rank_solvers(frame: Frame, tolerance: float) -> Frame:
     """Rank solvers by the number of cases that they bring to a tolerance, then by their mean time.
 
     Solvers with a contradicted claim come last. The first rows are within noise of the best (`tie`), `auto` first.
@@ -86,8 +86,7 @@ def rank_solvers(frame: Frame, tolerance: float, limit: float) -> Frame:
     Returns
     -------
     DataFrame
-        By solver: `solved`, `cases`, `mean` [s] (a miss counts as `limit` [s]), `solved_mean` [s] (without misses),
-        `worst` [s], `hardest` (case), `tie`.
+        By solver: `solved`, `cases`, `mean` [s] and `worst` [s] of the solved cases, `hardest` (case), `tie`.
     """
     runs = select_ranked_runs(frame)
     times = _get_times_of_runs(runs, tolerance)
@@ -95,7 +94,7 @@ def rank_solvers(frame: Frame, tolerance: float, limit: float) -> Frame:
     false = frame.loc[frame["claim_check"] == CONTRADICTED, "solver"].unique()
     ranking = pd.DataFrame({
         "solved": times.notna().sum(axis=1), "cases": times.shape[1], "worst": times.max(axis=1),
-        "mean": compute_mean(times.fillna(limit), axis=1), "solved_mean": compute_mean(times, axis=1),
+        "mean": compute_mean(times, axis=1),
         "hardest": times.fillna(-1.0).idxmax(axis=1) if len(times.columns) else "",
         "false": times.index.isin(false), "noise": (2.0 * ratio).reindex(times.index).clip(MIN_NOISE, MAX_NOISE),
     }, index=times.index)  # fmt: skip

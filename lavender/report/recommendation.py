@@ -65,7 +65,7 @@ def recommend(report: Contents) -> tuple[Statement, ...]:
 
 def _recommend_for(report: Contents, frame: pd.DataFrame) -> Statement:
     """Recommend the first solver of the ranking on some cases, and name ties, misses, engine and plug-ins."""
-    ranking = rank_solvers(frame, report.tolerance, report.limit)
+    ranking = rank_solvers(frame, report.tolerance)
     cases = list(frame["case"].unique())
     named = _describe_cases(report, cases)
     reached = f"down to {format_tolerance(report.tolerance)} of the error of the zero impulse"
@@ -73,7 +73,7 @@ def _recommend_for(report: Contents, frame: pd.DataFrame) -> Statement:
         (
             rank
             for e in report.engines
-            if (rank := e.rank(report.records, cases, report.tolerance, report.limit)) is not None
+            if (rank := e.rank(report.records, cases, report.tolerance)) is not None
         ),
         None,
     )
@@ -85,15 +85,15 @@ def _recommend_for(report: Contents, frame: pd.DataFrame) -> Statement:
     own = runs[(runs["solver"] == solver) & (runs[["tol", "relative"]].max(axis=1) <= report.tolerance)]
     missed, unreached = _list_unsolved_cases(report, runs, cases, solver)
     solved = f"{first['solved']} of " if missed or unreached else ""
-    time = format_seconds(first["solved_mean"]) + (" on average" if first["solved"] > 1 else "")
-    if first["worst"] > 3.0 * first["solved_mean"]:
+    time = format_seconds(first["mean"]) + (" on average" if first["solved"] > 1 else "")
+    if first["worst"] > 3.0 * first["mean"]:
         time += f" ({format_seconds(first['worst'])} at worst, {first['hardest']})"
     loosest = own[own["tol"] == own["tol"].max()]
     use = f"Stopped: {solver} solves" if report.is_stopped else f"Use {solver}: it solves"
     sentences = [f"{use} {solved}{named} in {time}, {_describe_start(frame, loosest)}, {reached}."]
     if report.unfinished:
         sentences.append(f"Not measured to the end: {_shorten_list(report.unfinished)}.")
-    ties = ranking.loc[ranking["tie"], "solved_mean"].iloc[1:]
+    ties = ranking.loc[ranking["tie"], "mean"].iloc[1:]
     if len(ties):
         names = _shorten_list([f"{name} ({format_seconds(t)})" for name, t in ties.items()])
         sentences.append(f"As fast within the noise of the repetitions: {names}.")
@@ -142,7 +142,7 @@ def _describe_plug_ins(ranking: pd.DataFrame, first: str) -> list[str]:
     """Return the sentence on place and time of plug-ins other than the recommended solver."""
     texts = [
         f"{name}: place {place} of {len(ranking)}, {row['solved']} of {row['cases']} solved"
-        + (f" in {format_seconds(row['solved_mean'])}" if row["solved"] else "")
+        + (f" in {format_seconds(row['mean'])}" if row["solved"] else "")
         for place, (name, row) in enumerate(ranking.iterrows(), 1)
         if is_plug_in(str(name)) and name != first
     ]
@@ -184,7 +184,7 @@ def _add_engine(text: str, engine: Any, first: Any) -> str:
     if not engine["solved"]:
         return f"{text} The engine's own {engine['solver']} solves none of them to that tolerance."
     missed = f" (misses {engine['cases'] - engine['solved']})" if engine["solved"] < engine["cases"] else ""
-    time = format_seconds(engine["solved_mean"]) + (" on average" if engine["solved"] > 1 else "")
+    time = format_seconds(engine["mean"]) + (" on average" if engine["solved"] > 1 else "")
     solves = f"solves {engine['solved']} of {engine['cases']}{missed} in {time}, {INSIDE}"
     if first is None or (-engine["solved"], engine["mean"]) < (-first["solved"], first["mean"]):
         return f"First is the engine's own {engine['solver']}: it {solves}. {text}"

@@ -55,7 +55,7 @@ def tabulate_fastest(report: Contents) -> Frame:
         some = report.frame[report.frame["case"].isin(cases)]
         row: dict[str, Any] = {"structure": name, "cases": len(cases)}
         for tolerance in report.tolerances:
-            ranking = rank_solvers(some, tolerance, report.limit)
+            ranking = rank_solvers(some, tolerance)
             best = ranking.iloc[0] if len(ranking) else None
             target = f"to {format_tolerance(tolerance)}"
             row[target], row[f"time {target} [s]"] = "none", math.nan
@@ -74,7 +74,7 @@ def tabulate_times(report: Contents) -> Frame:
     for law, some in report.frame.groupby("law", observed=True):
         table = pd.DataFrame()
         for tolerance in report.tolerances:
-            ranking = rank_solvers(some, tolerance, report.limit)
+            ranking = rank_solvers(some, tolerance)
             target = f"to {format_tolerance(tolerance)}"
             part = ranking[["solved", "mean"]].set_axis([f"solved {target}", f"time {target} [s]"], axis=1)
             table = pd.concat([table, part], axis=1)
@@ -249,8 +249,8 @@ def tabulate_engines(report: Contents) -> Frame:
     target, rows = f"to {format_tolerance(report.tolerance)}", []
     for e in report.engines:
         cases = [n for n, i in report.records.cases.items() if e.contains(i.source)]
-        ranking = rank_solvers(report.frame[report.frame["case"].isin(cases)], report.tolerance, report.limit)
-        engine = e.rank(report.records, cases, report.tolerance, report.limit)
+        ranking = rank_solvers(report.frame[report.frame["case"].isin(cases)], report.tolerance)
+        engine = e.rank(report.records, cases, report.tolerance)
         first = ranking.iloc[0] if len(ranking) and ranking["solved"].iloc[0] else None
         relative = e.lines["relative"]
         worst = e.lines.sort_values("velocity", na_position="first").iloc[-1]
@@ -258,12 +258,12 @@ def tabulate_engines(report: Contents) -> Frame:
             "recorded": Path(e.folder).name, "steps": len(e.lines), "not recorded": e.left_out,
             "rows": e.lines["rows"].median(),
             "engine's own": f"{e.solver}{'' if engine is None else count_solved(engine['solved'], len(cases))}",
-            f"own {target} [s]": math.nan if engine is None else engine["solved_mean"],
+            f"own {target} [s]": math.nan if engine is None else engine["mean"],
             "residual, median [-]": relative.median(), "worst [-]": relative.max(),
             "above floor": e.above_floor, "stopped early": e.unconverged,
             "velocity error [m/s]": worst["velocity"], "worst row": worst["worst"],
             "first here": "none" if first is None else f"{ranking.index[0]}{count_solved(first['solved'], len(cases))}",
-            f"first {target} [s]": math.nan if first is None else first["solved_mean"],
+            f"first {target} [s]": math.nan if first is None else first["mean"],
         })  # fmt: skip
     return pd.DataFrame(rows)
 
