@@ -56,6 +56,8 @@ def run_on_threads(work: Callable[[bytearray], T], threads: int) -> list[T]:
     is raised when all calls have ended.
     """
     stop = bytearray(1)
+    if threads <= 1:
+        return [work(stop)]
 
     def run() -> T:
         try:

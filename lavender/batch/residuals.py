@@ -84,9 +84,10 @@ class WorldResults:
             return
         self._data, self._sizes = list_problem_data(problems, Problem)
         at = np.zeros(len(problems), WORLD)
-        self._first = np.cumsum(self._sizes) - self._sizes
+        ends = self._sizes.cumsum()
+        self._first = ends - self._sizes
         at["rows"], at["row"] = self._sizes, self._first
-        self._impulse, self._velocity = np.zeros(int(self._sizes.sum())), None
+        self._impulse, self._velocity = np.zeros(int(ends[-1]) if len(ends) else 0), None
         self._worlds = Worlds(convert_table_for_kernel(at), self._impulse, np.zeros(0), cold)
         self._worlds.set_from_problems(problems, self._data, starts)
 
@@ -187,7 +188,7 @@ class WorldResults:
                     try_single(i, stop)
 
         run_on_threads(work, min(threads, len(self)))
-        for i in np.flatnonzero(self._worlds.code[:-1] == CODE["bad"]).tolist():
+        for i in (self._worlds.code == CODE["bad"]).nonzero()[0].tolist():
             # Repeat the invalid world by a single call, which raises the complete error.
             try_single(i, bytearray(1))
         if self.faults and errors == "raise":

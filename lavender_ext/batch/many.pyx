@@ -21,7 +21,7 @@ from lavender_ext.small.call cimport N_COUNTS, Rules, small_rules_t, small_probl
 from lavender_ext.batch.task cimport (copy_small_judgement, compute_missing_derived_numbers, judge_task, judge_zero_impulse_of_task,
                                       judge_task_workspace_size, prepare_task_for_small_call,
                                      solve_small_task, solve_task, task_t, task_workspaces_t)
-from lavender_ext.small.limits cimport max_newton_cost, estimate_newton_cost, limits_t
+from lavender_ext.small.limits cimport estimate_newton_cost_terms, limits_t, max_newton_cost, newton_cost_t
 from lavender_ext.small.workspace cimport grow_workspace_to, free_workspace
 from lavender_ext.batch.world cimport (BAD, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, LATE, LEFT, MASS, MU, N_ARRAYS, PLACES, READY,
                                        AT_ROW, FIELDS, ROWS, SOFT, STARTED, TARGET, TRIED, VELOCITIES, VELOCITY,
@@ -120,7 +120,8 @@ cdef class Limits:
     def cost(self, Data p, double work, int islands):
         """Return the estimated and permitted cost [ns] of Newton's method; `work`: multiply-adds to factorise every island."""
         cdef bint soft = needs_no_proximal_terms(&p.blocks, &p.general)
-        return (estimate_newton_cost(&p.blocks, &p.general, &self.at, work),
+        cdef newton_cost_t cost = estimate_newton_cost_terms(&p.blocks, &p.general, &self.at)
+        return (cost.fixed + cost.per_work * work,
                 max_newton_cost(&p.blocks, &p.general, &self.at, islands, soft))
 
 

@@ -26,8 +26,8 @@ from lavender_ext.judge.score cimport make_empty_score, score_t
 from lavender_ext.judge.slack cimport compute_generalized_slack
 from lavender_ext.small.call cimport (N_COUNTS, RESULT_IS_START, RESULT_SOLVED, are_all_rows_bounded, derive_small_problem,
                                       small_problem_t, small_rules_t, solve_small, solve_workspaces_t, can_use_small_call)
-from lavender_ext.small.limits cimport (max_newton_cost, estimate_newton_cost, limits_t, estimate_newton_step_cost,
-                                        max_factorisation_work)
+from lavender_ext.small.limits cimport (estimate_newton_cost_terms, estimate_newton_step_cost, limits_t,
+                                        max_factorisation_work, max_newton_cost, newton_cost_t)
 from lavender_ext.small.workspace cimport fits_workspace, grow_workspace_to, grow_workspace_to_arena
 from lavender_ext.batch.world cimport THIN_PADDING, LEFT, READY, STARTED, TRIED, compress_dense_rows
 from lavender_ext.velocity_newton.soft cimport needs_no_proximal_terms
@@ -199,6 +199,7 @@ cdef inline void solve_task(task_t* j, workspace_t* workspace, workspace_t* isla
     cdef options_t o = options_t(NEWTON, NEWTON_STEPS_PER_ISLAND, 0, 0, has_wide(), tol, 0.0, 0.0, limits.values, 0.0)
     cdef workspace_t r
     cdef int32_t m = j.p.n_rows, code = NEEDS_WORKSPACE
+    cdef newton_cost_t cost
     cdef bint soft
     j.counts[0] = j.counts[1] = j.counts[2] = j.counts[3] = 0
     if not compute_missing_derived_numbers(j):
@@ -211,7 +212,8 @@ cdef inline void solve_task(task_t* j, workspace_t* workspace, workspace_t* isla
     v = make_judge_view(j)
     # cost limits, workspace
     soft = needs_no_proximal_terms(&j.p, &j.g)
-    o.work = max_factorisation_work(&j.p, &j.g, limits, soft)
+    cost = estimate_newton_cost_terms(&j.p, &j.g, limits)
+    o.work = max_factorisation_work(&j.p, &j.g, limits, &cost, soft)
     if not o.work > 0.0:
         return
     lav_workspace_size(&v, &o, &r)
@@ -220,10 +222,9 @@ cdef inline void solve_task(task_t* j, workspace_t* workspace, workspace_t* isla
             return
         r.index = workspace.index
         code = lav_start(&v, &o, &r, j.lam)
-    if (code != NEEDS_WORKSPACE
-            or estimate_newton_cost(&j.p, &j.g, limits, r.work) > max_newton_cost(&j.p, &j.g, limits, r.islands, soft)):
+    if code != NEEDS_WORKSPACE or cost.fixed + cost.per_work * r.work > max_newton_cost(&j.p, &j.g, limits, r.islands, soft):
         return
-    if m > limits.coulomb_rows and estimate_newton_cost(&j.p, &j.g, limits, r.work) > j.cost_limit:
+    if m > limits.coulomb_rows and cost.fixed + cost.per_work * r.work > j.cost_limit:
         return                                          # In a short time sweeps reach a smaller residual.
     if not grow_workspace_to(workspace, 0, r.n_real):
         return

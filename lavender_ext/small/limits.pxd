@@ -60,10 +60,15 @@ cdef inline double estimate_row_cost(const blocks_t* p, const limits_t* l) noexc
     return cost
 
 
-cdef inline double estimate_newton_cost(const blocks_t* p, const generalized_t* g, const limits_t* l, double work) noexcept nogil:
-    """Return the estimated cost [ns] of Newton's method, (1)."""
-    cdef double step = estimate_row_cost(p, l) + estimate_newton_step_cost(p, g, l, work)
-    return (1.0 if has_only_free_rows(p) else l.count) * step
+cdef struct newton_cost_t:      # the cost (1) as a linear function of w
+    double fixed                # ns
+    double per_work             # ns per multiply-add
+
+
+cdef inline newton_cost_t estimate_newton_cost_terms(const blocks_t* p, const generalized_t* g, const limits_t* l) noexcept nogil:
+    """Return the terms of the estimated cost of Newton's method, (1), with w multiply-adds per factorisation."""
+    cdef double count = 1.0 if has_only_free_rows(p) else l.count
+    return newton_cost_t(count * (estimate_row_cost(p, l) + estimate_newton_step_cost(p, g, l, 0.0)), count * l.work)
 
 
 cdef inline bint are_rows_short(const generalized_t* g, double columns) noexcept nogil:
@@ -78,16 +83,17 @@ cdef inline bint are_rows_short(const generalized_t* g, double columns) noexcept
 cdef inline double max_newton_cost(const blocks_t* p, const generalized_t* g, const limits_t* l, int32_t islands,
                                    bint soft) noexcept nogil:
     """Return the permitted cost [ns], 0 if Newton's method must not run; with a rigid row at most the estimated cost of sweeps."""
-    cdef bint frictional = has_friction(p)
-    cdef double each = l.sweep_cone if p.law != COULOMB and frictional else l.sweep_entry
-    cdef double sweep = l.sweep_row * p.n_rows + each * (2.0 * g.pval[g.n_panels] + 4.0 * p.n_rows)
     cdef double max_rows = l.coulomb_rows if p.law == COULOMB else INFINITY if soft else l.cone_rows
-    if frictional and islands * max_rows < p.n_rows < l.dense * g.n and are_rows_short(g, l.columns):
+    cdef double each
+    if islands * max_rows < p.n_rows < l.dense * g.n and has_friction(p) and are_rows_short(g, l.columns):
         return 0.0
-    return l.max_cost if soft else min(l.max_cost, l.start + l.sweeps * sweep)
+    if soft:
+        return l.max_cost
+    each = l.sweep_cone if p.law != COULOMB and has_friction(p) else l.sweep_entry
+    return min(l.max_cost, l.start + l.sweeps * (l.sweep_row * p.n_rows + each * (2.0 * g.pval[g.n_panels] + 4.0 * p.n_rows)))
 
 
-cdef inline double max_factorisation_work(const blocks_t* p, const generalized_t* g, const limits_t* l, bint soft) noexcept nogil:
+cdef inline double max_factorisation_work(const blocks_t* p, const generalized_t* g, const limits_t* l,
+                                          const newton_cost_t* cost, bint soft) noexcept nogil:
     """Return the maximum multiply-adds of factorising every island, for any number of islands."""
-    cdef double fixed = estimate_newton_cost(p, g, l, 0.0)
-    return (max_newton_cost(p, g, l, p.n_rows, soft) - fixed) / (estimate_newton_cost(p, g, l, 1.0) - fixed)
+    return (max_newton_cost(p, g, l, p.n_rows, soft) - cost.fixed) / cost.per_work

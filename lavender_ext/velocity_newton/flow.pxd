@@ -34,6 +34,7 @@ cdef struct descent_t:          # state of the Newton steps under one law
     int32_t slack_is_fresh      # s was recomputed from y, not updated along a step
     int32_t needs_matrix        # N must be formed again
     int32_t response_is_known   # lambda and V belong to the present s
+    int32_t is_rigid            # some proximal term exceeds rounding
     int32_t is_stiff            # N is not updated by changes of V (`min_theta_for_updates`)
     int32_t center_moved        # the centre has moved since the last step
     double softness             # rho as a fraction of d
@@ -76,7 +77,7 @@ cdef struct flow_t:
     int32_t is_zero             # y of the island is 0
     double* theta               # (m) theta' of `newton.pxd` (2), > 0
     double* inv_theta           # (m) 1 / theta'
-    double* sqrt_theta          # (m) theta'^1/2
+    double* sqrt_theta          # (m) theta'^1/2 of contacts
     double* rho                 # (m) proximal weight of `newton.pxd` (2), >= 0
     double* y                   # (max(n, m)) y; mu of `normal.pxd` if over rows
     double* u                   # Y^T lambda; A lambda if over rows
@@ -98,8 +99,9 @@ cdef struct flow_t:
     double* normal              # N of the present island in the pattern of L; under Coulomb's law a full matrix
     double* factor              # factor of `normal`
     linear_t linear             # linear system of N, S or I + A V
-    double* weighted_y          # (rows of a panel, columns) V times Y
-    double* line                # (columns)
+    double* weighted_y          # (rows of a panel, columns rounded up to a multiple of four) -V Y
+    double* used_y              # (rows of a panel, columns) rows of Y for those of -V Y
+    double* strip               # (STRIP_ROWS of normal.pxd, columns) rows of Y^T V Y of a panel
     double* local_rhs           # (s)
     int32_t n_free              # rows of S: rows with V != 0
     int32_t rows                # rows of an island over rows, rounded up to a multiple of four; padding is 0
@@ -197,14 +199,17 @@ cdef inline void compute_impulses(const flow_t* f, int32_t first, int32_t last, 
     cdef const double* center = f.center
     cdef const double* soft = f.inv_theta
     cdef double z, low, high
+    cdef bint is_free
     if f.bounded_rows_only:                             # V has one entry for each row, at the row's index
         end = ptr[last]
         for k in range(ptr[first], end):
             z = (rho[k] * center[k] - s[k]) * soft[k]
             low = lower[k]
             high = upper[k]
-            v[k] = soft[k] if low <= z <= high and low < high else 0.0
-            lam[k] = low if z < low else (high if z > high else z)
+            is_free = (low <= z) & (z <= high) & (low < high)       # without branches, for vector lanes
+            v[k] = soft[k] if is_free else 0.0
+            z = low if z < low else z
+            lam[k] = high if z > high else z
         return
     for i in range(first, last):
         j = ptr[i]

@@ -11,6 +11,7 @@ from lavender_ext.core.block_types cimport CONE, COULOMB, blocks_t, has_friction
 from lavender_ext.core.roots cimport find_root
 from lavender_ext.core.view cimport generalized_t
 from lavender_ext.velocity_newton.flow cimport flow_t, end_row_of_run, first_row_of_run
+from lavender_ext.velocity_newton.normal cimport STRIP_ROWS
 from lavender_ext.velocity_newton.sparse cimport count_mass_factor_work, find_pattern, pattern_index_size
 from lavender_ext.velocity_newton.soft cimport has_bounded_rows_only
 
@@ -21,9 +22,8 @@ cdef enum:
 
 cdef struct requirements_t:     # sizes of the workspace, and the work of a factorisation
     int32_t island_columns      # columns of the largest island
-    int32_t panel_columns       # columns of the widest panel
-    int32_t panel_values        # rows x columns of the largest panel
-    int32_t panel_rows          # rows of the panel with the largest number of rows
+    int32_t panel_columns       # columns of the widest panel, rounded up to a multiple of four
+    int32_t panel_values        # rows x columns of the largest panel, with columns rounded up
     int32_t rows                # number of rows of the largest island that is solved over rows, plus 3 for padding
     int32_t exceeds_pattern     # L has more entries than the given workspace; repeat with more
     double values               # values of the largest N of an island; its factor has as many
@@ -32,8 +32,11 @@ cdef struct requirements_t:     # sizes of the workspace, and the work of a fact
     double unused_entries       # upper bound of the entries of L of islands over rows, which are not factored
 
 
-cdef inline void join_trees(const generalized_t* g, int32_t* up) noexcept nogil:
-    """Write the union-find parents up (n): columns of one tree, and trees that a panel couples, share a root."""
+cdef inline int32_t join_trees(const generalized_t* g, int32_t* up) noexcept nogil:
+    """Write the union-find parents up (n): columns of one tree, and trees that a panel couples, share a root.
+
+    Returns the number of trees before panels couple them.
+    """
     cdef int32_t b, q, r, k, i, end, n = g.n, trees = 0
     cdef const int32_t* parent = g.parent
     cdef const int32_t* cols = g.cols
@@ -57,28 +60,52 @@ cdef inline void join_trees(const generalized_t* g, int32_t* up) noexcept nogil:
                 elif k < r:
                     up[r] = k
                     r = k
+    return trees
+
+
+cdef inline bint list_single_island(flow_t* f, requirements_t* need) noexcept nogil:
+    """Put all panels into one island and list its columns; return False if some panel has no columns."""
+    cdef int32_t i, q, n = 0
+    cdef const generalized_t* g = f.g
+    cdef int32_t* iptr = <int32_t*>f.iptr
+    cdef int32_t* run = <int32_t*>f.run
+    cdef int32_t* cptr = <int32_t*>f.cptr
+    cdef int32_t* icols = <int32_t*>f.icols
+    cdef int32_t* local = <int32_t*>f.local
+    for i in range(g.n_panels):
+        if g.pcol[i + 1] == g.pcol[i]:
+            return False
+    f.n_islands, iptr[0], iptr[1], run[0], run[1] = 1, 0, 1, 0, g.n_panels
+    for i in range(g.n):
+        local[i] = -1
+    for q in range(g.pcol[g.n_panels]):
+        local[g.cols[q]] = 0
+    for i in range(g.n):
+        if local[i] == 0:
+            local[i], icols[n] = n, i
+            n += 1
+    cptr[0], cptr[1], need.island_columns = 0, n, n
+    return True
 
 
 cdef inline void index_panels(flow_t* f, requirements_t* need) noexcept nogil:
     """Write the first block of each panel to `pblock`, and the offset of each block's V to `vptr`.
 
-    `need` receives the largest number of columns, values and rows of a panel.
+    `need` receives the largest number of columns and values of a panel.
     """
-    cdef int32_t b, i = 0, size, nc, rows, at = 0
+    cdef int32_t b, i = 0, size, nc, at = 0
     cdef const int32_t* ptr = f.p.ptr
     cdef int32_t* pblock = <int32_t*>f.pblock
     cdef int32_t* vptr = <int32_t*>f.vptr
     cdef const generalized_t* g = f.g
-    need.panel_columns = need.panel_values = need.panel_rows = 0
+    need.panel_columns = need.panel_values = 0
     for b in range(g.n_panels):
         while ptr[i] < g.prow[b]:
             i += 1
         pblock[b] = i
-        nc = g.pcol[b + 1] - g.pcol[b]
-        rows = g.prow[b + 1] - g.prow[b]
+        nc = g.pcol[b + 1] - g.pcol[b] + 3 & ~3
         need.panel_columns = max(need.panel_columns, nc)
-        need.panel_values = max(need.panel_values, rows * nc)
-        need.panel_rows = max(need.panel_rows, rows)
+        need.panel_values = max(need.panel_values, (g.prow[b + 1] - g.prow[b]) * nc)
     pblock[g.n_panels] = f.p.n_blocks
     for i in range(f.p.n_blocks):
         vptr[i] = at
@@ -101,7 +128,8 @@ cdef inline void find_islands(flow_t* f, int32_t* up, int32_t* label, requiremen
     cdef int32_t* cptr = <int32_t*>f.cptr
     cdef int32_t* icols = <int32_t*>f.icols
     cdef int32_t* local = <int32_t*>f.local
-    join_trees(g, up)
+    if join_trees(g, up) == 1 and list_single_island(f, need):
+        return
     # Label each panel with the number of its island; `local` holds the numbers of the roots.
     for i in range(g.n):
         local[i] = -1
@@ -256,7 +284,7 @@ cdef inline void bind_iterate(flow_t* f, const requirements_t* need, arena_t* a)
     f.v, f.factored_v = take_doubles(a, nv), take_doubles(a, nv)
     f.normal, f.factor = take_doubles(a, values), take_doubles(a, values)
     f.linear.scale, f.local_rhs, f.weighted_y = take_doubles(a, size), take_doubles(a, size), take_doubles(a, need.panel_values)
-    f.line = take_doubles(a, need.panel_columns + need.panel_rows + 1)
+    f.used_y, f.strip = take_doubles(a, need.panel_values), take_doubles(a, STRIP_ROWS * need.panel_columns)
     f.sum, f.y_transpose = take_doubles(a, 2 * need.rows), take_doubles(a, <int64_t>need.row_matrix_values)
     f.a = NULL
 

@@ -176,41 +176,35 @@ cdef inline void set_proximal_terms(flow_t* f, int32_t island, double softness) 
     cdef double* rho = f.rho
     cdef double* soft = f.inv_theta
     cdef double x, low
-    cdef bint is_stiff = False
+    cdef bint is_stiff = False, is_rigid = False
     for a in range(f.iptr[island], f.iptr[island + 1]):
         last = end_block_of_run(f, a)
         for i in range(first_block_of_run(f, a), last):
             j = f.p.ptr[i]
-            end = f.p.ptr[i + 1]
+            # All blocks of a run of bounded rows have the same limit.
+            end = f.p.ptr[last] if f.bounded_rows_only else f.p.ptr[i + 1]
             low = min_relative_compliance(&f.p, i)
             if softness < low:
                 low = softness
             for k in range(j, end):
                 x = compliance[k]
-                if not x >= low * d[k]:
-                    x += softness * d[k]
-                theta[k] = x
+                theta[k] = x if x >= low * d[k] else x + softness * d[k]
+            if f.bounded_rows_only:
+                break
             if not has_bounded_rows_only(&f.p, i):
                 get_friction_components(&f.p, i, &q)
                 for g in range(q.n):
                     if q.size[g] > 1:
                         set_theta_to_maximum(theta, j + q.first[g], j + q.first[g] + q.size[g])
-            for k in range(j, end):
-                rho[k] = theta[k] - compliance[k]
-                soft[k] = 1.0 / theta[k]
-                is_stiff |= theta[k] < min_theta_for_updates() * d[k]
-                f.sqrt_theta[k] = sqrt(theta[k])
-    f.descent.is_stiff = is_stiff
-
-
-cdef inline bint has_proximal_terms(const flow_t* f, int32_t island) noexcept nogil:
-    """Return whether any proximal term exceeds rounding."""
-    cdef int32_t a, k
-    for a in range(f.iptr[island], f.iptr[island + 1]):
-        for k in range(first_row_of_run(f, a), end_row_of_run(f, a)):
-            if f.rho[k] > 1e-13 * f.theta[k]:
-                return True
-    return False
+                for k in range(j, end):
+                    f.sqrt_theta[k] = sqrt(theta[k])
+        end = end_row_of_run(f, a)
+        for k in range(first_row_of_run(f, a), end):
+            rho[k] = theta[k] - compliance[k]
+            soft[k] = 1.0 / theta[k]
+            is_stiff |= theta[k] < min_theta_for_updates() * d[k]
+            is_rigid |= rho[k] > 1e-13 * theta[k]
+    f.descent.is_stiff, f.descent.is_rigid = is_stiff, is_rigid
 
 
 cdef inline double compute_proximal_energy_error(const flow_t* f, int32_t island) noexcept nogil:
@@ -304,9 +298,8 @@ cdef inline int32_t descend_island(flow_t* f, int32_t island, double goal) noexc
     """
     cdef descent_t* x = &f.descent
     cdef int32_t a, c, change
-    cdef bint square = f.p.law == COULOMB, rigid, moves, is_far
+    cdef bint square = f.p.law == COULOMB, rigid = x.is_rigid, moves, is_far
     cdef double energy = 0.0, t, size, bound, over
-    rigid = has_proximal_terms(f, island)
     while True:
         if not x.response_is_known:
             compute_island_impulses(f, island, f.s, f.lam)

@@ -15,111 +15,69 @@ and with contacts, whose blocks of V may be full, with a the rows of the blocks 
     (I + A_aa V_aa) t = h_a,    x = V_aa t,    pi = lambda - mu + E_a x,    q = A E_a x - h,    q_a = -t      (3)
 """
 from libc.stdint cimport int32_t
-from libc.string cimport memcpy
+from libc.string cimport memcpy, memset
 
 from lavender_ext.core.dot cimport dot
 from lavender_ext.factor.linear cimport (CHOLESKY, LU, analyse_dense, analyse_tree, factor_linear_system_matrix,
                                          solve_linear_system, linear_t)
-from lavender_ext.factor.tiles cimport combine_rows
+from lavender_ext.factor.tiles cimport combine_rows, gemm_subtract_nt
 from lavender_ext.velocity_newton.flow cimport end_block_of_run, first_block_of_run, form_column_of_a, flow_t, multiply_y
 from lavender_ext.velocity_newton.soft cimport has_bounded_rows_only
 
 
-cdef inline void scale_row(double* out, const double* x, double f, int32_t n) noexcept nogil:
-    """Compute out = f x."""
-    cdef int32_t i
-    for i in range(n):
-        out[i] = f * x[i]
+cdef enum:
+    STRIP_ROWS = 6              # rows of Y^T (V Y) of a panel that are computed together
 
 
-cdef inline void add_row(double* out, const double* x, double f, int32_t n) noexcept nogil:
-    """Add f x to out."""
-    cdef int32_t i
-    for i in range(n):
-        out[i] += f * x[i]
+cdef inline void append_weighted_row(const flow_t* f, const double* y, double v, int32_t nc, int32_t n) noexcept nogil:
+    """Write row n of `weighted_y`, -v y padded with 0, and of `used_y`, y."""
+    cdef int32_t k, stride = nc + 3 & ~3
+    cdef double* out = f.weighted_y + <ssize_t>n * stride
+    cdef double* used = f.used_y + <ssize_t>n * nc
+    for k in range(nc):
+        out[k] = -v * y[k]
+        used[k] = y[k]
+    for k in range(nc, stride):
+        out[k] = 0.0
 
 
-cdef inline void scale_row_2(double* out, const double* x, const double* y, double f, double g, int32_t n) noexcept nogil:
-    """Compute out = f x + g y."""
-    cdef int32_t i
-    for i in range(n):
-        out[i] = f * x[i] + g * y[i]
+cdef inline int32_t append_weighted_block(const flow_t* f, const double* v, int32_t i, int32_t nc, const double* y,
+                                          int32_t n) noexcept nogil:
+    """Append the rows of -V Y of block i, padded with 0 to a multiple of four columns, to the n rows of `weighted_y`.
 
-
-cdef inline void scale_row_3(double* out, const double* x, const double* y, const double* z, double f, double g, double h,
-                         int32_t n) noexcept nogil:
-    """Compute out = f x + g y + h z."""
-    cdef int32_t i
-    for i in range(n):
-        out[i] = (f * x[i] + g * y[i]) + h * z[i]
-
-
-cdef inline void add_row_3(double* out, const double* x, const double* y, const double* z, double f, double g, double h,
-                       int32_t n) noexcept nogil:
-    """Add f x + g y + h z to out."""
-    cdef int32_t i
-    for i in range(n):
-        out[i] += (f * x[i] + g * y[i]) + h * z[i]
-
-
-cdef inline int32_t multiply_block_by_v(const flow_t* f, const double* v, int32_t i, int32_t row, int32_t nc, const double* y,
-                                        int32_t n) noexcept nogil:
-    """Append the non-zero rows of V Y of block i, with V in v, to the n rows of `weighted_y`; return the new number of rows.
-
-    `row` is the block's first row within its panel. `line` receives, after its columns, the row of Y of each appended row.
+    Rows of V that are 0 are omitted. `used_y` receives the row of Y for each row. v has the block's V, y its rows of Y.
+    Returns the new number of rows.
     """
-    cdef int32_t j = f.p.ptr[i], size = f.p.ptr[i + 1] - j, r, c
+    cdef int32_t size = f.p.ptr[i + 1] - f.p.ptr[i], r, c, k, first
     cdef double* out
-    cdef bint any_
     if has_bounded_rows_only(&f.p, i):
         for r in range(size):
             if v[r] != 0.0:
-                scale_row(f.weighted_y + n * nc, y + <ssize_t>(row + r) * nc, v[r], nc)
-                f.line[nc + n] = row + r
+                append_weighted_row(f, y + <ssize_t>r * nc, v[r], nc, n)
                 n += 1
         return n
     for r in range(size):
-        out = f.weighted_y + n * nc
-        any_ = False
-        for c in range(size):
-            if v[r * size + c] != 0.0:
-                if any_:
-                    add_row(out, y + <ssize_t>(row + c) * nc, v[r * size + c], nc)
-                else:
-                    scale_row(out, y + <ssize_t>(row + c) * nc, v[r * size + c], nc)
-                any_ = True
-        if any_:
-            f.line[nc + n] = row + r
+        first = 0
+        while first < size and v[first] == 0.0:
+            first += 1
+        if first < size:
+            append_weighted_row(f, y + <ssize_t>r * nc, v[r], nc, n)
+            out = f.weighted_y + <ssize_t>n * (nc + 3 & ~3)
+            for c in range(first, size):
+                if c != r and v[c] != 0.0:
+                    for k in range(nc):
+                        out[k] -= v[c] * y[<ssize_t>c * nc + k]
             n += 1
+        v += size
     return n
 
 
-cdef inline void weighted_row(const flow_t* f, const double* y, int32_t nc, int32_t n, int32_t a, int32_t end) noexcept nogil:
-    """Compute row a of Y^T (V Y), columns before `end`, into `line`."""
-    cdef int32_t r = 3
-    cdef const double* t = f.weighted_y
-    cdef double* line = f.line
-    cdef const double* at = line + nc                   # index of the row of Y for each row of `weighted_y`
-    cdef double f0 = y[<int32_t>at[0] * nc + a], f1, f2
-    if n == 1:
-        scale_row(line, t, f0, end)
-        return
-    f1 = y[<int32_t>at[1] * nc + a]
-    if n == 2:
-        scale_row_2(line, t, t + nc, f0, f1, end)
-        return
-    f2 = y[<int32_t>at[2] * nc + a]
-    scale_row_3(line, t, t + nc, t + 2 * nc, f0, f1, f2, end)
-    while r + 3 <= n:
-        f0 = y[<int32_t>at[r] * nc + a]
-        f1 = y[<int32_t>at[r + 1] * nc + a]
-        f2 = y[<int32_t>at[r + 2] * nc + a]
-        t = f.weighted_y + r * nc
-        add_row_3(line, t, t + nc, t + 2 * nc, f0, f1, f2, end)
-        r += 3
-    while r < n:
-        add_row(line, f.weighted_y + r * nc, y[<int32_t>at[r] * nc + a], end)
-        r += 1
+cdef inline void multiply_strip(const flow_t* f, int32_t n, int32_t nc, int32_t first, int32_t end) noexcept nogil:
+    """Compute rows [first, first + STRIP_ROWS) of Y^T (V Y), columns before `end`, from n appended rows into `strip`."""
+    cdef int32_t stride = nc + 3 & ~3
+    memset(f.strip, 0, STRIP_ROWS * stride * sizeof(double))
+    gemm_subtract_nt(f.wide, end + 3 & ~3, min(STRIP_ROWS, nc - first), n, f.weighted_y, stride, f.used_y + first, nc, f.strip,
+                     stride)
 
 
 cdef inline void add_panel_to_sparse_matrix(const flow_t* f, int32_t panel, int32_t n, int32_t size) noexcept nogil:
@@ -130,15 +88,16 @@ cdef inline void add_panel_to_sparse_matrix(const flow_t* f, int32_t panel, int3
     cdef const int32_t* local = f.local
     cdef const int32_t* lptr = f.lptr + c0
     cdef const int32_t* theirs
-    cdef const double* y = f.g.y + f.g.pval[panel]
-    cdef double* line = f.line
+    cdef const double* line
     cdef double* val = f.normal - lptr[0]
     cdef double* diag = f.normal + (lptr[size] - lptr[0])
     cdef double* to
     for a in range(nc):
+        if a % STRIP_ROWS == 0:
+            multiply_strip(f, n, nc, a, min(a + STRIP_ROWS, nc))
+        line = f.strip + a % STRIP_ROWS * (nc + 3 & ~3)
         k = local[cols[a]]
         to = val + lptr[k]
-        weighted_row(f, y, nc, n, a, a + 1)
         diag[k] += line[a]
         if lptr[k + 1] - lptr[k] == a:                  # Row k has the panel's columns only.
             for b in range(a):
@@ -161,11 +120,12 @@ cdef inline void add_panel_to_dense_matrix(const flow_t* f, int32_t panel, int32
     cdef int32_t nc = f.g.pcol[panel + 1] - f.g.pcol[panel], a, b
     cdef const int32_t* cols = f.g.cols + f.g.pcol[panel]
     cdef const int32_t* local = f.local
-    cdef const double* y = f.g.y + f.g.pval[panel]
-    cdef double* line = f.line
+    cdef const double* line
     cdef double* row
     for a in range(nc):
-        weighted_row(f, y, nc, n, a, nc)
+        if a % STRIP_ROWS == 0:
+            multiply_strip(f, n, nc, a, nc)
+        line = f.strip + a % STRIP_ROWS * (nc + 3 & ~3)
         row = f.normal + <ssize_t>(size - 1 - local[cols[a]]) * size + size - 1
         for b in range(nc):
             row[-local[cols[b]]] += line[b]
@@ -199,22 +159,13 @@ cdef inline bint has_nonzero_v(const flow_t* f, int32_t island) noexcept nogil:
     return False
 
 
-cdef inline void store_v(const flow_t* f, int32_t island) noexcept nogil:
-    """Store the V with which N is formed."""
+cdef inline void store_v(const flow_t* f, int32_t island, bint as_change) noexcept nogil:
+    """Store V in `factored_v`, or its difference from the V there."""
     cdef int32_t a, k, end
     for a in range(f.iptr[island], f.iptr[island + 1]):
         end = f.vptr[end_block_of_run(f, a)]
         for k in range(f.vptr[first_block_of_run(f, a)], end):
-            f.factored_v[k] = f.v[k]
-
-
-cdef inline void replace_stored_v_by_change(const flow_t* f, int32_t island) noexcept nogil:
-    """Replace the stored V by the difference of V from it."""
-    cdef int32_t a, k, end
-    for a in range(f.iptr[island], f.iptr[island + 1]):
-        end = f.vptr[end_block_of_run(f, a)]
-        for k in range(f.vptr[first_block_of_run(f, a)], end):
-            f.factored_v[k] = f.v[k] - f.factored_v[k]
+            f.factored_v[k] = f.v[k] - f.factored_v[k] if as_change else f.v[k]
 
 
 # -- over rows: S of (1), or I + A V of (3) ---------------------------------------------------------------------------------
@@ -302,20 +253,11 @@ cdef inline void solve_row_step(flow_t* f) noexcept nogil:
 
 cdef inline void set_identity(const flow_t* f, int32_t island, bint square) noexcept nogil:
     """Set N = I."""
-    cdef int32_t a, b, n = 0, size = f.cptr[island + 1] - f.cptr[island]
-    cdef double* normal = f.normal
-    if square:
-        for a in range(size):
-            for b in range(size):
-                normal[b] = 0.0
-            normal[a] = 1.0
-            normal += size
-        return
-    n = f.lptr[f.cptr[island + 1]] - f.lptr[f.cptr[island]]
-    for a in range(n):
-        normal[a] = 0.0
-    for a in range(n, n + size):
-        normal[a] = 1.0
+    cdef int32_t a, size = f.cptr[island + 1] - f.cptr[island], n, step = size + 1 if square else 1
+    n = 0 if square else f.lptr[f.cptr[island + 1]] - f.lptr[f.cptr[island]]
+    memset(f.normal, 0, (<ssize_t>size * size if square else n + size) * sizeof(double))
+    for a in range(size):
+        f.normal[n + <ssize_t>a * step] = 1.0
 
 
 cdef inline void form_normal_matrix(flow_t* f, int32_t island, bint square, bint updates) noexcept nogil:
@@ -324,11 +266,11 @@ cdef inline void form_normal_matrix(flow_t* f, int32_t island, bint square, bint
     cdef const double* y
     cdef const double* v = f.v
     if f.is_over_rows:
-        store_v(f, island)
+        store_v(f, island, False)
         form_row_matrix(f)
         return
     if updates:
-        replace_stored_v_by_change(f, island)
+        store_v(f, island, True)
         v = f.factored_v
     else:
         set_identity(f, island, square)
@@ -340,12 +282,12 @@ cdef inline void form_normal_matrix(flow_t* f, int32_t island, bint square, bint
             n = 0
             last = f.pblock[b + 1]
             for i in range(f.pblock[b], last):
-                n = multiply_block_by_v(f, v + f.vptr[i], i, f.p.ptr[i] - f.g.prow[b], nc, y, n)
+                n = append_weighted_block(f, v + f.vptr[i], i, nc, y + <ssize_t>(f.p.ptr[i] - f.g.prow[b]) * nc, n)
             if n > 0 and square:
                 add_panel_to_dense_matrix(f, b, n, size)
             elif n > 0:
                 add_panel_to_sparse_matrix(f, b, n, size)
-    store_v(f, island)
+    store_v(f, island, False)
 
 
 cdef inline bint factor_normal_matrix(flow_t* f, int32_t island, bint square) noexcept nogil:
