@@ -80,8 +80,7 @@ class ClaimComparison:
         Name of the worst row, with numbers removed -> number of wrong answers with this worst row, and their largest
         error [m/s].
     masses : list of (float, bool)
-        Effective mass [kg] of the worst row of each wrong answer, and whether the engine claimed that it had
-        converged.
+        Effective mass [kg] of the worst row of each wrong answer, and whether the engine claimed that it had converged.
     stopped : bool
         Ctrl-C ended the run early.
     error_limit : float, m/s, optional

@@ -135,8 +135,7 @@ def read_engine_states(source: Any, names: tuple[str, ...]) -> EngineState:
     Raises
     ------
     InputError
-        The file cannot be read, has arrays with other names or different numbers of entries, or a number is not
-        finite.
+        The file cannot be read, has arrays with other names or different numbers of entries, or a number is not finite.
     """
     label = "states"
     if isinstance(source, (str, os.PathLike)):

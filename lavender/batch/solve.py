@@ -322,8 +322,7 @@ def solve_many(
     impulses : sequence of (m,) N s, optional
         For problems: warm start of each, or None. Default: as for `solve`.
     threads : int
-        Number of worlds that are solved at the same time. Each thread starts the next world that no thread has
-        started.
+        Number of worlds that are solved at the same time. Each thread starts the next world that no thread has started.
     tol, max_iter, **options
         As for `solve`.
     velocity_tol : float, optional, m/s

@@ -74,11 +74,10 @@ def report(
 
     Every solver runs on every case, to each tolerance and with each budget.
 
-    FILES are problems (.npz, .hdf5), folders of them, folders of recorded steps, or cases of the built-in
-    suite such as "stack(n=64)"; without any, the built-in suite runs. A MuJoCo model (.xml) is simulated first,
-    and its steps are recorded in the folder of the report. For a records.jsonl, the report is written again
-    without solving; --solvers then selects the solvers that it shows. After an interruption, the same command
-    continues where it stopped.
+    FILES are problems (.npz, .hdf5), folders of them, folders of recorded steps, or cases of the built-in suite such as
+    "stack(n=64)"; without any, the built-in suite runs. A MuJoCo model (.xml) is simulated first, and its steps are
+    recorded in the folder of the report. For a records.jsonl, the report is written again without solving; --solvers
+    then selects the solvers that it shows. After an interruption, the same command continues where it stopped.
 
     Exit code 1: a file in a folder cannot be read, a step could not be recorded, or nothing was measured. Exit code 2:
     a named file cannot be read, or another report is writing to the folder.

@@ -9,9 +9,8 @@ that hold for the data of real bodies:
     targets     target = b + J v*: zero on tangents, not negative if bodies overlap                     (3)
     speeds      v* is a velocity, not g = 9.81 m/s^2; targets and approach speeds are plausible         (4)
 
-For a problem in J and M, (1) is checked if all contacts belong to free rigid bodies: six velocities in the world
-frame, coupled to no others, three of them with equal mass. A row of direction d then has J = (d, r x d) with the arm
-r.
+For a problem in J and M, (1) is checked if all contacts belong to free rigid bodies: six velocities in the world frame,
+coupled to no others, three of them with equal mass. A row of direction d then has J = (d, r x d) with the arm r.
 
 Thresholds are well outside the values that occur in the built-in suite, the scenes of the gallery, robots and recorded
 problems. If the numbers would be ordinary under another interpretation (M^-1 read as M), the diagnostic says so.

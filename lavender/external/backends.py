@@ -348,8 +348,7 @@ def _make_spec(backend: Backend) -> SolverSpec:
         name=backend.name,
         factory=partial(QPSolver, backend),
         laws=frozenset({"linear", "lcp", *(["cone"] if backend.cones else [])}),
-        # Under the law "cone", friction boxes are written as one row for each edge of the cone, which makes A
-        # singular.
+        # Under the law "cone", friction boxes are written as one row for each edge of the cone, which makes A singular.
         box_friction_laws=frozenset() if backend.needs_definite else frozenset({"cone"}),
         resumable=False,
         external=True,

@@ -605,8 +605,7 @@ def derivative(problem: Problem, solution: Any) -> Derivative:
     -------
     Derivative
         `.vjp(velocity=, impulse=)` computes gradients by all data, `.jvp(b=, mu=, ...)` changes of the solution.
-        `.states`, `.distance`, `.switching` and `.unique` show whether the derivative exists and is
-        unique.
+        `.states`, `.distance`, `.switching` and `.unique` show whether the derivative exists and is unique.
 
     Raises
     ------

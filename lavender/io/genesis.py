@@ -50,9 +50,8 @@ def from_genesis(scene: Any) -> EngineStep:
     InputError
         `scene` is not a built scene with rigid bodies.
     CapabilityError
-        The scene uses noslip iterations, hibernation, or the SAP or IPC coupler; the Signorini condition with
-        torsional or rolling friction; attributes of this version are missing; or M qacc_smooth is not the smooth
-        force.
+        The scene uses noslip iterations, hibernation, or the SAP or IPC coupler; the Signorini condition with torsional
+        or rolling friction; attributes of this version are missing; or M qacc_smooth is not the smooth force.
     """
     solver = getattr(getattr(scene, "sim", None), "rigid_solver", None)
     if solver is None or not getattr(scene, "is_built", False):

@@ -174,8 +174,7 @@ def read_states(mj: Any, model: Any, source: Any) -> StartStates:
     Raises
     ------
     InputError
-        The file cannot be read, or its arrays do not fit the model; a number is not finite; the model has no
-        keyframes.
+        The file cannot be read, or its arrays do not fit the model; a number is not finite; the model has no keyframes.
     """
     if isinstance(source, StartStates):
         return source

@@ -74,8 +74,7 @@ MAX_EXCUSED_RESIDUAL = 1e-5
 MAX_REST_VELOCITY = 1e-9  # [m/s] If V0 is smaller, the zero impulse counts as the problem's solution.
 UNIT_ROUNDOFF_FLOAT32 = 2.0**-24  # u of float32: half the distance from 1 to the next number.
 
-# at_floor(relative, floor) returns whether rounding explains the residual of one island. Solvers call this kernel,
-# too.
+# at_floor(relative, floor) returns whether rounding explains the residual of one island. Solvers call this kernel, too.
 at_floor = measure.is_residual_at_floor
 
 TOL = 1e-6  # [-] Default tolerance of `residual` and `solve`.

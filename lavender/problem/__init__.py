@@ -2,9 +2,8 @@
 
     A = J M^-1 J^T + diag(compliance)  [1/kg],   b = target - J v*  [m/s],   w = A lambda - b  [m/s]
 
-`Problem` holds one of three forms of A: rows (J and M^-1 of bodies, `lavender/problem/rows.py`), J and M in
-generalised coordinates (`lavender/problem/generalized.py`), or a matrix. Other quantities are derived at their first
-use.
+`Problem` holds one of three forms of A: rows (J and M^-1 of bodies, `lavender/problem/rows.py`), J and M in generalised
+coordinates (`lavender/problem/generalized.py`), or a matrix. Other quantities are derived at their first use.
 
 Each of these files builds on the files before it: `data.py` (fields and their checks), `operators.py` (A, J and the
 metric), `program.py` (quadratic programs), `builders.py` (class methods that build problems), `problem.py` (`Problem`

@@ -184,8 +184,7 @@ class Builders(Operators):
             Bounds of rows with findex < 0. On other rows, `upper` is mu [-] and `lower` is ignored, as in these
             engines.
         findex : (m,) int
-            Index of the normal row that bounds this row by |lambda_i| <= upper_i lambda_findex; -1 for constant
-            bounds.
+            Index of the normal row that bounds this row by |lambda_i| <= upper_i lambda_findex; -1 for constant bounds.
         **more
             Keywords of `Problem`: name, names, ...
 

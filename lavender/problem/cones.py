@@ -11,8 +11,7 @@ A block is one or more bounded rows (`ROW`), or a contact: a normal row, 0 to 2 
     CONTACT_ELLIPSE  0 <= lambda_n,  |(lambda_1 / mu, lambda_2 / (mu q))| <= lambda_n. The problem is solved and judged
                   in stretched tangents, in which the ellipse is a disk of the larger coefficient (`Problem.disk`)
     ROUND         0 <= lambda_n, |lambda_T| <= mu lambda_n with the norm over three to five tangents: two sliding, one
-                  spin, two rolling; each row is scaled by its own coefficient divided by mu, so that mu bounds all
-                  rows
+                  spin, two rolling; each row is scaled by its own coefficient divided by mu, so that mu bounds all rows
     CONTACT_ROLLING  as CONTACT or CONTACT_SPIN with two tangents, and |lambda_r| <= mu_r lambda_n on two rolling rows;
                   mu_r [m] is the distance by which rolling moves the normal force
 """

@@ -74,10 +74,9 @@ class Rows:
         Whether to copy the arrays. If false, arrays are used without a copy if their type fits; they are then shared
         with the caller and marked read-only, and inertias are not symmetrised.
 
-    An empty list means no joints, contacts or bodies. float32 arrays are converted to float64. Normals and
-    tangents that differ from orthogonal unit vectors by up to 1e-5 are corrected, and so are inertias that are
-    asymmetric by as much. If all arrays of numbers are float32, the `precision` of the rows and of their problems is
-    "float32".
+    An empty list means no joints, contacts or bodies. float32 arrays are converted to float64. Normals and tangents
+    that differ from orthogonal unit vectors by up to 1e-5 are corrected, and so are inertias that are asymmetric by as
+    much. If all arrays of numbers are float32, the `precision` of the rows and of their problems is "float32".
 
     Raises
     ------

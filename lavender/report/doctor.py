@@ -44,8 +44,7 @@ HASHES = {
 def run_self_test() -> dict[str, str]:
     """Compute the hash of each part: sweeps over a matrix and over bodies, exact blocks, steps of scenes.
 
-    `newton`, `direct` and `admm` are left out: parts of them use BLAS and LAPACK, and their bits depend on the
-    library.
+    `newton`, `direct` and `admm` are left out: parts of them use BLAS and LAPACK, and their bits depend on the library.
     """
     results = {}
     for name in ("pgs", "block_gauss_seidel", "nncg", "anderson"):

@@ -35,8 +35,7 @@ from lavender.solvers.registry import SolverSpec
 
 # If a step took less than this fraction of the time limit, no guarded solve (`timing`) precedes the next step's.
 UNGUARDED_TIME_RATIO = 0.05
-# Each step of a sequence with more steps is solved once, not `Plan.repeats` times: the sum over many steps varies
-# less.
+# Each step of a sequence with more steps is solved once, not `Plan.repeats` times: the sum over many steps varies less.
 MAX_REPEATED_STEPS = 20
 # A solver with up to this multiple of the fastest time on a case is timed again, alternately with the fastest.
 NEAR_TIME_RATIO = 1.6
@@ -399,8 +398,7 @@ class Runner:
             self.report_progress(task.case, spec.name, record, True)
         before: tuple[Problem, FloatArray] | None = None
         if call.start == "carried" and 0 < made < len(tasks) and spent <= limit:
-            # If an earlier run was stopped in this pass, repeat its steps without records for the last step's
-            # impulses.
+            # If an earlier run was stopped in this pass, repeat its steps without records for the last step's impulses.
             for item, task in zip(problems[:made], tasks, strict=False):
                 again = replace(task, repeats=1)
                 before = self.measure_step(item.problem, again, spec, before)[1]

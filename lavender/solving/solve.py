@@ -63,8 +63,7 @@ def solve(
         other packages run in a separate process, which is reused by later solves and killed at the limit (at twice the
         limit if the package has a time limit of its own); `isolate=False` runs them in this process.
     history : bool
-        Record iterations, time and residual at fixed numbers of iterations, in a `History`; with `auto`, of all
-        stages.
+        Record iterations, time and residual at fixed numbers of iterations, in a `History`; with `auto`, of all stages.
     callback : callable (iterations, impulse, residual), optional
         Called whenever history would be recorded; the solve stops if it returns a true value.
     **options

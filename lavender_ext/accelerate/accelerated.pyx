@@ -7,10 +7,9 @@
               f = D^1/2 (y - x), over the last `memory` sweeps                                        (2)
 
 nncg is the nonsmooth nonlinear conjugate gradient method, anderson is Anderson mixing. D = diag d, with which both methods use
-the energy norm. S is a sweep of projected Gauss-Seidel or of exact blocks (local/gauss_seidel.pyx), over A
-in compressed rows, over the factored form with v = M^-1 J^T lam, or over J and M with v = Y^T lam. With the symmetric order S
-is a sweep followed by the same sweep backwards. The returned iterate is always the result y of a sweep. All sums have a fixed
-order.
+the energy norm. S is a sweep of projected Gauss-Seidel or of exact blocks (local/gauss_seidel.pyx), over A in compressed rows,
+over the factored form with v = M^-1 J^T lam, or over J and M with v = Y^T lam. With the symmetric order S is a sweep followed
+by the same sweep backwards. The returned iterate is always the result y of a sweep. All sums have a fixed order.
 
 (2) and its safeguards are implemented in accelerate/mixing.pxd. The first `convex` iterations may sweep under the cone law,
 which has the same solution as Coulomb's law if all contacts stick. If `convex` is AUTOMATIC and there are MIN_CONVEX_ROWS rows,

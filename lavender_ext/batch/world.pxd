@@ -1,8 +1,7 @@
 """One world of a batch that is stored in a few arrays, float32 or float64, converted to the structs that kernels read.
 
-The results are the numbers of `Generalized` from the same arrays: J and the lower triangle of M in compressed
-rows without zeros, M = L^T D L in the given order, b = target - J v*. A world that `Generalized` would reorder is deferred
-to the caller.
+The results are the numbers of `Generalized` from the same arrays: J and the lower triangle of M in compressed rows without
+zeros, M = L^T D L in the given order, b = target - J v*. A world that `Generalized` would reorder is deferred to the caller.
 """
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcmp, memcpy, memset

@@ -293,9 +293,8 @@ cdef class Linear:
 
         An argument that is None counts as 0.
 
-        A factor is required; n is 0 for (2). None is returned if all three are None, or if one is not such an array or
-        not finite; the caller
-        then validates in detail.
+        A factor is required; n is 0 for (2). None is returned if all three are None, or if one is not such an array or not
+        finite; the caller then validates in detail.
         """
         cdef Py_ssize_t n = 3 * self.at.v.p.n_rows + self.at.n
         out = empty(n)

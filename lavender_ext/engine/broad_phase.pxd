@@ -1,15 +1,13 @@
 """The broad phase: a list of body pairs with overlapping boxes, reused while every body stays in its box.
 
-Each body has an axis-aligned box that is larger than its shape by margin + skin. The list holds every pair
-of overlapping boxes, sorted by bodies. It is rebuilt when a shape with its margin leaves its box. The narrow
-phase drops pairs beyond the margin, so that the contacts depend on the poses alone, never on the age of the
-list.
+Each body has an axis-aligned box that is larger than its shape by margin + skin. The list holds every pair of overlapping
+boxes, sorted by bodies. It is rebuilt when a shape with its margin leaves its box. The narrow phase drops pairs beyond the
+margin, so that the contacts depend on the poses alone, never on the age of the list.
 
-With few bodies, every pair is tested. With many bodies, a hash grid has one level for each power of two in
-size. A body is stored in the cell of its centre, at the finest level with cells at least as large as its box.
-It searches the neighbouring cells of coarser levels and, on its own level, the cells that follow its own. The
-cost is linear in bodies and pairs for any mix of sizes; counting sorts put the pairs in order. The search stops
-when more than MAX_PAIRS boxes overlap.
+With few bodies, every pair is tested. With many bodies, a hash grid has one level for each power of two in size. A body is
+stored in the cell of its centre, at the finest level with cells at least as large as its box. It searches the neighbouring
+cells of coarser levels and, on its own level, the cells that follow its own. The cost is linear in bodies and pairs for any mix
+of sizes; counting sorts put the pairs in order. The search stops when more than MAX_PAIRS boxes overlap.
 """
 from libc.math cimport fabs, floor
 from libc.stdint cimport int32_t, uint32_t

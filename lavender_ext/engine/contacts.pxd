@@ -16,9 +16,8 @@ loaded contact has the same slop above the surface as below, and returns at the 
 
 Combined: mu = sqrt(mu_a mu_b), e = max, patch radius = min.
 
-Contacts are built pair by pair. Under the alternating order, every second substep runs from the last point of the
-last pair to the first: a sweep in one direction leaves its error on one side of a face, and the next sweep on the
-other.
+Contacts are built pair by pair. Under the alternating order, every second substep runs from the last point of the last pair to
+the first: a sweep in one direction leaves its error on one side of a face, and the next sweep on the other.
 
 The cache holds key, impulse and arms of the last substep's contacts, sorted by pair like the pair list.
 A contact reuses the impulse of the entry with the same key if its point is within the match distance in the

@@ -18,8 +18,7 @@ islands. While a force-limited motor runs up to its bound, E, V and r rise, alth
 
 Without (5), a larger r counts against an impulse: in an island without a solution, f falls without end while impulses grow
 against each other. An impulse outside its bounds has no f, and neither has one so large that rounding of its slack may hide a
-thousandth of b. Impulses of a problem that is proven to have no solution are
-compared by (1) and (3) alone (`by_residual`).
+thousandth of b. Impulses of a problem that is proven to have no solution are compared by (1) and (3) alone (`by_residual`).
 """
 from libc.math cimport INFINITY, fabs, sqrt
 from libc.stdint cimport int32_t, int64_t

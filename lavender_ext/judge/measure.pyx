@@ -472,9 +472,8 @@ def compute_program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t f
              scale_i is at most the largest of |J x|_k, |target_k| and |x_j| over the rows that act: terms that cancel, or
              a small J_kj, are no reason to accept more than OSQP and Clarabel do
 
-    px (n,) = P x, force (n,) = J^T lambda, jx (m,); jac: (indptr, indices, data) of J, with `ordered` (n,) = x in the
-    order of its columns; `sizes_without_rows()` returns `unbounded` in this order. Each force counts as `least_force` at
-    least.
+    px (n,) = P x, force (n,) = J^T lambda, jx (m,); jac: (indptr, indices, data) of J, with `ordered` (n,) = x in the order of
+    its columns; `sizes_without_rows()` returns `unbounded` in this order. Each force counts as `least_force` at least.
 
     Returns
     -------

@@ -11,9 +11,8 @@ one lane of a vector. The last block of a kind in a slot is paired with a block 
 slots and updates the blocks that are due: those with 0 <= k - stage < sweeps, stage = floor(level / T). Every block reads the same
 velocities as in a sequence of sweeps.
 
-First levels may be chosen. A body with an early first block and late others (a joint, which is swept first, on top of a
-tower) begins later, so that T is close to the maximum number of blocks of a body. Independent parts of a scene fill the same
-slots.
+First levels may be chosen. A body with an early first block and late others (a joint, which is swept first, on top of a tower)
+begins later, so that T is close to the maximum number of blocks of a body. Independent parts of a scene fill the same slots.
 
 If something is done between two sweeps (`single`), T is the number of levels and there is one stage. Contacts come after all
 joints. Two blocks that share a body are in different records, in the sequence of the order; therefore the records of joints, then

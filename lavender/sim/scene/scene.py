@@ -45,8 +45,7 @@ def named_scene(**defaults: Any) -> Callable[[Builder], Builder]:
     Parameters
     ----------
     **defaults
-        Defaults of the scene for the parameters that every scene has, if they differ from the defaults of
-        `Parameters`.
+        Defaults of the scene for the parameters that every scene has, if they differ from the defaults of `Parameters`.
 
     Returns
     -------

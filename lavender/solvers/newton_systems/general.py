@@ -95,8 +95,7 @@ def run_newton_steps(
         if status is Status.CONVERGED:
             judged = judge_impulse(problem, impulse.copy())
         if status is Status.CONVERGED and not judged.relative <= tol:
-            # The judge does not confirm the kernel's test, which adds in another order and whose squares may
-            # underflow.
+            # The judge does not confirm the kernel's test, which adds in another order and whose squares may underflow.
             status = Status.MAX_ITERATIONS if tolerance_ratio > MIN_TOLERANCE_RATIO else Status.STALLED
             tolerance_ratio *= 0.25
             is_continued = False
