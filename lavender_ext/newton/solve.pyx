@@ -33,8 +33,8 @@ from lavender_ext.newton.path cimport path_compliance
 from lavender_ext.newton.plan cimport start_newton_solve, step_newton_solve
 from lavender_ext.newton.run cimport (N_COUNTED, bind_indices, bind_values, convex_residual, newton_t, scale_problem,
                                       set_problem, set_reference, write_certificate, write_impulse)
-from lavender_ext.newton.rows cimport (ANY_FORM, MAX_ALWAYS_DENSE_ROWS, analyse_row_system, bind_row_values, form_generalized_matrix,
-                                       form_row_system, has_dense_rows, is_dense_faster)
+from lavender_ext.newton.rows cimport (ANY_FORM, MAX_ALWAYS_DENSE_ROWS, analyse_row_system, bind_row_values,
+                                       form_generalized_matrix, form_row_system, has_dense_rows, is_dense_faster)
 from lavender_ext.newton.scaling cimport index_unfixed_elements, is_problem_supported
 from lavender_ext.newton.steps cimport (begin_interior_point, form_de_saxce_matrices, take_interior_point_step,
                                         multiply_cone_duals, compute_all_normal_shifts)
@@ -160,7 +160,8 @@ cdef inline int32_t analyse_rows_in_workspace(newton_t* n, const view_t* v, cons
     if v.g != NULL:
         form, n.linear.cost = DENSE, <double>n.sc.e.m * n.sc.e.m * n.sc.e.m / 3.0
         r.islands = 1 if v.p.islands == NULL else v.p.islands.n
-    elif v.p.n_rows > MAX_ALWAYS_DENSE_ROWS and measure_asymmetry_and_bandwidth(v.a, v.p.d, v.p.n_rows, n.linear.swap, bands) > 1e-14:
+    elif (v.p.n_rows > MAX_ALWAYS_DENSE_ROWS
+            and measure_asymmetry_and_bandwidth(v.a, v.p.d, v.p.n_rows, n.linear.swap, bands) > 1e-14):
         form = DENSE                                    # Factors of a sparse A without symmetry may lose pivots.
     outcome = analyse_row_system(n, v.a, form, r.n_index, &a)
     if outcome == 0:

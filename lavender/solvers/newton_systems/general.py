@@ -37,6 +37,9 @@ _STATUS = {
     OUTCOMES["floor"]: Status.ROUNDOFF_LIMIT,
     OUTCOMES["more"]: Status.MAX_ITERATIONS,
     OUTCOMES["stuck"]: Status.STALLED,
+    OUTCOMES[
+        "certificate"
+    ]: Status.STALLED,  # The method over rows of A or bodies continues, and checks certificates.
     OUTCOMES["broken"]: Status.NUMERICAL_ERROR,
     OUTCOMES["lost"]: Status.DIVERGED,
 }

@@ -298,3 +298,13 @@ def test_newton_coulomb_jacobian_with_sparse_matrix_steps_over_rows(seed):
     problem = draw_generalized_contacts(seed, 12, 150, trees=50)
     solution = lv.solve(problem, "newton", tol=1e-9)
     assert solution.success and "Coulomb rounds" not in solution.work
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_newton_jacobian_with_two_bounds_takes_few_steps(seed):
+    rng = np.random.default_rng(seed)
+    jac, bound = rng.normal(size=(30, 60)), rng.uniform(0.1, 2.0, 30)
+    cones = lv.Cones.bounded(-bound, bound)
+    problem = lv.Problem.from_jacobian(jac, np.eye(60), rng.normal(size=60), cones=cones)
+    solution = lv.solve(problem, "newton", tol=1e-9)
+    assert solution.success and solution.work["factorisations"] <= 6  # Exchanges over rows took 1 to 3.
