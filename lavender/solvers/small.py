@@ -111,7 +111,7 @@ def describe_small_call(problem: Problem) -> str:
         if kernel is None or AUTO.limits is None:
             return ""
         cost, max_cost = AUTO.limits.cost(problem.metric, kernel.work, kernel.islands)
-        return f"newton over velocities, counted to take {1e-3 * cost:.3g} us" if cost <= max_cost else ""
+        return f"newton on J and M, counted to take {1e-3 * cost:.3g} us" if cost <= max_cost else ""
     small = get_small_call(problem)
     if small is None:
         return ""

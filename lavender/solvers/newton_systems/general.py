@@ -1,6 +1,6 @@
-"""Newton's method over the velocities of generalised coordinates (`lavender_ext/velocity_newton/newton.pxd`).
+"""Newton's method for J and M: over velocities (`velocity_newton/newton.pxd`) or over a dense A (`newton/rows.pxd`).
 
-One compiled call solves every island of trees; this module checks the clock and builds the claim.
+The compiled driver selects one. It solves every island of trees; this module checks the clock and builds the claim.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from lavender.solvers.costs import RATES
 from lavender_ext.core.method import OUTCOMES
 from lavender_ext.driver.driver import Driver
 
-FORM = "generalized velocities"
+FORM = "generalized coordinates"
 # Between two checks of the clock and Ctrl-C, an island does at most this many steps, and at most as many as are
 # estimated for CHECK_INTERVAL [s] with SPARSE_FLOP_TIME. With a time limit, the steps use at most CALL_TIME_FRACTION of
 # the remaining time, at the measured speed or at FLOP_TIME, whichever is slower, because the first steps may be cheap.
