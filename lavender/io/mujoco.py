@@ -113,7 +113,7 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
     return problem
 
 
-def _make_fields(kept: Any, model: Any, parts: tuple[Any, ...]) -> dict[str, Any]:
+def _make_fields(cache: Any, model: Any, parts: tuple[Any, ...]) -> dict[str, Any]:
     """Return the fields of a problem that are made when one of them is first read.
 
     `parts` is a result of `convert_regular_step`, or of `_convert_step`, with the `Generalized` in place of v*.
@@ -122,7 +122,7 @@ def _make_fields(kept: Any, model: Any, parts: tuple[Any, ...]) -> dict[str, Any
     m = blocks.n_rows
     if not isinstance(general, Generalized):
         general = Generalized.from_operator(operator, general)
-    names = partial(_make_block_names, kept.mj, model, blocks.ints[2 * m + 1 :], m)
+    names = partial(_make_block_names, cache.mj, model, blocks.ints[2 * m + 1 :], m)
     return {
         "b": rhs, "cones": Cones._from_blocks(blocks), "generalized": general, "compliance": compliance, "key": key,
         "names": Names(blocks.n_blocks, names),

@@ -347,7 +347,6 @@ cdef class Data:
 
     @property
     def n_rows(self):
-        """Number of rows."""
         return self.blocks.n_rows
 
     @property
