@@ -26,7 +26,6 @@ the error of `impulse`.
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -40,7 +39,6 @@ from lavender.problem import Names, Problem
 from lavender.problem.cones import Cones
 from lavender.problem.generalized import MIN_TREE_ORDERING_VELOCITIES, Generalized
 from lavender.problem.operators import MAX_SAFE_ENTRY
-from lavender_ext.core.problem import LAWS, make_generalized_data
 from lavender_ext.io import mujoco_rows
 from lavender_ext.io.mujoco_step import Step
 
@@ -95,53 +93,53 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
         convergence: the problem does not depend on the answer.
     """
     step = read_step(model, data)
-    kept = step.cache
-    parts = None
-    if kept.is_plain:
-        parts = mujoco_rows.convert_regular_step(
-            step, kept.codes, kept.first_operator, MASS_TOLERANCE, SUM_TOLERANCE, MIN_INDEPENDENT_AXIS_FRACTION,
-            COMPLIANCE_TOLERANCE, MAX_SAFE_ENTRY,
-        )  # fmt: skip
+    cache = step.cache
     if step.has_noslip:
         name += " (noslip)"
-    if parts is None:
-        parts, is_usual = _convert_step(step, data)
-        if not is_usual:
-            return Problem(**_make_fields(kept, model, parts), friction="cone", name=name, copy=False)
-    view = make_generalized_data(*parts[:4], LAWS["cone"])
-    problem: Problem = Problem._from_checked_data(view, "cone", name, _make_fields, (kept, model, parts))
-    return problem
+    if cache.is_plain:
+        parts = mujoco_rows.convert_regular_step(
+            step, cache.codes, cache.first_operator, MASS_TOLERANCE, SUM_TOLERANCE, MIN_INDEPENDENT_AXIS_FRACTION,
+            COMPLIANCE_TOLERANCE, MAX_SAFE_ENTRY,
+        )  # fmt: skip
+        if parts is not None:
+            rest = _make_postponed_fields, (cache.mj, model, parts)
+            problem: Problem = Problem._from_checked_data(parts[0], "cone", name, rest)
+            return problem
+    return Problem(**_convert_step(step, data), friction="cone", name=name, copy=False)
 
 
-def _make_fields(cache: Any, model: Any, parts: tuple[Any, ...]) -> dict[str, Any]:
-    """Return the fields of a problem that are made when one of them is first read.
-
-    `parts` is a result of `convert_regular_step`, or of `_convert_step`, with the `Generalized` in place of v*.
-    """
-    blocks, rhs, operator, compliance, general, key = parts
+def _make_postponed_fields(mj: Any, model: Any, parts: tuple[Any, ...]) -> dict[str, Any]:
+    """Return the fields of a problem from the result of `mujoco_rows.convert_regular_step`."""
+    _, blocks, operator, numbers = parts
     m = blocks.n_rows
-    if not isinstance(general, Generalized):
-        general = Generalized.from_operator(operator, general)
-    names = partial(_make_block_names, cache.mj, model, blocks.ints[2 * m + 1 :], m)
+    general = Generalized.from_operator(operator, numbers[2 * m : 2 * m + operator.n])
+    fields = {"b": numbers[:m], "generalized": general, "compliance": numbers[m : 2 * m]}
+    return fields | _make_block_fields(mj, model, blocks)
+
+
+def _make_block_fields(mj: Any, model: Any, blocks: Any) -> dict[str, Any]:
+    """Return the fields of a problem from the result of `mujoco_rows.make_blocks`."""
+    m, numbers = blocks.n_rows, blocks.numbers
+    first, count = len(numbers) - m, blocks.n_blocks
     return {
-        "b": rhs, "cones": Cones._from_blocks(blocks), "generalized": general, "compliance": compliance, "key": key,
-        "names": Names(blocks.n_blocks, names),
+        "cones": Cones._from_blocks(blocks), "key": numbers[first : first + count].view(np.uint64),
+        "names": Names(count, lambda: _make_block_names(mj, model, blocks.ints[2 * m + 1 :], m)),
     }  # fmt: skip
 
 
-def _convert_step(step: Step, data: Any) -> tuple[tuple[Any, ...], bool]:
+def _convert_step(step: Step, data: Any) -> dict[str, Any]:
     """Convert a step whose data are unusual or invalid, or the first step of a model; see `convert_regular_step`."""
     kept = step.cache
     like, dt = kept.first_operator, _get_timestep(step)
     mass, change = _read_mass(step, data, NO_TRIANGLE if like is None else like.mass[:2])
-    blocks, scale, key = _make_blocks(step, data)
+    blocks, scale = _make_blocks(step, data)
     jac = _read_jacobian(step, data, scale)
-    rhs, compliance, v_free, is_usual, gap, gaps = mujoco_rows.compute_problem_numbers(
-        step, jac, scale, _get_velocity_before(step), MAX_SAFE_ENTRY
+    rhs, compliance, v_free, gap, gaps = mujoco_rows.compute_problem_numbers(
+        step, jac, scale, _get_velocity_before(step)
     )
     _check_jacobian(*gaps)
     if not gap <= COMPLIANCE_TOLERANCE:
-        compliance, is_usual = _compute_compliance(data) * scale * scale, False
+        compliance = _compute_compliance(data) * scale * scale
     general = Generalized.from_compressed_rows(jac, mass, v_free, like=like)
     if like is None:
         kept.first_operator = general.operator
@@ -149,8 +147,8 @@ def _convert_step(step: Step, data: Any) -> tuple[tuple[Any, ...], bool]:
     if change is not None:  # MuJoCo's own a0 is as accurate as opt.tolerance only.
         rhs = mark_read_only(rhs - dt * general.velocity_of(change))
         general = general.with_jacobian(v_free=v_free + dt * change)
-    is_usual = is_usual and not general.operator.has_entry_above(MAX_SAFE_ENTRY)
-    return (blocks, rhs, general.operator, compliance, general, key), is_usual
+    fields = {"b": rhs, "generalized": general, "compliance": compliance}
+    return fields | _make_block_fields(kept.mj, step.model, blocks)
 
 
 @np.errstate(over="ignore", invalid="ignore")
@@ -343,8 +341,8 @@ def _check_jacobian(velocity: float, row: float, push: float, finite: float) -> 
             )
 
 
-def _make_blocks(step: Step, data: Any) -> tuple[Any, FloatArray, Any]:
-    """Return the blocks, the factor of each row and the key of each block.
+def _make_blocks(step: Step, data: Any) -> tuple[Any, FloatArray]:
+    """Return the blocks and the factor of each row.
 
     Raises
     ------
@@ -369,12 +367,11 @@ def _make_blocks(step: Step, data: Any) -> tuple[Any, FloatArray, Any]:
             f"constraint row {result} of {step.m} is of type {kind} and belongs to number {which} of "
             f"{count}{dim}, which does not exist or has fewer rows. {CHANGED_ADVICE}"
         )
-    blocks, key = result
-    if blocks.fault:
+    if result.fault:
         raise InputError(
             f"efc_frictionloss, or the friction of a contact, is negative or not finite. {CHANGED_ADVICE}"
         )
-    return blocks, blocks.numbers[5 * step.m : 6 * step.m], key
+    return result, result.numbers[5 * step.m : 6 * step.m]
 
 
 def _make_block_names(

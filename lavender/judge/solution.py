@@ -15,7 +15,7 @@ from lavender.base.errors import SolveFailed, require_packages
 from lavender.base.lazy_import import import_module_lazily
 from lavender.judge.residuals import Residual, residual
 from lavender.problem import Problem
-from lavender.problem.derived import LateFields
+from lavender.problem.derived import late_field
 from lavender_ext.core.checks import make_instance
 
 if TYPE_CHECKING:
@@ -218,7 +218,7 @@ class SolverRun:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Solution(LateFields):
+class Solution:
     """Result of `solve` for every status. `str()` is a summary in one line.
 
     Parameters
@@ -489,6 +489,11 @@ def raise_if_interrupted(solution: Solution) -> Solution:
     if solution.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
     return solution
+
+
+for _field in fields(Solution):
+    if _field.name != "velocity_tol":
+        setattr(Solution, _field.name, late_field(_field.name))
 
 
 def _rebuild_solution(values: dict[str, Any]) -> Solution:

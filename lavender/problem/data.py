@@ -27,7 +27,7 @@ from lavender.base.arrays import (
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import issparse
 from lavender.problem.cones import Cones
-from lavender.problem.derived import Derived, LateFields, cached_property
+from lavender.problem.derived import Derived, cached_property, late_field
 from lavender.problem.generalized import Generalized
 from lavender.problem.rows import Rows
 from lavender_ext.core.blocks import are_joints_then_contacts
@@ -81,7 +81,7 @@ class Names(Sequence[str]):
 
 
 @dataclass(frozen=True, eq=False)
-class ProblemData(LateFields):
+class ProblemData:
     """Checked fields of a `Problem`; derived classes compute everything that follows from them."""
 
     b: FloatArray
@@ -375,9 +375,8 @@ def _check_rhs(b: FloatArray) -> None:
         )
 
 
-# Importers postpone these fields; an attribute of the class, the default, would be read instead of them.
-for _name in ("generalized", "compliance", "key", "names"):
-    delattr(ProblemData, _name)
+for _name in ("b", "cones", "generalized", "compliance", "key", "names"):
+    setattr(ProblemData, _name, late_field(_name))  # Importers postpone these fields.
 ProblemData.__init__.__qualname__ = "Problem.__init__"  # Makes a TypeError name the class that users call.
 
 

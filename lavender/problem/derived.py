@@ -1,4 +1,4 @@
-"""Values computed once, also by several threads: `Derived`, `LateFields`, `cached_property`, `computed_once`."""
+"""Values computed once, also by several threads: `Derived`, `cached_property`, `computed_once`, `late_field`."""
 
 from __future__ import annotations
 
@@ -37,30 +37,6 @@ class Derived:
         self.view = view
         self.start: FloatArray | None = None
         self.cache: dict[Any, Any] = {}
-
-
-class LateFields:
-    """Base class of objects with fields that are computed when one of them is first read.
-
-    The attribute `_rest` is a function and its arguments; the function returns these fields by name.
-    """
-
-    if not TYPE_CHECKING:  # Hide `__getattr__` from type checkers, so that they report unknown names.
-
-        def __getattr__(self, name: str) -> Any:
-            # Python calls this only for names that are missing: postponed fields or unknown attributes.
-            attributes = self.__dict__
-            rest = attributes.get("_rest")
-            if rest is not None:
-                function, arguments = rest
-                # Two threads may compute these fields at once; they get equal values. Fields that were set stay.
-                attributes.update(function(*arguments) | attributes)
-                attributes.pop("_rest", None)
-            if name in attributes:
-                return attributes[name]
-            raise AttributeError(
-                f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self
-            )
 
 
 # Identity of this process. A forked process gets a new object and then new locks, because threads that hold the old
@@ -114,3 +90,28 @@ class computed_once(cached_property[T]):
             if self.name not in attributes:
                 attributes[self.name] = self.function(instance)
             return attributes[self.name]
+
+
+class late_field:
+    """A field of a dataclass that is computed, if it was not set, when it is first read; set after the decoration.
+
+    The attribute `_rest` of the object is a function and its arguments; the function returns the late fields by name.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def __get__(self, instance: Any, owner: type) -> Any:
+        """Compute all fields that were not set, and return this one."""
+        if instance is None:
+            return self
+        attributes = instance.__dict__
+        rest = attributes.get("_rest")
+        if rest is not None:
+            function, arguments = rest
+            for name, value in function(*arguments).items():
+                attributes.setdefault(name, value)  # Another thread may have set an equal value.
+            attributes.pop("_rest", None)
+        if self.name not in attributes:
+            raise AttributeError(f"{type(instance).__name__!r} object has no attribute {self.name!r}")
+        return attributes[self.name]

@@ -38,7 +38,7 @@ class Operators(ProblemData):
             self.metric  # noqa: B018 - raises the error now, not in a solve
 
     @classmethod
-    def _from_checked_data(cls, view: Data, friction: str, name: str, *rest: Any) -> Any:
+    def _from_checked_data(cls, view: Data, friction: str, name: str, rest: tuple[Any, Any]) -> Any:
         """Build a problem over J and M without copies, from data that `lavender_ext.io.mujoco_rows` has checked.
 
         The arrays are read-only, and no entry of J and M^-1 exceeds `MAX_SAFE_ENTRY`. `rest` is a function and its

@@ -2,6 +2,8 @@
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.arena cimport arena_t
+from lavender_ext.core.blocks cimport Blocks
+from lavender_ext.core.generalized cimport Operator
 from lavender_ext.core.block_types cimport blocks_t, islands_t
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 
@@ -38,6 +40,9 @@ cdef public int32_t lav_compute_csr_diagonal(const blocks_t* p, const csr_t* a, 
 cdef public int32_t lav_compute_body_diagonal(const blocks_t* p, const rows_t* r, int32_t* empty) noexcept nogil
 cdef void bind_derived_row_arrays(rows_t* r, const blocks_t* p, arena_t* a) noexcept nogil
 cdef int bind_body_arrays(rows_t* r, const blocks_t* p, rows) except -1
+
+
+cdef Data bind_generalized_data(Blocks blocks, Operator operator, int law, const double* b, const double* compliance, list keep)
 
 
 cdef class Data:

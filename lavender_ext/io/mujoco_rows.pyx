@@ -16,10 +16,10 @@ import numpy as np
 from lavender_ext.core.arrays cimport as_double_pointer, as_int_pointer, make_read_only, ndarray
 from lavender_ext.core.blocks cimport Blocks, allocate_blocks
 from lavender_ext.core.validate cimport is_valid_number, is_valid_magnitude, update_max_abs
-from lavender_ext.core.block_types cimport ROW, blocks_t, choose_contact_kind, write_contact_bounds
+from lavender_ext.core.block_types cimport CONE, ROW, blocks_t, choose_contact_kind, write_contact_bounds
 from lavender_ext.core.faults cimport NO_FAULT
-from lavender_ext.core.generalized cimport MAX_INDEX, Operator
-from lavender_ext.core.problem cimport Workspace, allocate_bytes
+from lavender_ext.core.generalized cimport Operator
+from lavender_ext.core.problem cimport Workspace, allocate_bytes, bind_generalized_data
 from lavender_ext.io.mujoco_step cimport Step, step_t
 
 
@@ -28,7 +28,12 @@ cpdef enum:
     MAX_EQUALITY_ROWS = 6
     CODES = 8                   # number of kinds of constraints
 
-cdef object new = np.empty, I4 = np.dtype(np.int32), U8 = np.dtype(np.uint64)
+cdef enum:                      # results of reading J; INVALID_ROW - i refers to row i
+    NO_JACOBIAN = -1
+    UNSORTED = -1
+    INVALID_ROW = -2
+
+cdef object new = np.empty, I4 = np.dtype(np.int32)
 
 
 cdef public int32_t lav_export_blocks(int32_t m, const int32_t* type_, const int32_t* id_, const int32_t* codes,
@@ -275,10 +280,10 @@ cdef inline double* get_row_scales(Blocks blocks) noexcept:
 
 
 cpdef make_blocks(Step step, codes):
-    """Return (blocks, keys), or the number of a row with an unknown type or an invalid id.
+    """Return the blocks, or the number of a row with an unknown type or an invalid id.
 
     The blocks have a fault if a bound is not a valid number. Their `ints` hold type, id, dim and geom from index 2 m + 1, their
-    `numbers` the factor of each row from index 5 m.
+    `numbers` the factor of each row from index 5 m, and the last m numbers the keys as uint64.
     """
     cdef const step_t* s = &step.at
     cdef int32_t m = <int32_t>s.m, c = <int32_t>s.contacts, k, i
@@ -307,48 +312,58 @@ cpdef make_blocks(Step step, codes):
     p.n_blocks = k
     made.validate()
     write_contact_bounds(&made.at)
-    keys = new(k, U8)
-    memcpy((<ndarray>keys).data, key, k * sizeof(uint64_t))
-    return made, make_read_only(keys)
+    return made
 
 
-def read_jacobian(Step step, scale):
-    """Return (indptr, indices, data) of J, each row times `scale` (m,); a row's number if its indices are invalid.
+def read_jacobian(Step step, scale_):
+    """Return (indptr, indices, data) of J, each row times `scale_` (m,); a row's number if its indices are invalid.
 
     The result is None if columns do not ascend, and -1 if efc_J has fewer entries than a dense J.
     """
-    return compress_jacobian(step, as_double_pointer(scale, step.at.m))
+    cdef const double* scale = as_double_pointer(scale_, step.at.m)
+    cdef int64_t total = count_jacobian_entries(step, scale), at
+    if total < 0:
+        return -1 if total == NO_JACOBIAN else INVALID_ROW - total
+    indptr, indices, data = new(step.at.m + 1, I4), new(total, I4), new(total)
+    at = compress_jacobian(step, scale, <int32_t*>(<ndarray>indptr).data, <int32_t*>(<ndarray>indices).data,
+                           <double*>(<ndarray>data).data)
+    if at < 0:
+        return None if at == UNSORTED else INVALID_ROW - at
+    return (indptr, indices, data) if at == total else (indptr, indices[:at], data[:at])
 
 
-cdef compress_jacobian(Step step, const double* scale):
-    """Return the result of `read_jacobian`."""
+cdef int64_t count_jacobian_entries(Step step, const double* scale) noexcept:
+    """Return an upper bound of the number of entries of J; NO_JACOBIAN, or INVALID_ROW - i if the position of row i is invalid."""
+    cdef const step_t* s = &step.at
+    cdef int32_t i, j, m = <int32_t>s.m, n = s.n
+    cdef int64_t total = 0
+    cdef const int32_t* count = s.efc_J_rownnz
+    cdef const int32_t* first = s.efc_J_rowadr
+    if not step.is_sparse:
+        if s.jac_entries < <int64_t>m * n:
+            return NO_JACOBIAN
+        for i in range(m):
+            for j in range(n):
+                total += s.efc_J[i * n + j] * scale[i] != 0.0
+        return total
+    if m and (count == NULL or first == NULL or s.efc_J_colind == NULL):
+        return INVALID_ROW
+    for i in range(m):
+        if not 0 <= count[i] <= s.jac_entries or not 0 <= first[i] <= s.jac_entries - count[i]:
+            return INVALID_ROW - i
+        total += count[i]
+    return total
+
+
+cdef int64_t compress_jacobian(Step step, const double* scale, int32_t* indptr, int32_t* indices, double* data) noexcept:
+    """Write J with scaled rows and return its number of entries; UNSORTED, or INVALID_ROW - i if a column of row i is invalid."""
     cdef const step_t* s = &step.at
     cdef int32_t i, j, is_invalid, m = <int32_t>s.m, n = s.n
-    cdef int64_t q, begin, end, at = 0, total = 0
+    cdef int64_t q, begin, end, at = 0
     cdef double x, factor
     cdef bint ascend = True
     cdef const double* value = s.efc_J
     cdef const int32_t* column = s.efc_J_colind
-    cdef const int32_t* count = s.efc_J_rownnz
-    cdef const int32_t* first = s.efc_J_rowadr
-    cdef int32_t* indptr
-    cdef int32_t* indices
-    cdef double* data
-    if step.is_sparse:
-        if m and (count == NULL or first == NULL or column == NULL):
-            return 0
-        for i in range(m):
-            if not 0 <= count[i] <= s.jac_entries or not 0 <= first[i] <= s.jac_entries - count[i]:
-                return i
-            total += count[i]
-    else:
-        if s.jac_entries < <int64_t>m * n:
-            return -1
-        for i in range(m):
-            for j in range(n):
-                total += value[i * n + j] * scale[i] != 0.0
-    indptr_, indices_, data_ = new(m + 1, I4), new(total, I4), new(total)
-    indptr, indices, data = as_int_pointer(indptr_, m + 1), as_int_pointer(indices_, total), as_double_pointer(data_, total)
     indptr[0] = 0
     for i in range(m):
         factor = scale[i]
@@ -361,13 +376,13 @@ cdef compress_jacobian(Step step, const double* scale):
                     at += 1
             indptr[i + 1] = <int32_t>at
             continue
-        begin = first[i]
-        end = begin + count[i]
+        begin = s.efc_J_rowadr[i]
+        end = begin + s.efc_J_rownnz[i]
         is_invalid = 0
         for q in range(begin, end):
             is_invalid |= not 0 <= column[q] < n
         if is_invalid:
-            return i
+            return INVALID_ROW - i
         for q in range(begin + 1, end):
             is_invalid |= column[q] <= column[q - 1]
         ascend &= not is_invalid
@@ -378,12 +393,27 @@ cdef compress_jacobian(Step step, const double* scale):
                 data[at] = x
                 at += 1
         indptr[i + 1] = <int32_t>at
-    if not ascend:
-        return None
-    return (indptr_, indices_, data_) if at == total else (indptr_, indices_[:at], data_[:at])
+    return at if ascend else UNSORTED
 
 
-cpdef tuple extract_lower_triangle_of_mass(Step step, double bound, tuple like):
+cdef double compare_smooth_force(const step_t* p, const int32_t* at, const int32_t* column, const double* data, double bound,
+                                 double* product) noexcept:
+    """Return the relative difference of M x and y of `extract_lower_triangle_of_mass`; product (n) is scratch."""
+    cdef int32_t i
+    cdef double gap = 0.0, big = 0.0
+    multiply_mass(p.n, at, column, data, p.qacc_smooth, False, product)
+    for i in range(p.n):
+        gap = update_max_abs(gap, product[i] - p.qfrc_smooth[i])
+        big = update_max_abs(big, p.qfrc_smooth[i])
+    if not gap <= bound * big:
+        big = 0.0
+        multiply_mass(p.n, at, column, data, p.qacc_smooth, True, product)
+        for i in range(p.n):
+            big = update_max_abs(big, product[i] + fabs(p.qfrc_smooth[i]))
+    return gap / big if big > 0.0 else gap
+
+
+def extract_lower_triangle_of_mass(Step step, double bound, tuple like):
     """Return the lower triangle of M as (indptr, indices, data), and max |M x - y| over max (|M| |x| + |y|).
 
     x and y are qacc_smooth and qfrc_smooth. The second number is max |M x - y| / max |y| instead, if that is at most
@@ -392,13 +422,9 @@ cpdef tuple extract_lower_triangle_of_mass(Step step, double bound, tuple like):
     """
     cdef const step_t* p = &step.at
     cdef int32_t i, q, last, n = p.n, nnz = p.mass_entries
-    cdef double gap = 0.0, big = 0.0
-    cdef Workspace scratch
-    cdef const int32_t* at
-    cdef const int32_t* column
+    cdef Workspace product
     cdef int32_t* whole
-    cdef double* out
-    cdef double* made
+    cdef double* data
     if n == 0:
         return None if nnz else ((np.zeros(1, I4), new(0, I4), new(0)), 0.0)
     if not has_row_pattern(like, p):
@@ -421,20 +447,11 @@ cpdef tuple extract_lower_triangle_of_mass(Step step, double bound, tuple like):
             return None
         for made_ in like:
             make_read_only(made_)
-    at, column = as_int_pointer(like[0], n + 1), as_int_pointer(like[1], nnz)
-    copy, scratch = new(nnz), allocate_bytes(n * sizeof(double))
-    out, made = as_double_pointer(copy, nnz), <double*>scratch.at
-    memcpy(out, p.M, nnz * sizeof(double))
-    multiply_mass(n, at, column, out, p.qacc_smooth, False, made)
-    for i in range(n):
-        gap = update_max_abs(gap, made[i] - p.qfrc_smooth[i])
-        big = update_max_abs(big, p.qfrc_smooth[i])
-    if not gap <= bound * big:
-        big = 0.0
-        multiply_mass(n, at, column, out, p.qacc_smooth, True, made)
-        for i in range(n):
-            big = update_max_abs(big, made[i] + fabs(p.qfrc_smooth[i]))
-    return (like[0], like[1], copy), gap / big if big > 0.0 else gap
+    copy, product = new(nnz), allocate_bytes(n * sizeof(double))
+    data = as_double_pointer(copy, nnz)
+    memcpy(data, p.M, nnz * sizeof(double))
+    return (like[0], like[1], copy), compare_smooth_force(p, as_int_pointer(like[0], n + 1), as_int_pointer(like[1], nnz), data,
+                                                          bound, <double*>product.at)
 
 
 cpdef find_velocity_before(Step step, double tolerance, double alike):
@@ -464,8 +481,8 @@ cpdef find_velocity_before(Step step, double tolerance, double alike):
     return v
 
 
-def compute_problem_numbers(Step step, tuple jac, scale, v, double usual):
-    """Return (b, compliance, v*, whether they are valid and usual, max |efc_R efc_D - 1|, gaps) of J with scaled rows.
+def compute_problem_numbers(Step step, tuple jac, scale, v):
+    """Return (b, compliance, v*, max |efc_R efc_D - 1|, gaps) of J with scaled rows.
 
         b = dt (aref - J a0),   v* = v + dt a0,   a0 = qacc_smooth
 
@@ -475,33 +492,33 @@ def compute_problem_numbers(Step step, tuple jac, scale, v, double usual):
 
     with v before the step and f = efc_force. A gap is 0 if the stored vector is all zeros, as in a copy that does not fill it.
     The size of terms is |J_i|_1 |x|_max for (1) and (2), max |J|^T |f| for (3). The fourth gap is NaN if a is not finite.
-    Compliances up to `usual` count as usual.
     """
-    cdef double[5] gap
-    cdef bint is_usual
-    rhs, compliance, free = multiply_problem_numbers(step, jac, as_double_pointer(scale, step.at.m), v, usual, gap, &is_usual)
-    return rhs, compliance, free, is_usual, gap[0], (gap[1], gap[2], gap[3], gap[4])
-
-
-cdef tuple multiply_problem_numbers(Step step, tuple jac, const double* scale, v_, double usual, double* gap, bint* is_usual):
-    """Return (b, compliance, v*) of `compute_problem_numbers`; store its other results in gap (5) and `is_usual`."""
     cdef const step_t* p = &step.at
+    cdef Py_ssize_t m = p.m, n = p.n
+    cdef double[5] gap
+    cdef Workspace scratch = allocate_bytes(3 * n * sizeof(double))
+    cdef const int32_t* jptr = as_int_pointer(jac[0], m + 1)
+    rhs, compliance, free = new(m), new(m), new(n)
+    multiply_problem_numbers(p, jptr, as_int_pointer(jac[1], jptr[m]), as_double_pointer(jac[2], jptr[m]),
+                             as_double_pointer(scale, m), p.qvel if v is None else as_double_pointer(v, n), 0.0,
+                             <double*>(<ndarray>rhs).data, <double*>(<ndarray>compliance).data,
+                             <double*>(<ndarray>free).data, <double*>scratch.at, gap)
+    return rhs, compliance, free, gap[0], (gap[1], gap[2], gap[3], gap[4])
+
+
+cdef bint multiply_problem_numbers(const step_t* p, const int32_t* jptr, const int32_t* jidx, const double* jval,
+                                   const double* scale, const double* v, double usual, double* rhs, double* compliance,
+                                   double* free, double* force_sum, double* gap) noexcept:
+    """Compute the results of `compute_problem_numbers`, with five gaps; force_sum (3 n) receives J^T f, |J|^T |f| and scratch.
+
+    Returns whether all numbers are valid, and compliances are at most `usual`.
+    """
     cdef int32_t i, j, m = <int32_t>p.m, n = p.n
     cdef Py_ssize_t q
-    cdef const int32_t* jptr = as_int_pointer(jac[0], m + 1)
-    cdef const int32_t* jidx = as_int_pointer(jac[1], jptr[m])
-    cdef const double* jval = as_double_pointer(jac[2], jptr[m])
-    cdef const double* v = p.qvel if v_ is None else as_double_pointer(v_, n)
     cdef double dt = p.dt, c, size, s_v, s_free, f, finite = 0.0, gap_0 = 0.0, gap_1 = 0.0, gap_2 = 0.0, gap_3 = 0.0
     cdef double big_1 = 0.0, big_2 = 0.0, big_3 = 0.0, stored_1 = 0.0, stored_2 = 0.0, stored_3 = 0.0
     cdef double top_v = 0.0, top_free = 0.0, top_b = 0.0
     cdef bint sound = True
-    rhs_, compliance_, free_ = new(m), new(m), new(n)
-    cdef double* rhs = as_double_pointer(rhs_, m)
-    cdef double* compliance = as_double_pointer(compliance_, m)
-    cdef double* free = as_double_pointer(free_, n)
-    cdef Workspace scratch = allocate_bytes(3 * n * sizeof(double))
-    cdef double* force_sum = <double*>scratch.at           # J^T f, then |J|^T |f|
     cdef double* change = force_sum + 2 * n                # dt a0
     for j in range(n):
         change[j] = dt * p.qacc_smooth[j]
@@ -542,54 +559,69 @@ cdef tuple multiply_problem_numbers(Step step, tuple jac, const double* scale, v
         big_3 = update_max_abs(big_3, force_sum[n + j] + fabs(p.qfrc_constraint[j]))
     if p.has_moving_surfaces:                           # efc_vel contains the velocities of surfaces, too.
         stored_1 = 0.0
-    is_usual[0] = sound and is_valid_magnitude(top_b)
     gap[0], gap[4] = gap_0, finite
     gap[1] = gap_1 / big_1 if stored_1 != 0.0 and big_1 != 0.0 else 0.0
     gap[2] = gap_2 / big_2 if stored_2 != 0.0 and big_2 != 0.0 else 0.0
     gap[3] = gap_3 / big_3 if stored_3 != 0.0 and big_3 != 0.0 else 0.0
-    return make_read_only(rhs_), make_read_only(compliance_), make_read_only(free_)
+    return sound and is_valid_magnitude(top_b)
 
 
 def convert_regular_step(Step step, codes, Operator like, double mass_tolerance, double tolerance, double alike,
                          double compliance_tolerance, double usual):
-    """Return (blocks, b, operator, compliance, v*, key) with the factor of M; None if one of the checks needs its own message.
+    """Return (data, blocks, operator, numbers) with the factor of M; None if one of the checks needs its own message.
 
     The functions above describe the arguments. M must have the pattern of `like`, and all entries must be at most `usual`.
+    `numbers` begins with b (m), the compliance (m) and v* (n).
     """
+    cdef const step_t* p = &step.at
+    cdef Py_ssize_t m = p.m, n = p.n
+    cdef int64_t total
     cdef Operator operator
     cdef Blocks blocks
     cdef double[5] gap
-    cdef bint is_usual
-    if not 0.0 < step.at.dt < 1.0 / 0.0 or step.at.is_discrete or not step.has_mass:
-        return None
-    result = extract_lower_triangle_of_mass(step, mass_tolerance, like.mass)
-    if result is None:
-        return None
-    mass, difference = result
-    if not difference <= mass_tolerance or mass[0] is not like.mass[0]:
+    cdef const double* scale
+    cdef double* rhs
+    cdef double* jval
+    cdef double* mval
+    cdef double* factor
+    cdef int32_t* jptr
+    if not 0.0 < p.dt < 1.0 / 0.0 or p.is_discrete or not step.has_mass or not has_row_pattern(like.mass, p):
         return None
     made = make_blocks(step, codes)
     if type(made) is int:
         return None
-    blocks, keys = made
-    if blocks.fault != NO_FAULT:
+    blocks = made
+    scale = get_row_scales(blocks)
+    total = count_jacobian_entries(step, scale)
+    if blocks.fault != NO_FAULT or total < 0:
         return None
-    jac = compress_jacobian(step, get_row_scales(blocks))
+    numbers = make_read_only(new(2 * m + n + total + p.mass_entries + like.get_factor_size()))
+    ints = make_read_only(new(m + 1 + total, I4))
+    rhs, jptr = <double*>(<ndarray>numbers).data, <int32_t*>(<ndarray>ints).data
+    jval = rhs + 2 * m + n
+    mval = jval + total
+    factor = mval + p.mass_entries                      # scratch before M is factored
+    memcpy(mval, p.M, p.mass_entries * sizeof(double))
+    if not compare_smooth_force(p, like.g.mptr, like.g.midx, mval, mass_tolerance, factor) <= mass_tolerance:
+        return None
     v = find_velocity_before(step, tolerance, alike)
-    if type(jac) is not tuple or type(v) is int:
+    if type(v) is int or compress_jacobian(step, scale, jptr, jptr + m + 1, jval) < 0:
         return None
-    rhs, compliance, v_free = multiply_problem_numbers(step, jac, get_row_scales(blocks), v, usual, gap, &is_usual)
-    if not is_usual or not gap[0] <= compliance_tolerance or gap[4] != 0.0:
+    if not multiply_problem_numbers(p, jptr, jptr + m + 1, jval, scale, p.qvel if v is None else as_double_pointer(v, n), usual,
+                                    rhs, rhs + m, rhs + 2 * m, factor, gap):
+        return None
+    if not gap[0] <= compliance_tolerance or gap[4] != 0.0:
         return None
     for i in range(1, 4):
         if not gap[i] <= tolerance:
             return None
     operator = Operator.__new__(Operator)
-    operator.set_arrays(jac, mass, like, MAX_INDEX)
-    operator.factor()
+    operator.share_memory(like, <int32_t>m, numbers, ints, jval, mval)
+    operator.factor_into(factor)
     if operator.failed >= 0 or operator.has_entry_above(usual):
         return None
-    return blocks, rhs, operator, compliance, v_free, keys
+    data = bind_generalized_data(blocks, operator, CONE, rhs, rhs + m, [blocks, operator, numbers])
+    return data, blocks, operator, numbers
 
 
 def copy_rows(Step step):
