@@ -280,6 +280,27 @@ cdef inline double compute_gradient(flow_t* f) noexcept nogil:
     return sqrt(size) if size > 0.0 else size * 0.0     # Rounding may make h's square negative; NaN stays NaN.
 
 
+cdef inline bint bounds_errors(const flow_t* f, int32_t island, double size) noexcept nogil:
+    """Return whether |G| = size bounds the errors of lambda(s) by their limits, without proximal terms.
+
+    lambda(s) has no error with the slack s + theta lambda, and the error of a row changes by at most |Y_k G| / d_k
+    <= |G| d_k^-1/2 with its own slack. Below a tol of 1e-9, rounding of s could exceed the limits.
+    """
+    cdef int32_t a, k, rows = 0
+    cdef double nu = 0.0
+    if f.tol < 1e-9:
+        return False
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        rows += end_row_of_run(f, a) - first_row_of_run(f, a)
+    size *= sqrt(<double>rows)
+    if not size <= f.energy_limit:
+        return False
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        for k in range(first_row_of_run(f, a), end_row_of_run(f, a)):
+            nu = f.p.nu[k] if f.p.nu[k] > nu else nu
+    return size * sqrt(nu) <= f.velocity_limit
+
+
 cdef inline int32_t end_descent(flow_t* f, int32_t island, bint moves, bint is_far, int32_t outcome) noexcept nogil:
     """Keep the last iterate in `best` if its error, which is not measured if it `is_far`, is lower; return `outcome`."""
     cdef double energy
@@ -306,6 +327,9 @@ cdef inline int32_t descend_island(flow_t* f, int32_t island, double goal) noexc
         x.response_is_known = 0
         moves = multiply_y_transpose(f, island, f.lam, f.u)
         size = compute_gradient(f)
+        if not rigid and f.law != COULOMB and x.steps > 0 and bounds_errors(f, island, size):
+            copy_rows(f, island, f.lam, f.best)
+            return REACHED
         is_far = (not rigid and not square and f.steps > 0 and size > FAR_GRADIENT * goal * f.energy_limit > 0.0
                   and has_nonzero_v(f, island))
         over = size / f.energy_limit if is_far else store_iterate_if_best(f, island, moves, &energy)
