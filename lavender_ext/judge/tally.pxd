@@ -2,7 +2,7 @@
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport compute_block_error, euclidean_norm
+from lavender_ext.core.block cimport compute_block_error, compute_row_error, euclidean_norm
 from lavender_ext.core.block_types cimport (CONE, blocks_t, get_disk_component, get_row_groups, is_disk_friction_contact,
                                             has_independent_rows, get_friction_components, friction_components_t)
 from lavender_ext.judge.score cimport (zero_if_at_floor, floor_hides_residual, is_at_floor, ratio_to_reference,
@@ -308,7 +308,7 @@ cdef inline void score_all_blocks(const blocks_t* p, const double* lam, const do
 
     sizes (m) is an upper bound of |A| |lam|, from which the floors are computed. If it is NULL, the floor entries are not changed.
     """
-    cdef int32_t island, a, i, end, n = begin_island_scores(p, out)
+    cdef int32_t island, a, i, k, end, n = begin_island_scores(p, out)
     cdef const int32_t* order = p.islands.order if p.islands != NULL else NULL
     cdef tally_t own, s = make_empty_tally()
     cdef floor_t floor, f = make_empty_floor()
@@ -317,6 +317,13 @@ cdef inline void score_all_blocks(const blocks_t* p, const double* lam, const do
         end = index_of_island_end(p, island)
         for a in range(index_of_island_begin(p, island), end):
             i = get_block_in_order(order, a)
+            if has_independent_rows(p, i):              # the common case, compiled without calls
+                for k in range(p.ptr[i], p.ptr[i + 1]):
+                    e[k] = compute_row_error(lam[k], w[k], p.d[k], p.lower[k], p.upper[k])
+                    add_row_error(p, k, e[k], &own)
+                    if sizes != NULL:
+                        add_row_floor(p, k, lam[k], w[k], sizes[k], &floor)
+                continue
             compute_block_error(p, i, lam, w, e)
             add_block_error(p, i, e, &own)
             if sizes != NULL:
