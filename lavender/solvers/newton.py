@@ -379,8 +379,7 @@ def _estimate_full_matrix_cost(problem: Problem) -> float:
 def _has_sparse_coulomb_rows(problem: Problem) -> bool:
     """Return whether J and M under Coulomb's law have a sparse A, on which Newton's method may run."""
     entries = float(problem.metric.entries_of_matrix)
-    is_supported = problem.law == "coulomb" and not problem.cones.has_round
-    return is_supported and not uses_dense_rows(entries, float(problem.m), False)
+    return problem.law == "coulomb" and not uses_dense_rows(entries, float(problem.m), False)
 
 
 def _is_sparse_matrix_faster(problem: Problem, work: float) -> bool:

@@ -16,7 +16,7 @@ from lavender_ext.newton.coupled cimport (copy_coupled_entries, coupled_t, list_
                                           transpose_graph)
 from lavender_ext.newton.elements cimport elements_t
 from lavender_ext.newton.run cimport newton_t
-from lavender_ext.newton.scaling cimport form_scaled_matrix, is_problem_supported, scaled_t
+from lavender_ext.newton.scaling cimport form_scaled_matrix, scaled_t
 from lavender_ext.newton.system cimport DENSE, SPARSE
 
 
@@ -196,9 +196,7 @@ cdef inline bint are_generalized_rows_faster(const view_t* v) noexcept nogil:
     cdef const generalized_t* g = v.g
     cdef double m = v.p.n_rows, n = g.n, islands = 1 if v.p.islands == NULL else v.p.islands.n, work, nc
     cdef int32_t b
-    if m * (m + n) > 1e9 or not is_problem_supported(&v.p):
-        return False
-    if v.p.law != COULOMB if has_friction(&v.p) else not has_row_with_two_bounds(&v.p):
+    if m * (m + n) > 1e9 or (v.p.law != COULOMB if has_friction(&v.p) else not has_row_with_two_bounds(&v.p)):
         return False
     work = n * n * n / (3.0 * islands * islands)
     for b in range(g.n_panels):
