@@ -18,12 +18,12 @@
 
 Problems in generalised coordinates are first solved over their velocities (`newton_systems/general.py`), without
 forming A. Unless rows far outnumber velocities, this kernel runs method 4 over a dense A under Coulomb's law, and
-methods 1 and 2 if bounded rows have two bounds. Under Coulomb's law, a sparse A is formed if its factor is estimated
-to cost less. Methods 1 to 4 over the rows of A are also used if they are estimated to cost less than a tenth (few rows
-of a soft body), and afterwards if the method over velocities fails, unless form="velocity". If the velocities belong
-to free rigid bodies and every block couples at most two of these, methods 1 to 4 run over the bodies and not over A;
-under Coulomb's law, and if many contacts are rigid, they then replace the method over velocities
-(`SmallCall.cost_limit`).
+methods 1 and 2 if bounded rows with a compliance below 0.03 d have two bounds. Under Coulomb's law, a sparse A is
+formed if its factor is estimated to cost less. Methods 1 to 4 over the rows of A are also used if they are estimated to
+cost less than a tenth (few rows of a soft body), and afterwards if the method over velocities fails, unless
+form="velocity". If the velocities belong to free rigid bodies and every block couples at most two of these, methods 1
+to 4 run over the bodies and not over A; under Coulomb's law, and if many contacts are rigid, they then replace the
+method over velocities (`SmallCall.cost_limit`).
 
 Methods 1 to 4 are compiled and run one factorisation at a time; `lavender_ext/newton/plan.pxd` has the table of their
 states. Between factorisations, Python checks the clock, Ctrl-C and certificates. `newton_systems/` builds the linear
