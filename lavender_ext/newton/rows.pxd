@@ -198,9 +198,9 @@ cdef inline bint are_generalized_rows_faster(const view_t* v) noexcept nogil:
     random problems stalled.
     """
     cdef const generalized_t* g = v.g
-    cdef double m = v.p.n_rows, n = g.n, islands = 1 if v.p.islands == NULL else v.p.islands.n, work, nc
+    cdef double m = v.p.n_rows, n = min(g.n, g.pcol[g.n_panels]), islands = 1 if v.p.islands == NULL else v.p.islands.n, work, nc
     cdef int32_t b
-    if m * (m + n) > 1e9 or (v.p.law != COULOMB if has_friction(&v.p) else not has_row_with_two_bounds(&v.p, g)):
+    if m * (m + g.n) > 1e9 or (v.p.law != COULOMB if has_friction(&v.p) else not has_row_with_two_bounds(&v.p, g)):
         return False
     work = n * n * n / (3.0 * islands * islands)
     for b in range(g.n_panels):
