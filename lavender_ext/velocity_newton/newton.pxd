@@ -27,8 +27,9 @@ After the second stage the normals are lowered by phi = sum of a_g |w_g| over th
 convex problem (De Saxce, Feng 1998; Cadoux 2009). A run that was given a start begins with the second stage.
 
 The stopping test uses the judge's error of lambda itself: w = Y (Y^T lambda) - b + theta lambda, error e of every
-block. N and its factor are reused if no block has changed its V, and in the first step after the centre has moved:
-lambda changes there along the law that it has settled on, and so does V.
+block, unless |G| bounds it (`bounds_errors`). N and its factor are reused if no block has changed its V, and in the first
+step after the centre has moved: lambda changes there along the law that it has settled on, and so does V. If few entries of
+V have changed, Y^T dV Y is added to N.
 """
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
@@ -54,7 +55,8 @@ cdef enum:                      # stages of a round of Coulomb friction
 
 cdef enum:
     MAX_IDLE_STEPS = 30         # An island is stuck if this many consecutive steps do not lower its lowest error by a tenth.
-    FAR_GRADIENT = 100          # Above this multiple of the limit, |G| has always exceeded what a solved island has.
+    FAR_GRADIENT = 100          # Errors are not measured if |G| is above this multiple of the limit: on 217 steps of robots,
+                                # no such iterate with V != 0 was a solution.
     MAX_COULOMB_ROUNDS = 12     # Problems that need more rounds are solved faster by other methods.
 
 

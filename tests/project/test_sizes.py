@@ -38,7 +38,7 @@ BUDGETS = {
     "lavender_ext/io": (480, 850),
     "lavender_ext/judge": (2300, 2740),
     "lavender_ext/local": (950, 1100),
-    "lavender_ext/newton lavender_ext/velocity_newton": (4700, 7922),
+    "lavender_ext/newton lavender_ext/velocity_newton": (4700, 7953),
     "lavender_ext/pivot": (1450, 1720),
 }
 
