@@ -55,8 +55,7 @@ cdef enum:                      # stages of a round of Coulomb friction
 
 cdef enum:
     MAX_IDLE_STEPS = 30         # An island is stuck if this many consecutive steps do not lower its lowest error by a tenth.
-    FAR_GRADIENT = 100          # Errors are not measured if |G| is above this multiple of the limit: on 217 steps of robots,
-                                # no such iterate with V != 0 was a solution.
+    FAR_GRADIENT = 100          # Errors are not measured above this multiple of the limit: on 217 steps none was a solution there.
     MAX_COULOMB_ROUNDS = 12     # Problems that need more rounds are solved faster by other methods.
 
 
