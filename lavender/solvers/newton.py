@@ -18,7 +18,7 @@
 
 Problems in generalised coordinates are first solved over their velocities (`newton_systems/general.py`), without
 forming A. Unless rows far outnumber velocities, this kernel runs method 4 over a dense A under Coulomb's law, and
-methods 1 and 2 if bounded rows with a compliance below 0.03 d have two bounds. Under Coulomb's law, a sparse A is
+methods 1 and 2 if bounded rows with a compliance below 0.005 d have two bounds. Under Coulomb's law, a sparse A is
 formed if its factor is estimated to cost less. Methods 1 to 4 over the rows of A are also used if they are estimated to
 cost less than a tenth (few rows of a soft body), and afterwards if the method over velocities fails, unless
 form="velocity". If the velocities belong to free rigid bodies and every block couples at most two of these, methods 1
