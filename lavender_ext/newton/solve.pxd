@@ -3,7 +3,6 @@ from libc.stdint cimport int32_t
 
 from lavender_ext.core.method cimport options_t, workspace_t, info_t
 from lavender_ext.core.view cimport view_t
-from lavender_ext.newton.elements cimport elements_t
 
 
 cdef int32_t rows_workspace_size(const view_t* v, const options_t* o, workspace_t* r) noexcept nogil
@@ -12,4 +11,3 @@ cdef int32_t bodies_workspace_size(const view_t* v, const options_t* o, workspac
 cdef int32_t start_newton_over_bodies(const view_t* v, const options_t* o, workspace_t* r, const double* lam) noexcept nogil
 cdef int32_t step_newton_system(const view_t* v, const options_t* o, const workspace_t* r, int32_t work, double* lam,
                          info_t* info) noexcept nogil
-cdef const elements_t* elements_of(object solve) except NULL

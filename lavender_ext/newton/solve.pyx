@@ -668,8 +668,3 @@ cdef class Solve(Method):
         compute_all_normal_shifts(self.n.s.e, self.n.u, fraction, self.n.c, self.n.psi)
         form_de_saxce_matrices(&self.n.s, self.n.psi)
         return np.asarray(<double[:self.m]>self.n.psi).copy()
-
-
-cdef const elements_t* elements_of(object solve) except NULL:
-    """Return the elements of a `Solve`."""
-    return &(<Solve?>solve).n.sc.e

@@ -30,15 +30,15 @@ BUDGETS = {
     "lavender/suite": (1900, 0),
     "lavender_ext/accelerate lavender_ext/sweep": (2150, 2470),
     "lavender_ext/batch lavender_ext/small": (1800, 2340),
-    "lavender_ext/core": (5300, 6550),
+    "lavender_ext/core": (5300, 6590),
     "lavender_ext/derivative": (750, 0),
     "lavender_ext/driver lavender_ext/host": (250, 0),
     "lavender_ext/engine": (2650, 0),
     "lavender_ext/factor": (2600, 3260),
-    "lavender_ext/io": (480, 850),
+    "lavender_ext/io": (480, 901),
     "lavender_ext/judge": (2300, 2740),
     "lavender_ext/local": (950, 1100),
-    "lavender_ext/newton lavender_ext/velocity_newton": (4700, 7953),
+    "lavender_ext/newton lavender_ext/velocity_newton": (4700, 7950),
     "lavender_ext/pivot": (1450, 1720),
 }
 
