@@ -27,7 +27,6 @@ from lavender_ext.factor.linear cimport (FALLBACK, PythonCalls, analyse_blocks, 
 from lavender_ext.newton.active_set cimport begin_active_set, count_active_bound_changes, exchange_rows
 from lavender_ext.newton.bodies cimport (bind_pattern, form_panel, form_velocity_panel, needs_lu, order_bodies, order_elements,
                                          pattern_t, use_panel)
-from lavender_ext.newton.elements cimport elements_t
 from lavender_ext.newton.interior cimport compute_scaling
 from lavender_ext.newton.path cimport path_compliance
 from lavender_ext.newton.plan cimport start_newton_solve, step_newton_solve
