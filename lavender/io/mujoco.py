@@ -404,7 +404,8 @@ def _make_block_names(
             while i + size < m and types[i + size] == row_type and ids[i + size] == which:
                 size += 1
             name, has_edges = get_name("equality", which), size > joined
-            part = "edge" if size > mujoco_rows.MAX_EQUALITY_ROWS else "axis"  # of a flex, or of a weld
+            # The rows of a flex belong to edges of its mesh, the rows of a weld to axes.
+            part = "edge" if size > mujoco_rows.MAX_EQUALITY_ROWS else "axis"
         elif row_type == kinds.mjCNSTR_FRICTION_DOF:
             joint = int(model.dof_jntid[which])
             axis = which - int(model.jnt_dofadr[joint])

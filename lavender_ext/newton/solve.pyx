@@ -117,7 +117,7 @@ cdef int32_t step_newton_system(const view_t* v, const options_t* o, const works
 
 
 cdef inline void bind_row_indices(newton_t* n, const view_t* v, arena_t* a) noexcept nogil:
-    """Take the state, the integers of `form_generalized_matrix` after it, and those of the elements."""
+    """Take the integers of the state, then of `form_generalized_matrix`, then of the elements."""
     set_problem(n, &v.p, v.a, NULL, v.g)
     take_integers(a, head())
     take_integers(a, 0 if v.g == NULL else v.g.n)

@@ -2,7 +2,7 @@
 
     count (row m_1 + contact_row m_c + entry (2 Y + 4 m) + work w)                                         (1)
 
-m: rows, m_c of which belong to contacts with friction and m_1 do not; Y: entries of J L^-1; w: multiply-adds to factorise N of
+m: rows; m_c: rows of contacts with friction; m_1: other rows; Y: entries of J L^-1; w: multiply-adds to factorise N of
 every island; count: number of factorisations. Python calls this estimate, too (`estimate_velocity_newton_cost` of
 `lavender/solvers/small.py`); the rates are in `lavender/base/rates.json`.
 """

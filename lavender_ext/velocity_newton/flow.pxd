@@ -100,7 +100,7 @@ cdef struct flow_t:
     double* factor              # factor of `normal`
     linear_t linear             # linear system of N, S or I + A V
     double* weighted_y          # (rows of a panel, columns rounded up to a multiple of four) -V Y
-    double* used_y              # (rows of a panel, columns) rows of Y for those of -V Y
+    double* used_y              # (rows of a panel, columns) rows of Y that belong to the rows of -V Y
     double* strip               # (STRIP_ROWS of normal.pxd, columns) rows of Y^T V Y of a panel
     double* local_rhs           # (s)
     int32_t n_free              # rows of S: rows with V != 0

@@ -23,7 +23,7 @@ from lavender.report import machine
 from lavender.report.runner import Event
 
 ERROR_QUANTILE = 0.99  # Settings are compared by this quantile of the error over all steps.
-# After the first round, a setting is no longer timed if it takes more than this multiple of the present setting's time.
+# Only the first round times a setting that takes more than this multiple of the present setting's time.
 MAX_TIME_RATIO = 2.0
 
 

@@ -102,7 +102,7 @@ def test_newton_over_velocities_reaches_the_floor_or_tol(friction, soft, seed):
     elif friction == "cone":
         assert solution.residual.relative <= max(tol, 2 * solution.residual.roundoff_floor), str(solution)
     assert solution.claim_check == "confirmed"
-    assert solution.solver.form in ("generalized coordinates", "velocity")  # of bodies that they stand for
+    assert solution.solver.form in ("generalized coordinates", "velocity")  # "velocity" if J and M describe free bodies
 
 
 @pytest.mark.parametrize("seed", range(5))
