@@ -26,13 +26,12 @@ COMMAND_GROUPS = {
     "Solve and judge": ("solve", "check", "explain"),
     "Measure": ("report",),
     "MuJoCo": ("record", "audit", "tune", "slip"),
-    "Engine": ("run", "view", "web"),
+    "Engine": ("run", "web"),
     "Tools": ("solvers", "contract", "doctor", "export"),
 }
-_WEB_COMMANDS = ("view", "web")
 #: Module of each command.
 COMMANDS = {
-    name: "lavender.sim.web.command" if name in _WEB_COMMANDS else f"lavender.cli.{name}"
+    name: "lavender.sim.web.command" if name == "web" else f"lavender.cli.{name}"
     for names in COMMAND_GROUPS.values()
     for name in names
 }

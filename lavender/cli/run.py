@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import sys
 from pathlib import Path
-from time import perf_counter, sleep
 from typing import Any
 
 import click
@@ -50,9 +49,7 @@ from lavender.io.stored import check_figure_path, check_writable, resolve_destin
 @click.option(
     "--replace", is_flag=True, help="With --record: first delete the problems of an earlier recording."
 )
-@click.option("--view", is_flag=True, help="Show the run live in a web page on this machine, until Ctrl-C.")
-@click.option("--film", type=PATH,
-              help="Write a film of the run: .gif, .mp4, .png pictures, or a file for `lavender view`.")  # fmt: skip
+@click.option("--film", type=PATH, help="Write a film of the run (.gif).")
 @click.pass_context
 def run(
     context: click.Context,
@@ -65,7 +62,6 @@ def run(
     trace: Path | None,
     record: Path | None,
     replace: bool,
-    view: bool,
     film: Path | None,
     velocity_tol: float | None,
     **scene_options: Any,
@@ -81,7 +77,7 @@ def run(
     """
     from lavender.sim.engine import Simulation
     from lavender.sim.engine import run as run_simulation
-    from lavender.sim.engine.picture import PICTURES, get_picture_suffix, save_picture
+    from lavender.sim.engine.picture import Film
     from lavender.sim.engine.run import format_step
     from lavender.sim.scene import Scene
 
@@ -99,9 +95,8 @@ def run(
         )
     for path in files.values():
         check_writable(path)
-    drawn = film is not None and film.suffix.lower() in PICTURES
-    if film is not None and drawn:
-        get_picture_suffix(film)
+    if film is not None and film.suffix.lower() != ".gif":
+        raise InputError(f"--film {film} is of format {film.suffix!r}; a name that ends in .gif is needed")
     live, writes = sys.stdout.isatty(), bool(files) or record is not None
 
     def show(text: str) -> None:
@@ -112,37 +107,27 @@ def run(
     scene_parameters = _collect_parameters(parameters, scene_options, velocity_tol)
     simulation = Simulation(Scene(scene, **scene_parameters), report_residual=residual)
     every = 1 if live else max(1, steps // 20)
-    with simulation.view() if view else contextlib.nullcontext() as viewer:
-        frames = viewer.film if viewer is not None else simulation.start_film() if film is not None else None
-        if viewer is not None:
-            show(f"{viewer.address}   Ctrl-C ends")
-        begun = perf_counter()
+    frames = None if film is None else Film(simulation)
 
-        def show_step(step: int, observation: dict[str, Any], info: dict[str, Any]) -> None:
-            if step % every == 0 or step == steps or "lost_body" in info:
-                show(format_step(step, observation, info))
-            if viewer is not None:  # A viewer shows the simulation in real time: wait for the clock.
-                sleep(max(0.0, info["time"] - (perf_counter() - begun)))
+    def show_step(step: int, observation: dict[str, Any], info: dict[str, Any]) -> None:
+        if step % every == 0 or step == steps or "lost_body" in info:
+            show(format_step(step, observation, info))
+        if frames is not None:
+            frames.add(info["time"], observation["positions"], observation["quaternions"])
 
-        result = run_simulation(simulation, steps, record=record, replace=replace, watch=show_step)
-        if result.lost_body:
-            show(f"stopped: the state of {result.lost_body!r} is not finite")
-        if trace is not None:
-            result.save(trace)
-        if plot is not None:
-            result.plot(plot)
-        if film is not None and frames is not None:
-            if drawn:
-                save_picture(frames, film)
-            else:
-                frames.save(film)
-        if viewer is not None and not result.stopped:
-            viewer.wait()
+    result = run_simulation(simulation, steps, record=record, replace=replace, watch=show_step)
+    if result.lost_body:
+        show(f"stopped: the state of {result.lost_body!r} is not finite")
+    if trace is not None:
+        result.save(trace)
+    if plot is not None:
+        result.plot(plot)
+    if film is not None and frames is not None:
+        frames.save(film)
     if live:
         click.echo()
     for name, path in files.items():
-        shown_by = f": lavender view {path}" if name == "film" and not drawn else ""
-        print_escaped(f"{name}: {path}{shown_by}")
+        print_escaped(f"{name}: {path}")
     if record is not None:
         print_escaped(f"{result.recorded} problems in {record}: lavender report {record}")
     best = 1e3 * result.cost.min()

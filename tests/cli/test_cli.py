@@ -382,7 +382,6 @@ def _must_not_begin(*_, **__):
     [
         ("run stack --plot {}/x.svg", "lavender.sim.engine.Simulation.step"),
         ("run stack --trace {}/x.csv", "lavender.sim.engine.Simulation.step"),
-        ("run stack --film {}/x.film", "lavender.sim.engine.Simulation.step"),
         ("run stack --film {}/x.gif", "lavender.sim.engine.Simulation.step"),
         ("solve toy_stack --output {}/x.npz", "lavender.report.resolve_sources"),
         ("web build {}/x.wasm", "lavender.sim.web.compile.build"),
@@ -407,9 +406,8 @@ def test_a_format_that_nobody_writes_is_refused_before_the_work(lavender, monkey
     monkeypatch.setattr("lavender.sim.engine.Simulation.step", _must_not_begin)
     code, _, err = lavender("run", "stack", "--plot", "x.plot")
     assert code == cli.EXIT_BAD_INPUT and "suffix" in err and "svg" in err
-    monkeypatch.setattr("lavender.sim.engine.picture.which", lambda name: None)
     code, _, err = lavender("run", "stack", "--film", "x.mp4")
-    assert code == cli.EXIT_BAD_INPUT and "ffmpeg" in err
+    assert code == cli.EXIT_BAD_INPUT and ".gif is needed" in err
 
 
 @pytest.mark.skipif(sys.version_info[:3] == (3, 13, 0), reason="CPython 3.13.0 imports nothing in such a folder")

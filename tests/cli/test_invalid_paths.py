@@ -35,7 +35,7 @@ from lavender.report.store import Store
 from lavender.report.terminal import print_report
 from lavender.report.timing import format_call
 from lavender.sim.engine import run
-from lavender.sim.engine.picture import save_picture
+from lavender.sim.engine.picture import Film
 
 resource = pytest.importorskip("resource", reason="limits, pipes and devices with names are of POSIX")
 pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes and devices with names are of POSIX")
@@ -46,7 +46,6 @@ READERS = {
     "load npz": (".npz", lambda results, path: lv.load(path)),
     "load hdf5": (".hdf5", lambda results, path: lv.load(path)),
     "load solution": (".npz", lambda results, path: io.load_solution(path)),
-    "load film": (".film", lambda results, path: lv.engine.Film.load(path)),
     "load snapshot": (".snap", lambda results, path: lv.Snapshot.load(path)),
     "load state": (".snap", lambda results, path: lv.Simulation("stack").load(path)),
     "read records": (".jsonl", lambda results, path: report.read(path)),
@@ -59,7 +58,7 @@ def results():
     simulation = lv.Simulation("stack")
     return {
         "problem": lv.Problem.contact(np.eye(3), [1.0, 0.0, 0.0], 0.5),
-        "film": lv.Simulation(lv.Scene("stack", n=1)).film(1),
+        "film": Film(lv.Simulation(lv.Scene("stack", n=1))),
         "trace": run(simulation, 3),
         "state": simulation.snapshot(),
     }
@@ -68,9 +67,7 @@ def results():
 WRITERS = {
     "npz": (".npz", lambda results, path: io.save(results["problem"], path)),
     "hdf5": (".hdf5", lambda results, path: io.save(results["problem"], path)),
-    "film": (".film", lambda results, path: results["film"].save(path)),
-    "strip": (".png", lambda results, path: save_picture(results["film"], path, frames=1)),
-    "animation": (".gif", lambda results, path: save_picture(results["film"], path)),
+    "film": (".gif", lambda results, path: results["film"].save(path)),
     "trace": (".csv", lambda results, path: results["trace"].save(path)),
     "figure": (".svg", lambda results, path: results["trace"].plot(path)),
     "snapshot": (".snap", lambda results, path: results["state"].save(path)),

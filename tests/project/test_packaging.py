@@ -162,6 +162,7 @@ def test_every_import_is_declared():
     known |= declared("newton") | {"lavendersim", "mujoco_warp", "pinocchio", "pydrake", "qoco", "siconos", "warp"}
     known |= {"genesis"}  # genesis-world, of the extra `genesis`
     known |= {"cupy"}  # imported only for a caller who gives arrays of it
+    known |= {"PIL"}  # Pillow, which matplotlib requires
     known |= {"typing_extensions"}  # for type checkers alone, which bring its stub
     known |= set(sys.stdlib_module_names) | {"lavender", "lavender_ext"}
     found = set()

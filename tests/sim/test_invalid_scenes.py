@@ -85,7 +85,6 @@ CALLS = {
         lv.Simulation,
         {"scene": "stack", "report_residual": True, "report_motion": True},
     ),
-    "Simulation.film": Call(on_simulation("film"), {"steps": 1}),
     "Simulation.reset": Call(on_simulation("reset"), {"seed": 1}),
     "Simulation.restore": Call(on_simulation("restore"), {"snapshot": lv.Simulation("stack").snapshot()}),
     "Simulation.set_solver_iterations": Call(
@@ -101,11 +100,9 @@ CALLS = {
 #: Public calls that are not in the table, and why.
 NOT_CALLED = {
     "Snapshot": "a result: the package makes it",
+    "Simulation.write_problem": "for the package's own use",
     **dict.fromkeys(
-        ("Simulation.end_film", "Simulation.write_problem"), "for the package's own use"
-    ),
-    **dict.fromkeys(
-        ("Simulation.frames", "Simulation.load", "Simulation.record", "Simulation.save", "Snapshot.load",
+        ("Simulation.load", "Simulation.record", "Simulation.save", "Snapshot.load",
          "Snapshot.save"),
         "a file: test_invalid_files.py of tests/cli",
     ),

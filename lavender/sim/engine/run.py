@@ -91,7 +91,6 @@ class Trace:
             top.semilogy(self.time, np.where(value > 0.0, value, np.nan), label=label)
         top.set(title=f"{self.title}: residual of the normals", ylabel="max $|e_n|$ [N s]")
         for name, label, width in (("contacts", "contacts", 5.0), ("cache_matches", "matches", 1.5)):
-            # Different line widths: both curves are visible if they are equal.
             middle.plot(self.time, self.column(name), linewidth=width, label=label)
         middle.set(title="contacts, and those found in the cache", ylim=(0, None))
         for axes in (top, middle):

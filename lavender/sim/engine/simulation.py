@@ -1,4 +1,4 @@
-"""`Simulation`: the step loop with its problems, records, films and snapshots."""
+"""`Simulation`: the step loop with its problems, records and snapshots."""
 
 from __future__ import annotations
 
@@ -9,13 +9,10 @@ from typing import Any
 from lavender import io
 from lavender.base.arrays import check_int, mark_read_only
 from lavender.base.errors import InputError, LavenderError, check_name
-from lavender.base.lazy_import import import_module_lazily
 from lavender.io.stored import lock_step_folder
 from lavender.problem import Problem
 from lavender.sim.engine.check import check_snapshot_fields, check_state, check_state_sizes, require_intact
-from lavender.sim.engine.film import Film, make_film_header
 from lavender.sim.engine.layout import HEAD
-from lavender.sim.engine.picture import save_picture
 from lavender.sim.engine.snapshot import Snapshot
 from lavender.sim.engine.state import State
 from lavender.sim.engine.stepping import (
@@ -36,7 +33,7 @@ class Simulation(Stepping):
     Threads may share a simulation: a call waits until the calls of other threads have ended. A call from inside a step
     (by a solver that the step runs) raises LavenderError.
 
-    A simulation is a context manager: `close` ends its films and viewers.
+    A simulation is a context manager, which `close` ends.
 
     Parameters
     ----------
@@ -173,120 +170,10 @@ class Simulation(Stepping):
         io.save(problem, path, drop=drop)
         return path
 
-    # -- pictures -------------------------------------------------------------------------------
-
-    def film(self, steps: int) -> Film:
-        """Step `steps` times and return a film of the poses, which starts with the present poses.
-
-        Stepping ends early if the state is no longer finite.
-
-        Parameters
-        ----------
-        steps : int
-
-        Returns
-        -------
-        Film
-            At most steps + 1 frames; `save` writes a file that `lavender view` opens.
-        """
-        steps = check_int("steps", steps, 1)
-        film = self.start_film()
-        try:
-            for _ in range(steps):
-                if self.step()[2]:
-                    break
-        finally:
-            self.end_film(film)
-        return film
-
-    @run_exclusively
-    def start_film(self) -> Film:
-        """Return a new film with the present poses; every step adds a frame until `end_film`. Earlier films go on."""
-        film = Film(make_film_header(self.scene, self.state))
-        film.add(self.time, self._make_observation())
-        self.films.append(film)
-        return film
-
-    def end_film(self, film: Film) -> None:
-        """End a film: later steps are not added."""
-        with self._lock:
-            if self._refusal == INSIDE_STEP:
-                raise LavenderError(INSIDE_STEP)
-            film.ended = True
-            self.films = [other for other in self.films if other is not film]
-
-    def frames(self, path: str | PathLike[str], steps: int = 120, **options: Any) -> Path:
-        """Step `steps` times and write an animation (`.gif`, `.mp4`) or a strip of frames (`.png`, `.svg`, `.pdf`).
-
-        Parameters
-        ----------
-        path : path
-        steps : int
-        **options
-            frames (number of frames of a strip, default 4), turn and tilt [rad], size [inch], rate [1/s] of an
-            animation.
-
-        Returns
-        -------
-        Path
-
-        Raises
-        ------
-        InputError
-            The suffix is unknown, or the path cannot be written.
-        """
-        return save_picture(self.film(steps), path, **options)
-
-    def view(self, *, port: int = 0, browser: bool = True) -> Any:
-        """Show this simulation in a browser page on this machine: all later steps live, and a replay of them.
-
-        Parameters
-        ----------
-        port : int
-            Port on the loopback address; 0 selects a free one.
-        browser : bool
-            Open the page.
-
-        Returns
-        -------
-        Viewer
-            A context manager; `address`, `film`, `wait()` until Ctrl-C, `close()`.
-
-        Raises
-        ------
-        InputError
-            The port is in use.
-
-        Examples
-        --------
-        >>> import lavender as lv
-        >>> sim = lv.Simulation("stack")
-        >>> with sim.view(browser=False) as viewer:
-        ...     for _ in range(10):
-        ...         _ = sim.step()
-        >>> len(viewer.film)
-        11
-        """
-        film = self.start_film()
-
-        def end() -> None:
-            self._viewers.pop(id(film), None)
-            self.end_film(film)
-
-        try:
-            viewer = import_module_lazily("lavender.sim.web.view").Viewer(
-                film, port=port, browser=browser, end=end
-            )
-        except BaseException:
-            self.end_film(film)
-            raise
-        self._viewers[id(film)] = viewer
-        return viewer
-
     # -- the end --------------------------------------------------------------------------------
 
     def close(self) -> None:
-        """End the films and close the viewers of this simulation.
+        """End this simulation.
 
         Later calls raise LavenderError; the time, the number of steps and the settings can still be read. A second
         `close` does nothing.
@@ -300,12 +187,7 @@ class Simulation(Stepping):
             if self._refusal == INSIDE_STEP:
                 raise LavenderError(INSIDE_STEP)
             self._refusal = SIMULATION_CLOSED
-            for film in self.films:
-                film.ended = True
-            self.films = []
             self._state_before_step = self._last = None
-        for viewer in list(self._viewers.values()):
-            viewer.close()
 
     def __enter__(self) -> Simulation:
         return self
@@ -381,7 +263,7 @@ class Simulation(Stepping):
         self.restore(Snapshot.load(path))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Copy or pickle as a new simulation that continues from the same state, without films."""
+        """Copy or pickle as a new simulation that continues from the same state."""
         return _restore_simulation, (self.scene, self.report_residual, self.report_motion, self.snapshot())
 
 

@@ -17,7 +17,6 @@ from lavender.base.arrays import check_bool as check_flag
 from lavender.base.errors import InputError, LavenderError, SolveFailed, UnknownName
 from lavender.judge.solution import Solution, get_order_name, raise_if_interrupted
 from lavender.problem import Problem
-from lavender.sim.engine.film import Film
 from lavender.sim.engine.layout import HEAD, SIZE
 from lavender.sim.engine.problem import build_problem, summarise_motion, summarise_residual
 from lavender.sim.engine.state import State
@@ -61,7 +60,7 @@ def run_exclusively(
 
 
 class Stepping:
-    """Base class of `Simulation`: the step loop of a scene, without records, films and snapshots."""
+    """Base class of `Simulation`: the step loop of a scene, without records and snapshots."""
 
     def __init__(
         self,
@@ -83,8 +82,6 @@ class Stepping:
         self.report_residual = check_flag("report_residual", report_residual)
         self.report_motion = check_flag("report_motion", report_motion)
         self._lock, self._refusal = RLock(), ""  # `_refusal` is the reason why calls are rejected, or empty.
-        self.films: list[Film] = []  # Every step adds a frame to these films.
-        self._viewers: dict[int, Any] = {}  # Open pages by the id of their film.
         self._load_scene(scene)
 
     def _load_scene(self, scene: Scene) -> None:
@@ -277,10 +274,7 @@ class Stepping:
             try:
                 self._advance_all_substeps()
                 lost = self._find_lost_body()
-                observation = self._make_observation()
-                for film in self.films:
-                    film.add(self.time, observation)
-                return observation, 0.0, bool(lost), False, self._make_step_info(lost)
+                return self._make_observation(), 0.0, bool(lost), False, self._make_step_info(lost)
             finally:
                 self._refusal = ""
 

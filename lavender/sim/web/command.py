@@ -6,18 +6,12 @@ from pathlib import Path
 
 import click
 
-PORT = click.option(
-    "--port",
-    type=click.IntRange(0, 65535),
-    default=0,
-    help="Port of the page's server; 0 selects a free one.",
-)
-NO_BROWSER = click.option("--no-browser", is_flag=True, help="Only print the address of the page.")
-
 
 @click.group(invoke_without_command=True)
-@PORT
-@NO_BROWSER
+@click.option(
+    "--port", type=click.IntRange(0, 65535), default=0, help="Port of the server; 0 selects a free one."
+)
+@click.option("--no-browser", is_flag=True, help="Only print the address of the page.")
 @click.pass_context
 def web(context: click.Context, port: int, no_browser: bool) -> None:
     """Open a page that runs the kernels in a browser.
@@ -94,17 +88,3 @@ def check() -> None:
 
     if not pages.compare_with_native_kernels(_print_message):
         raise click.exceptions.Exit(EXIT_UNMET)
-
-
-@click.command()
-@click.argument("film", type=click.Path(path_type=Path), metavar="FILM")
-@PORT
-@NO_BROWSER
-def view(film: Path, port: int, no_browser: bool) -> None:
-    """Show a film written by `lavender run NAME --film FILM` in a browser page on this machine."""
-    from lavender.sim.engine import Film
-    from lavender.sim.web.view import Viewer
-
-    with Viewer(Film.load(film), port=port, browser=not no_browser) as viewer:
-        click.echo(f"{viewer.address}   Ctrl-C ends")
-        viewer.wait()

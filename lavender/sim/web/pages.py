@@ -128,7 +128,7 @@ def _copy_file(source: str, target: str) -> None:
     write_bytes(target, Path(source).read_bytes())
 
 
-class Handler(SimpleHTTPRequestHandler):
+class _Handler(SimpleHTTPRequestHandler):
     """Handler with its own table of content types, because the table of the system may be incomplete or wrong."""
 
     extensions_map = {  # noqa: RUF012 - as the base class has it
@@ -159,14 +159,15 @@ class Handler(SimpleHTTPRequestHandler):
 
 
 def create_file_server(folder: Path, port: int = 0) -> ThreadingHTTPServer:
-    """Create a server of `folder` on the loopback address without starting it; port 0 selects a free one."""
-    return create_server(partial(Handler, directory=str(folder)), port)
+    """Create a server of `folder` on the loopback address without starting it; port 0 selects a free one.
 
-
-def create_server(handler: Callable[..., Any], port: int) -> ThreadingHTTPServer:
-    """Create a server on the loopback address that answers with `handler`; InputError if the port cannot be used."""
+    Raises
+    ------
+    InputError
+        The port cannot be used.
+    """
     try:
-        return ThreadingHTTPServer(("127.0.0.1", port), handler)
+        return ThreadingHTTPServer(("127.0.0.1", port), partial(_Handler, directory=str(folder)))
     except (OSError, OverflowError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"port {port} cannot be used ({reason}); give another") from None
