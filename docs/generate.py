@@ -40,11 +40,9 @@ from lavender import registry, suite
 from lavender.base.deadline import format_seconds
 from lavender.problem import LAWS
 from lavender.report import Plan, Report, run, tables
-from lavender.report.figures import build_overall_figure
-from lavender.report.page import render_page
-from lavender.report.plotting import assign_styles, render_svg
-from lavender.report.records import format_tolerance
-from lavender.report.text import format_residual
+from lavender.report.figures import assign_styles, build_overall_figure, render_svg
+from lavender.report.findings import render_report
+from lavender.report.text import format_residual, format_tolerance
 from lavender.sim.scene.gallery import SCENES
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -525,7 +523,7 @@ def measured_page(site, report, figures):
     records = report.records
     run = next(iter(records.runs.values()))
     structures = f"{by_structure(report)}\n\n[A report's page](report.html) shows the same records."
-    site.write("report.html", render_page(report))
+    site.write("report.html", render_report(report))
     shown = ", ".join(f"{n} {v}" for n, v in run.versions.items())
     drawn = []
     for law in LAWS:

@@ -26,11 +26,10 @@ from lavender.io.engine_step import EngineStep
 from lavender.io.recorder import Recorder, read_recorded_state
 from lavender.io.stored import STATES_FOLDER, write_arrays
 from lavender.judge.residuals import AT_FLOOR, DEFAULT_THRESHOLD
-from lavender.report.records import format_tolerance
 from lavender.report.runner import Event
 from lavender.report.summary_page import PageSection, SummaryPage
 from lavender.report.table import Table
-from lavender.report.text import format_count, format_percent, format_size
+from lavender.report.text import format_count, format_percent, format_size, format_tolerance
 
 #: Outcomes of a world's step.
 OUTCOMES = (

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 # Columns that a narrow terminal leaves out, in this order.
 NARROW_CHECK_OMITS = (
-    "objective [J]", "allowed [√J]", "floor", "distance [√J]", "what ran", "time [ms]", "relative",
+    "objective [J]", "allowed [√J]", "floor [-]", "distance [√J]", "what ran", "time [s]", "relative [-]",
 )  # fmt: skip
 
 
@@ -73,9 +73,8 @@ def check(
     from lavender.base.arrays import check_float
     from lavender.judge.residuals import AT_FLOOR, CLOSE
     from lavender.report.check import cross_check
-    from lavender.report.records import format_tolerance
-    from lavender.report.terminal import print_table
-    from lavender.report.text import format_count, format_residual
+    from lavender.report.render import print_table
+    from lavender.report.text import format_count, format_residual, format_tolerance
     from lavender.solving.limits import check_time_limit
 
     limit_to_one_thread()
@@ -103,7 +102,7 @@ def check(
             if comparison.reference is None and comparison.reference_note != reason:
                 reason = comparison.reference_note  # Problems that follow usually have the same.
                 print_escaped(f"no reference: {reason}")
-            print_table(make_console(), comparison.table, optional=NARROW_CHECK_OMITS)
+            print_table(make_console(), comparison.frame, optional=NARROW_CHECK_OMITS)
             if (exact := _describe_distances(item, comparison)) is not None:
                 print_escaped(exact)
             if stored is not None:

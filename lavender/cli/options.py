@@ -291,14 +291,14 @@ def escape_markup(text: str) -> str:
     """Return text with rich's markup escaped and control characters written as their codes."""
     from rich.markup import escape
 
-    from lavender.report.records import escape_unprintable
+    from lavender.report.text import escape_unprintable
 
     return escape(escape_unprintable(text, lines=True))
 
 
 def print_escaped(text: str, err: bool = False, style: str = "") -> None:
     """Print text that may contain names of files and problems; control characters are written as their codes."""
-    from lavender.report.records import escape_unprintable
+    from lavender.report.text import escape_unprintable
 
     if style:
         make_console(err).print(escape_markup(text), style=style, highlight=False, soft_wrap=True)

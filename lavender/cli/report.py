@@ -87,9 +87,8 @@ def report(
         reject_unused_options(context, given, "with --list")
         _list_suite()
         return
-    from lavender.report.engine import read_engine_answers
     from lavender.report.store import read
-    from lavender.report.text import format_count, list_skip_reasons
+    from lavender.report.text import format_count
 
     for limit in options["time_budgets"]:
         if not (math.isfinite(limit) and limit > 0.0):
@@ -118,9 +117,8 @@ def report(
         if not records_files:
             measured = measure_files(context, files, path, watch)
         # These modules import pandas, which only a report needs.
-        from lavender.report.files import write
-        from lavender.report.findings import Report
-        from lavender.report.terminal import print_report
+        from lavender.report.findings import Report, list_skip_reasons, print_report, write
+        from lavender.report.tables import read_engine_answers
 
         engines = [] if is_campaign(context) else read_engine_answers(files, measured.records)
         shown = Report(measured.records, old, options["time_budgets"], engines)
@@ -205,7 +203,7 @@ def _record_model(
     if path.suffix.lower() != ".xml":
         return word
     from lavender.io.recording import record_file
-    from lavender.report.records import make_file_name
+    from lavender.report.text import make_file_name
 
     model, n = str(path.resolve()), 1
     first = out / "recorded" / make_file_name(f"{path.resolve().parent.name}-{path.stem}")

@@ -40,7 +40,7 @@ def solve(file: str, solver: str, tol: float, output: Path | None, **options: An
     """
     from lavender import report
     from lavender.judge.residuals import WRONG
-    from lavender.report.worker import TaskFailed, Worker, solve_isolated
+    from lavender.report.workers import TaskFailed, Worker, solve_isolated
 
     limit_to_one_thread()
     if output is not None:

@@ -85,27 +85,23 @@ def _describe_solver(name: str) -> None:
 
 def _list_solvers() -> None:
     """Print a table of the solvers, installed ones first."""
-    from rich.table import Table
+    import pandas as pd
 
     from lavender.problem import LAWS, OPERATORS
+    from lavender.report.render import print_table
     from lavender.solvers import registry
 
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for name in ("solver", "laws", "reads", "capabilities", "description"):
-        table.add_column(name, no_wrap=name == "solver", overflow="fold")
     reasons = registry.known()
-    for name, spec in sorted(registry.specs().items(), key=lambda pair: (bool(reasons[pair[0]]), pair[0])):
-        reason = reasons[name]
-        table.add_row(
-            escape_markup(name),
-            _join_in_order(LAWS, spec.laws),
-            _join_in_order(OPERATORS, spec.operators),
-            _get_capabilities(spec),
-            f"[yellow]{escape_markup(reason)}[/]" if reason else escape_markup(spec.summary),
-            style="dim" if reason else "",
-        )
-    legend = Table("capability", "meaning", box=None, pad_edge=False, header_style="bold")
-    for _, word, meaning in CAPABILITIES:
-        legend.add_row(word, meaning)
+    rows = [
+        {
+            "solver": name, "laws": _join_in_order(LAWS, spec.laws), "reads": _join_in_order(OPERATORS, spec.operators),
+            "capabilities": _get_capabilities(spec), "description": reasons[name] or spec.summary,
+        }
+        for name, spec in sorted(registry.specs().items(), key=lambda pair: (bool(reasons[pair[0]]), pair[0]))
+    ]  # fmt: skip
     console = make_console()
-    console.print(table, "", legend, sep="\n")
+    print_table(console, pd.DataFrame(rows), optional=("reads",))
+    console.print()
+    print_table(
+        console, pd.DataFrame(CAPABILITIES, columns=["field", "capability", "meaning"]).drop(columns="field")
+    )

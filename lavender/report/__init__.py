@@ -12,25 +12,21 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from lavender.report import tables
-    from lavender.report.cases import Item, make_sequence, resolve_sources
-    from lavender.report.files import write
-    from lavender.report.findings import Report
-    from lavender.report.plan import CampaignPlan, Plan
+    from lavender.report.cases import Item, classify_structure, make_sequence, resolve_sources
+    from lavender.report.findings import Report, write
     from lavender.report.records import CaseInfo, Record, Records, Run, Skip
     from lavender.report.runner import Event, carry_impulses, run, select_solver_names
     from lavender.report.store import Store, read
-    from lavender.report.structure import classify_structure
+    from lavender.report.timing import CampaignPlan, Plan
 
 # Module -> public names in it, imported when a name is first used: tables and pages need pandas, solving does not.
 _PUBLIC_NAMES = {
-    "cases": ("Item", "make_sequence", "resolve_sources"),
-    "findings": ("Report",),
-    "plan": ("CampaignPlan", "Plan"),
+    "cases": ("Item", "classify_structure", "make_sequence", "resolve_sources"),
+    "findings": ("Report", "write"),
     "records": ("CaseInfo", "Record", "Records", "Run", "Skip"),
     "store": ("Store", "read"),
-    "structure": ("classify_structure",),
+    "timing": ("CampaignPlan", "Plan"),
     "runner": ("Event", "carry_impulses", "run", "select_solver_names"),
-    "files": ("write",),
 }
 _MODULE_OF_NAME = {name: module for module, names in _PUBLIC_NAMES.items() for name in names}
 

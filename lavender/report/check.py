@@ -19,8 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from html import escape
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -30,14 +29,19 @@ from lavender.external.backends import explain_contradicted_claim
 from lavender.judge.residuals import MAX_EXCUSED_RESIDUAL, WRONG
 from lavender.judge.solution import CONTRADICTED, NOT_PROVEN, Solution, Status, raise_if_interrupted
 from lavender.problem import Problem, check_problem
-from lavender.report.records import format_tolerance
-from lavender.report.table import Table
-from lavender.report.text import format_residual, format_significant_digits
-from lavender.report.worker import TaskFailed, Worker, solve_isolated
+from lavender.report.render import format_cells, render_table
+from lavender.report.text import format_residual, format_tolerance
+from lavender.report.workers import TaskFailed, Worker, solve_isolated
 from lavender.solvers.registry import available, get, known, specs
 from lavender.solving.limits import check_time_limit
 from lavender.solving.prepared import check_arguments
 
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+NUMBER_COLUMNS = (
+    "relative [-]", "floor [-]", "error [m/s]", "distance [√J]", "allowed [√J]", "objective [J]", "time [s]"
+)  # fmt: skip
 REFERENCES = ("osqp", "clarabel", "piqp", "direct")
 # Reference solvers, in order, under the law "cone" (relaxed friction), which does not give a QP.
 CONE_REFERENCES = ("clarabel_cone", "block_gauss_seidel")
@@ -155,31 +159,22 @@ class CrossCheck:
 
     def _repr_html_(self) -> str:
         """Return the table for notebooks."""
-        rows = ("".join(f"<td>{escape(text)}</td>" for text in line) for line in self._cells)
-        return f"<table>{''.join(f'<tr>{row}</tr>' for row in rows)}</table>"
+        return render_table(self.frame)
 
     @property
-    def _cells(self) -> list[Any]:
-        """Texts of the table, beginning with the heads of its columns."""
-        head = (
-            "solver", "verdict", "status", "relative", "floor", "error [m/s]", "distance [√J]", "allowed [√J]",
-            "objective [J]", "time [ms]", "what ran",
-        )  # fmt: skip
-        return [head] + [
-            (
-                f"{r.solver} → {r.ran}" if r.ran else r.solver, r.verdict, r.status,
-                _format_number(r.relative), _format_number(r.roundoff_floor), _format_number(r.velocity),
-                _format_number(r.distance), _format_number(r.allowed), _format_number(r.objective),
-                "" if r.time is None else format_significant_digits(1e3 * r.time), r.note,
-            )
+    def frame(self) -> DataFrame:
+        """Row for each solver; the bounded variant that ran is named after an arrow."""
+        import pandas as pd
+
+        return pd.DataFrame([
+            {
+                "solver": f"{r.solver} → {r.ran}" if r.ran else r.solver, "verdict": r.verdict, "status": r.status,
+                "relative [-]": r.relative, "floor [-]": r.roundoff_floor, "error [m/s]": r.velocity,
+                "distance [√J]": r.distance, "allowed [√J]": r.allowed, "objective [J]": r.objective,
+                "time [s]": r.time, "what ran": r.note,
+            }
             for r in self.rows
-        ]  # fmt: skip
-
-    @property
-    def table(self) -> Table:
-        """Table of the compared solvers."""
-        heads, *rows = self._cells
-        return Table(heads, rows, words=frozenset({"solver", "verdict", "status", "what ran"}))
+        ]).astype(dict.fromkeys(NUMBER_COLUMNS, float))  # fmt: skip
 
     @property
     def description(self) -> str:
@@ -189,17 +184,12 @@ class CrossCheck:
         return f"{name} ({self.problem.law}), cold, tol {format_tolerance(self.tol)}{reference}"
 
     def __str__(self) -> str:
-        widths = [max(map(len, column)) for column in zip(*self._cells, strict=True)]
-        lines = [
-            "  ".join(x.ljust(n) for x, n in zip(line, widths, strict=True)).rstrip() for line in self._cells
-        ]
+        texts = format_cells(self.frame)
+        lines = [list(texts), *texts.to_numpy().tolist()]
+        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+        table = ["  ".join(x.ljust(n) for x, n in zip(line, widths, strict=True)).rstrip() for line in lines]
         reason = [] if self.reference else [f"no reference: {self.reference_note}"]
-        return "\n".join([self.description, *reason, *lines])
-
-
-def _format_number(x: float | None) -> str:
-    """Format a number, or nothing."""
-    return "" if x is None else format_residual(x)
+        return "\n".join([self.description, *reason, *table])
 
 
 def cross_check(

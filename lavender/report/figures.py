@@ -1,26 +1,53 @@
-"""Compute the points of every figure of a report, independent of the drawing library (`plotting`)."""
+"""Compute the points of the figures of a report, and draw figures with matplotlib, as SVG files and within a page.
+
+A solver of lavender has the same colour and dash in all reports. The colours are from Okabe and Ito (distinct under
+the common colour-vision deficiencies); dashes distinguish solvers that share a colour, also in grey print. Plug-ins
+have colours of their own. The style sheet of a page replaces black and grey by the colours of its theme.
+"""
 
 from __future__ import annotations
 
+import io
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from html import escape
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lavender.report.records import format_tolerance
-from lavender.report.text import format_count
+from lavender.base.errors import require_packages
+from lavender.io.stored import make_folder, write_text
+from lavender.report.text import format_count, format_tolerance, make_file_name
+from lavender.solvers import registry
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from lavender.report.findings import Report
+    from lavender.report.tables import Contents
 
 MIN_RESIDUAL = 1e-17  # A residual of exactly zero is drawn here.
 MAX_CURVES = 6  # Largest number of solvers in a figure, without plug-ins; more are hard to distinguish.
 GRID_SIZE = 49  # Number of points on the horizontal axis at which the residuals of all cases are evaluated.
 MAX_SEQUENCES = 4  # Largest number of sequences that have a figure.
+SOLVER_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#A0803A", "#7F7F7F")
+PLUG_IN_COLORS = ("#000000", "#B000B0", "#C03040")  # No solver of lavender has one of these colours.
+DASHES = ("-", "--", ":", "-.")  # Line styles of matplotlib.
+MARKERS = ("o", "s", "^", "D", "X", "*", "v")
+GREY = "#b0b0b0"  # Grid and tolerances.
+# [inches] Size of a figure without its legend; legible on a phone and on half of a screen.
+WIDTH, HEIGHT = 5.6, 3.9
+LEFT, RIGHT, TOP, BOTTOM = 0.75, 0.12, 0.3, 0.5  # [inches] Margins of the axes.
+LEGEND_ROW_HEIGHT = 0.21  # [inches]
+LEGEND_COLUMNS = 2
+MAX_NAME_LENGTH = 34  # [characters] Longer names in a legend are cut.
+MAX_TITLE_LENGTH = 62  # [characters] Longer titles are cut.
+# Solvers that get the first styles, so that solvers that are often compared have different colours.
+FIRST_SOLVERS = (
+    *("auto", "direct", "newton", "anderson", "nncg", "osqp", "pgs", "sequential_impulses"),
+    *("jacobi", "admm"),
+)
 FLAT_LINES_NOTE = (
     "A curve is flat after the last run of its solver, which ended at a tolerance (grey lines) or after a fixed "
     "number of iterations."
@@ -73,7 +100,7 @@ class Figure:
         return f"{self.title}. {self.y_title} against {self.x_title}. Curves: {names}."
 
 
-def build_figures(report: Report) -> list[Figure]:
+def build_figures(report: Contents) -> list[Figure]:
     """Build the figures of a report that have a curve; none for a campaign, which has no times."""
     if report.is_campaign or not len(report.frame):
         return []
@@ -83,23 +110,22 @@ def build_figures(report: Report) -> list[Figure]:
     return [figure for figure in figures if figure.curves]
 
 
-def select_drawn_solvers(report: Report, frame: pd.DataFrame) -> list[str]:
+def select_drawn_solvers(report: Contents, frame: pd.DataFrame) -> list[str]:
     """Select the solvers that figures show: the best of the ranking, at most `MAX_CURVES`, and all plug-ins."""
-    from lavender.report.ranking import rank_solvers
-    from lavender.report.recommendation import is_plug_in
+    from lavender.report.tables import is_plug_in, rank_solvers
 
     ranking = [str(name) for name in rank_solvers(frame, report.tolerance).index]
     plug_ins = [name for name in ranking if is_plug_in(name)]
     return [*[name for name in ranking if name not in plug_ins][:MAX_CURVES], *plug_ins]
 
 
-def build_overall_figure(report: Report, name: str = "error-against-time", law: str = "") -> Figure:
+def build_overall_figure(report: Contents, name: str = "error-against-time", law: str = "") -> Figure:
     """Plot the residual that each solver has reached by a time: median over the cases, and a band of the quartiles.
 
     A case without a result by that time counts with residual 1, as the zero impulse. Cases are single problems from a
     cold start; if there are only sequences, each step is a case. With `law`, its cases and all solvers are drawn.
     """
-    from lavender.report.ranking import select_starts
+    from lavender.report.tables import select_starts
 
     frame = report.frame[report.frame["law"] == law] if law else report.frame
     single = frame["step"] < 0
@@ -146,10 +172,9 @@ def build_overall_figure(report: Report, name: str = "error-against-time", law: 
                   tolerances=report.tolerances, note=note)  # fmt: skip
 
 
-def build_cost_figure(report: Report) -> Figure:
+def build_cost_figure(report: Contents) -> Figure:
     """Plot the time to the middle tolerance against the number of rows, with the fitted power of each solver."""
-    from lavender.report.ranking import get_times
-    from lavender.report.tables import tabulate_costs
+    from lavender.report.tables import get_times, tabulate_costs
 
     fits, target = tabulate_costs(report), format_tolerance(report.tolerance)
     times, curves = get_times(report.frame, report.tolerance), []
@@ -168,7 +193,7 @@ def build_cost_figure(report: Report) -> Figure:
                   tuple(curves), note=note)  # fmt: skip
 
 
-def build_sequence_figure(report: Report, name: str) -> Figure:
+def build_sequence_figure(report: Contents, name: str) -> Figure:
     """Plot the time of all steps so far of a sequence to the middle tolerance, carried and cold (thin)."""
     runs = report.frame[(report.frame["sequence"] == name) & (report.frame["mode"] == "tol")]
     curves: list[Curve] = []
@@ -190,3 +215,138 @@ def build_sequence_figure(report: Report, name: str) -> Figure:
 def list_solvers(figures: Sequence[Figure]) -> list[str]:
     """Return the names of the curves of all figures, in their order."""
     return list(dict.fromkeys(c.solver for figure in figures for c in figure.curves))
+
+
+# -- drawing -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class CurveStyle:
+    """Colour, dash and mark of a solver, as matplotlib names them."""
+
+    color: str
+    dash: str
+    marker: str
+
+
+def number_styles(names: Sequence[str], colors: Sequence[str] = SOLVER_COLORS) -> dict[str, CurveStyle]:
+    """Return a style for each name, in their order; names of different colours come first, then other dashes."""
+    return {
+        name: CurveStyle(
+            colors[i % len(colors)], DASHES[i // len(colors) % len(DASHES)], MARKERS[i % len(MARKERS)]
+        )
+        for i, name in enumerate(names)
+    }
+
+
+def assign_styles(solvers: Iterable[str]) -> dict[str, CurveStyle]:
+    """Return a style for each solver.
+
+    The style of a built-in solver is fixed by its place in `FIRST_SOLVERS`, followed by the other names in
+    alphabetical order. Plug-ins get the colours of `PLUG_IN_COLORS` in alphabetical order.
+    """
+    names = set(solvers)
+    own = {name for name, spec in registry.specs().items() if spec.builtin}
+    styles = number_styles([*FIRST_SOLVERS, *sorted(own - set(FIRST_SOLVERS))])
+    styles |= number_styles(sorted(names - own), PLUG_IN_COLORS)
+    return {name: style for name, style in styles.items() if name in names}
+
+
+def plot_figure(figure: Figure, styles: Mapping[str, CurveStyle]) -> Any:
+    """Draw a figure with its legend below the axes.
+
+    Points that the axes cannot show are gaps: not finite, or not positive on a logarithmic axis. Lines have the id
+    SOLVER--NUMBER in an SVG.
+    """
+    require_packages("a figure", "matplotlib")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure as Canvas
+
+    below = LEGEND_ROW_HEIGHT * -(-sum(bool(c.label) for c in figure.curves) // LEGEND_COLUMNS)
+    height = HEIGHT + below
+    canvas = Canvas(figsize=(WIDTH, height))
+    FigureCanvasAgg(canvas)
+    canvas.patch.set_visible(False)
+    # The axes have a fixed position: fitting it to the labels would take longer than drawing the figure.
+    axes = canvas.add_axes(
+        (LEFT / WIDTH, (BOTTOM + below) / height, 1.0 - (LEFT + RIGHT) / WIDTH, (HEIGHT - TOP - BOTTOM) / height),
+        facecolor="none", xscale="log" if figure.x_log else "linear", yscale="log" if figure.y_log else "linear",
+    )  # fmt: skip
+    for i, c in enumerate(figure.curves):
+        _draw_curve(axes, figure, c, styles[c.solver], f"{c.solver}--{i}")
+    low, high = axes.get_ylim()
+    for tolerance in figure.tolerances:
+        if low <= tolerance <= high:
+            axes.axhline(tolerance, color=GREY, linewidth=0.8, zorder=0)
+    for axis, is_log in ((axes.xaxis, figure.x_log), (axes.yaxis, figure.y_log)):
+        if is_log:
+            axis.set_major_formatter(lambda x, _: f"{x:g}" if 0.1 <= x < 1e4 else format_tolerance(x))
+            axis.set_minor_formatter(lambda x, _: "")
+    axes.grid(True, color=GREY, linewidth=0.4, alpha=0.4)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.set_title(_shorten(figure.title, MAX_TITLE_LENGTH), fontsize=10, loc="left", parse_math=False)
+    axes.set_xlabel(figure.x_title, parse_math=False)
+    axes.set_ylabel(figure.y_title, parse_math=False)
+    handles, labels = axes.get_legend_handles_labels()
+    if handles:
+        legend = canvas.legend(
+            handles, labels, loc="lower left", bbox_to_anchor=(0.1, 0.0), ncols=LEGEND_COLUMNS, fontsize=9,
+            frameon=False, borderpad=0.0, labelspacing=0.35,
+        )  # fmt: skip
+        for text in legend.get_texts():
+            text.set_parse_math(False)  # A name with two dollars is not a formula.
+    return canvas
+
+
+def _draw_curve(axes: Any, figure: Figure, c: Curve, style: CurveStyle, gid: str) -> None:
+    """Draw one curve with its band."""
+    logs, points = (figure.x_log, figure.y_log), []
+    for point in zip(c.x, c.y, strict=True):
+        shown = all(math.isfinite(v) and (v > 0.0 or not log) for v, log in zip(point, logs, strict=True))
+        points.append(point if shown else (math.nan, math.nan))
+    x, y = zip(*points, strict=True) if points else ((), ())
+    has_marks = c.points or len(x) == 1 or not (c.unmarked or c.steps)
+    (line,) = axes.plot(
+        x, y, label=_shorten(c.label, MAX_NAME_LENGTH) if c.label else "_", color=style.color,
+        linestyle="none" if c.points else "--" if c.thin else style.dash, linewidth=1.0 if c.thin else 1.7,
+        marker=style.marker if has_marks else "", markersize=4.5, drawstyle="steps-post" if c.steps else "default",
+    )  # fmt: skip
+    line.set_gid(gid)
+    if c.low:
+        axes.fill_between(c.x, c.low, c.high, color=style.color, alpha=0.15, linewidth=0.0)
+
+
+def _shorten(text: str, longest: int) -> str:
+    """Cut a text, and begin it with a thin space if matplotlib would hide it (a label that begins with _)."""
+    text = text if len(text) <= longest else text[: longest - 1] + "…"
+    return "\u2009" + text if text.startswith("_") else text
+
+
+def render_svg(figure: Figure, styles: Mapping[str, CurveStyle]) -> str:
+    """Return a figure as the text of an SVG file, with texts as texts."""
+    canvas, text = plot_figure(figure, styles), io.StringIO()
+    from matplotlib import rc_context
+
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": figure.name}):
+        canvas.savefig(text, format="svg", metadata={"Date": None})
+    return text.getvalue()
+
+
+def embed_svg(figure: Figure, svg: str) -> str:
+    """Return a figure of a page: the SVG as matplotlib wrote it, with its alternative text."""
+    alt = escape(figure.description)
+    note = f'<figcaption class="quiet">{escape(figure.note)}</figcaption>' if figure.note else ""
+    return f'<figure class="chart"><div role="img" aria-label="{alt}">{svg[svg.index("<svg") :]}</div>{note}</figure>'
+
+
+def draw_figures(
+    figures: Sequence[Figure], styles: Mapping[str, CurveStyle], folder: Path | None = None
+) -> list[str]:
+    """Return the figures for a page; with `folder`, also write each as NAME.svg."""
+    drawn = []
+    for figure in figures:
+        svg = render_svg(figure, styles)
+        if folder is not None:
+            write_text(make_folder(folder) / f"{make_file_name(figure.name)}.svg", svg)
+        drawn.append(embed_svg(figure, svg))
+    return drawn

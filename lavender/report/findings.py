@@ -1,24 +1,55 @@
-"""Compute the contents of a report, which the page, the terminal and the files show."""
+"""Compute the contents of a report, print them on a terminal, and write them to a folder."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import importlib.util
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
+from lavender.base.errors import InputError
 from lavender.problem.derived import cached_property
 from lavender.report import tables
-from lavender.report.contents import Contents
-from lavender.report.recommendation import Statement, recommend
-from lavender.report.records import escape_unprintable, format_tolerance
-from lavender.report.table import Table
+from lavender.report.figures import build_figures
+from lavender.report.recommendation import recommend
+from lavender.report.records import Records, Skip
+from lavender.report.render import Section, Statement, format_markdown, print_table, render_page, write_files
+from lavender.report.runner import Event
+from lavender.report.text import (
+    escape_markdown,
+    escape_unprintable,
+    format_count,
+    format_residual,
+    format_tolerance,
+)
 
-MAX_ROWS = 500  # Largest number of rows of a table on a page and in the summary; files have all rows.
+if TYPE_CHECKING:
+    from rich.console import Console
 
+LONG_TABLES = ("cases", "failures", "runs", "skipped")  # Tables that are not written as LaTeX and Markdown.
+GROUPED_TABLES = ("runs", "sequences", "times")  # Tables that show equal first cells once on a terminal.
+MAX_LINES = 25  # Largest number of lines of a short report, including the lines that the command adds.
+# Number of lines that the command adds: a blank line, page, reused runs, cases that did not load.
+COMMAND_LINES = 5
+MAX_LEFT_OUT = 3  # Largest number of warnings about cases that did not load.
+MAX_NOTES = 20  # Largest number of notes of one kind in a complete report.
+LIMITATIONS = """\
+Times are wall-clock times, the minimum of the repetitions (the median is in records.csv). Differences below a few \
+tens of per cent are not significant without more repetitions. Ratios are computed within one run only.
+A time is the time of one call of lv.solve, including the judge and Python; below about 0.2 ms the share of Python is \
+as large as that of the solver. A simulation that reuses a factorisation between steps needs the set-up less often. \
+BLAS and OpenMP have one thread; threads that a backend starts in other ways are not limited.
+Means of times are those of the solved cases: compare them only between solvers that solve the same cases.
+Recommendations hold for these cases: by cases solved, then by time; solvers within noise of the best are in a fixed \
+order, auto first.
+The residual is zero exactly at a solution; the distance of an impulse from the solution also depends on the \
+conditioning. Structures are derived from the numbers."""
 
 #: Title, meaning of the numbers, and function of each table, in their order.
-SECTIONS: dict[str, tuple[str, str, Callable[[Contents], pd.DataFrame]]] = {
+SECTIONS: dict[str, tuple[str, str, Callable[[tables.Contents], pd.DataFrame]]] = {
     "structures": ("By structure", (
         "The solver that solves the largest number of cases to each tolerance, then the fastest, with the mean time of "
         "the cases that it solves. Solvers after ≈ tie with it within the noise of the repetitions."
@@ -54,23 +85,8 @@ SECTIONS: dict[str, tuple[str, str, Callable[[Contents], pd.DataFrame]]] = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Section:
-    """A table under its heading, with the meaning of its numbers; `file` is its name as a file and on the page."""
-
-    file: str
-    title: str
-    note: str
-    frame: pd.DataFrame
-
-    @property
-    def table(self) -> Table:
-        """The first `MAX_ROWS` rows, with numbers as texts."""
-        return Table.from_frame(self.frame.head(MAX_ROWS))
-
-
-class Report(Contents):
-    """Contents of a report (`Contents`) with its tables and sentences."""
+class Report(tables.Contents):
+    """Contents of a report (`Contents`) with its sentences and tables."""
 
     @cached_property
     def statements(self) -> tuple[Statement, ...]:
@@ -78,43 +94,49 @@ class Report(Contents):
         return recommend(self)
 
     @cached_property
-    def overview(self) -> Section:
+    def warnings(self) -> list[str]:
+        """Sentences on a busy machine, on missing times and on cases that are left out."""
+        texts = [self.busy_warning] if self.busy_warning else []
+        texts += ["Error and robustness without times: runs end by iterations."] if self.is_campaign else []
+        left_out = list_cases_not_loaded(self.records)
+        texts += [f"Left out of all numbers: {cases}: {reason}" for cases, reason in left_out[:MAX_LEFT_OUT]]
+        more = len(left_out) - MAX_LEFT_OUT
+        return [*texts, f"{more} more are left out: see the table Not run."] if more > 0 else texts
+
+    @cached_property
+    def overview(self) -> pd.DataFrame:
         """The table of the first screen: the fastest solver by structure, or each solver if there is one structure."""
         target, name = f"to {format_tolerance(self.tolerance)}", "times"
         if not len(self.frame):
-            return Section("overview", "", "", self.frame.iloc[:, :0])
+            return self.frame.iloc[:, :0]
         wanted = ["solver", "cases", f"solved {target}", f"time {target} [s]"]
         if self.has_passes_only:
             name, wanted = "sequences", ["target", "steps, cold", "time, cold [s]", "residual, cold [-]"]
         elif len(self.structures) > 1 and not self.is_campaign:
             name, wanted = "structures", ["structure", target, f"time {target} [s]"]
-        frame = self.sections[name].frame
-        frame = frame[[c for c in wanted if c in frame]].rename(columns={f"time {target} [s]": "time [s]"})
-        return Section("overview", "", "", frame)
+        frame = self.sections[name].frames[0]
+        return frame[[c for c in wanted if c in frame]].rename(columns={f"time {target} [s]": "time [s]"})
 
     @cached_property
     def sections(self) -> dict[str, Section]:
         """The tables by name, in their order; tables without rows are left out."""
-        if not len(self.newest):
-            return self._skipped
-        wanted = ("times", "budgets", "claims", "failures") if self.is_campaign else tuple(SECTIONS)
-        wanted = ("sequences", "budgets", "claims", "failures") if self.has_passes_only else wanted
-        made = [
-            Section(name, title, note, make(self))
-            for name, (title, note, make) in SECTIONS.items()
-            if name in wanted and len(self.frame)
-        ]
-        if self.earlier is not None:
-            made.append(self._compare_with_earlier_run())
-        note = "The zero impulse solves these cases. They are left out of all rankings."
-        made.append(Section("idle", "Solved by the zero impulse", note, tables.tabulate_idle(self)))
-        return {**{s.file: s for s in made if len(s.frame)}, **self._skipped}
-
-    @property
-    def _skipped(self) -> dict[str, Section]:
-        """The table of pairs that did not run, and of cases that did not load."""
-        section = Section("skipped", "Not run", "", tables.tabulate_skips(self.records.skips))
-        return {"skipped": section} if len(section.frame) else {}
+        made: list[Section] = []
+        if len(self.newest):
+            wanted = ("times", "budgets", "claims", "failures") if self.is_campaign else tuple(SECTIONS)
+            wanted = ("sequences", "budgets", "claims", "failures") if self.has_passes_only else wanted
+            for name, (title, note, make) in SECTIONS.items():
+                if name in wanted and len(self.frame):
+                    made.append(Section(title, [make(self)], note, name=name))
+            if self.earlier is not None:
+                made.append(self._compare_with_earlier_run())
+            note = "The zero impulse solves these cases. They are left out of all rankings."
+            made.append(
+                Section("Solved by the zero impulse", [tables.tabulate_idle(self)], note, name="idle")
+            )
+        diagnostics = pd.DataFrame(list_diagnostics(self.records), columns=["case", "possible mistake"])
+        made.append(Section("Diagnostics about the data", [diagnostics], name="diagnostics"))
+        made.append(Section("Not run", [tables.tabulate_skips(self.records.skips)], name="skipped"))
+        return {section.name: section for section in made if len(section.frames[0])}
 
     def _compare_with_earlier_run(self) -> Section:
         """Return the table of changes since the earlier run; its note has the number of compared times."""
@@ -127,4 +149,244 @@ class Report(Contents):
             changes = pd.DataFrame(
                 {"change": ["nothing beyond noise" if compared else "nothing was compared"]}
             )
-        return Section("changes", f"Against {escape_unprintable(self.earlier.source)}", note, changes)
+        return Section(f"Against {escape_unprintable(self.earlier.source)}", [changes], note, name="changes")
+
+    def describe_run(self) -> pd.DataFrame:
+        """Return the machine, versions and plan of the newest run."""
+        facts = []
+        for run in list(self.records.runs.values())[-1:]:
+            counts = format_count(self.frame["case"].nunique(), "case"), format_count(len(self.newest), "run")
+            versions = {"lavender": run.lavender, "Python": run.python, **run.versions}
+            load = "" if run.load is None else f"; load {run.load:.2g}"
+            facts += [
+                ("run", f"{run.run}, started {run.started}; {', '.join(counts)}"),
+                ("machine", f"{run.cpu}, {run.cores} cores; {run.platform}"),
+                ("threads", f"{run.threads} for BLAS and OpenMP while timing; runs are serial"),
+                ("versions", ", ".join(f"{name} {v}" for name, v in versions.items())),
+                ("build", "; ".join(f"{name} {v}" for name, v in run.build.items()) + load),
+                ("plan", "; ".join(f"{name} {v}" for name, v in run.plan.items())),
+            ]
+        return pd.DataFrame(facts, columns=["fact", "value"], dtype=object)
+
+
+def render_report(report: Report, figures: bool = True, folder: Path | None = None) -> str:
+    """Return the page of a report as HTML; with `folder`, each figure is also written there as an SVG file."""
+    drawn = build_figures(report) if figures else []
+    files = "The folder of this page has every run in records.csv, the tables in tables/ and the figures in figures/."
+    sections = [
+        Section("Figures", figures=drawn[1:], name="figures"),
+        *report.sections.values(),
+        Section("Machine, versions, options", [report.describe_run()], files, name="machine"),
+        Section("Limitations", note=LIMITATIONS, name="limits"),
+    ]
+    if len(report.frame) and not len(tables.select_failures(report)):
+        note = "Every run reached its target or the round-off floor, and every claim holds."
+        sections.insert(1, Section("No failures", note=note, name="failures"))
+    return render_page(
+        "lavender report", report.statements, sections[len(drawn) < 2 :], warnings=report.warnings,
+        first_figure=drawn[0] if drawn else None, folded=True, folder=folder,
+    )  # fmt: skip
+
+
+def write(
+    source: Records | Report,
+    folder: str | Path,
+    *,
+    figures: bool = True,
+    watch: Callable[[Event], None] = lambda event: None,
+) -> Path:
+    """Write `records.csv`, `tables/*.csv`, `tables/*.tex`, `figures/*.svg`, `summary.md` and `index.html`.
+
+    If pyarrow is installed, `records.parquet` is written, too.
+
+    Parameters
+    ----------
+    source : Records or Report
+        Records, or a report of them with earlier records and budgets. Times are compared within the newest run alone;
+        `records.csv` holds all runs.
+    folder : path
+    figures : bool
+        False leaves out the figures, which take the largest part of the time.
+    watch : callable (Event), optional
+        Called before each file.
+
+    Returns
+    -------
+    Path
+        Path of index.html.
+
+    Raises
+    ------
+    InputError
+        `source` is neither records nor a report, or the folder cannot be written.
+    """
+    report = Report(source) if isinstance(source, Records) else source
+    if not isinstance(report, Report):
+        raise InputError(
+            f"source is a {type(source).__name__}; Records (the result of lavender.report.run) or a Report is needed"
+        )
+    folder, frame = Path(folder), report.records.frame
+    files: dict[str, Any] = {"records.csv": frame}
+    if importlib.util.find_spec("pyarrow") is not None:
+        files["records.parquet"] = frame
+    for name, section in report.sections.items():
+        files[f"tables/{name}.csv"] = section.frames[0]
+        if name not in LONG_TABLES:
+            files[f"tables/{name}.tex"] = section.frames[0]
+    files["summary.md"] = lambda: summarise(report)
+    files["index.html"] = lambda: render_report(report, figures, folder / "figures")
+    names = list(files)
+    write_files(
+        folder, files, lambda name: watch(Event(names.index(name), len(names), name, "", phase="writing"))
+    )
+    return folder / "index.html"
+
+
+def summarise(report: Report) -> str:
+    """Return recommendations and tables in Markdown, to paste into a pull request."""
+    lines = ["## lavender report", ""]
+    for run in list(report.records.runs.values())[-1:]:
+        machine = f"{run.cpu}, {run.threads} thread; lavender {run.lavender}, Python {run.python}"
+        lines += [escape_markdown(f"{machine}; run {run.run}, {run.started}"), ""]
+    for statement in report.statements:
+        lines += [escape_markdown(statement.text), ""]
+        lines += ["```python", *statement.code, "```", ""] if statement.code else []
+    for text in report.warnings:
+        lines += [f"**{escape_markdown(text)}**", ""]
+    for name, section in report.sections.items():
+        if name not in LONG_TABLES:
+            lines += [f"**{escape_markdown(section.title)}** {escape_markdown(section.note)}".rstrip(), ""]
+            lines += [*format_markdown(section.frames[0]), ""]
+    return "\n".join(lines)
+
+
+# -- on a terminal -----------------------------------------------------------------------------------------
+
+
+def print_report(report: Report, console: Console, complete: bool = False) -> None:
+    """Print the recommendation, a table to the middle tolerance, and notes.
+
+    A short report has up to `MAX_LINES` lines, none wider than the terminal. `complete` prints every sentence, table
+    and warning.
+    """
+    from rich.text import Text
+
+    lines: list[Text] = []
+    for i, statement in enumerate(report.statements):
+        lines.append(Text(statement.text, style="" if i else "bold"))
+        is_cut = len(statement.code) > 1 and not complete
+        code = [statement.call_line, "# all lines: --tables"] if is_cut else statement.code
+        lines += [Text(f"    {line}") for line in code]
+    if report.busy_warning:
+        lines.append(Text(report.busy_warning, style="yellow"))
+    for text in lines:
+        console.print(text, highlight=False)
+    notes = [Text(text, style=style) for text, style in _list_notes(report, MAX_NOTES if complete else 1)]
+    if complete:
+        for name, section in report.sections.items():
+            note = f": {section.note}" if section.note else ""
+            console.print(Text.assemble("\n", (section.title, "bold"), note))
+            print_table(console, section.frames[0], grouped=name in GROUPED_TABLES)
+    elif n := len(report.overview):
+        height = (
+            MAX_LINES
+            - COMMAND_LINES
+            - len(notes)
+            - sum(len(text.wrap(console, console.width)) for text in lines)
+        )
+        shown = n if n <= height - 2 else max(1, height - 3)
+        console.print()
+        print_table(console, report.overview.head(shown), cut=True)
+        if shown < n:
+            console.print(f"{n - shown} more: --tables", highlight=False, style="dim")
+    for text in notes:
+        console.print(
+            text, highlight=False, no_wrap=not complete, overflow="fold" if complete else "ellipsis"
+        )
+
+
+def _list_notes(report: Report, longest: int) -> Iterator[tuple[str, str]]:
+    """Yield (note, style): at most `longest` notes of each kind; if there are more, a note has their number."""
+    records = report.records
+    failures = tables.select_failures(report) if len(report.frame) else report.frame
+    false = failures[failures["status_conflict"].astype(str) != ""]
+    kinds = {
+        "false claim": (
+            "red",
+            [
+                f"{c}, {s}: {x}"
+                for c, s, x in zip(false["case"], false["solver"], false["status_conflict"], strict=True)
+            ],
+        ),
+        "suspicious": ("yellow", [f"{case}: {reason}" for case, reason in list_diagnostics(records)]),
+        "left out": ("yellow", [f"{cases}: {reason}" for cases, reason in list_cases_not_loaded(records)]),
+    }
+    for kind, (style, texts) in kinds.items():
+        for i, text in enumerate(texts[:longest], 1):
+            place = f" ({i} of {len(texts)})" if longest > 1 else f", the first of {len(texts)}"
+            yield f"{kind}{place if len(texts) > 1 else ''}: {text}", style
+    skipped = [s.reason.partition(":")[0] for s in records.skips if s.solver]
+    replacements = Counter(pair for pair in skipped if " → " in pair)
+    for pair, n in replacements.items():
+        cases = format_count(n, "case")
+        yield f"{pair} on {cases} with bounds: the same method; the first accepts only free rows", ""
+    refused = len(skipped) - replacements.total()
+    if refused:
+        pairs = format_count(refused, "pair")
+        yield f"{pairs} of case and solver not run, or not to the end: the page has the reasons", "dim"
+    if "changes" in report.sections:
+        section = report.sections["changes"]
+        counts = sorted(Counter(section.frames[0]["change"].astype(str)).items())
+        text = ", ".join(f"{n} {kind}" if "target" in section.frames[0] else kind for kind, n in counts)
+        yield f"{section.title}: {text} ({section.note})", ""
+    if "idle" in report.sections:
+        frame = report.sections["idle"].frames[0]
+        case, _, solver, velocity, _ = frame.iloc[-1]
+        cases, speed = format_count(len(frame), "case"), format_residual(velocity)
+        yield f"{cases} solved by the zero impulse; largest error {speed} m/s, by {solver} on {case}", "dim"
+
+
+def list_diagnostics(records: Records) -> list[tuple[str, str]]:
+    """Return (case, possible mistake in its data) for all cases.
+
+    Equal diagnostics of a sequence are one entry, with its first step and the number of further steps.
+    """
+    seen: dict[tuple[str, str], list[tuple[str, str]]] = {}
+    for name, info in records.cases.items():
+        for diagnostic in info.diagnostics:
+            kind = diagnostic.partition(":")[0]
+            seen.setdefault((info.sequence or name, kind), []).append((name, diagnostic))
+    found = []
+    for (name, diagnostic), *more in seen.values():
+        found.append((f"{name} and {format_count(len(more), 'more step')}" if more else name, diagnostic))
+    return found
+
+
+def _group_by_reason(skips: Iterable[Skip]) -> dict[str, list[Skip]]:
+    """Group skips by their reason without the name of the case."""
+    same: dict[str, list[Skip]] = {}
+    for skip in skips:
+        reason = skip.reason.removeprefix("did not load: ").removeprefix(f"{skip.case}: ")
+        same.setdefault(reason, []).append(skip)
+    return same
+
+
+def list_skip_reasons(skips: Iterable[Skip]) -> list[str]:
+    """Return each different reason of some skips; if it holds for several cases, with their number."""
+    same = _group_by_reason(skips)
+    cases = {reason: len({skip.case for skip in some}) for reason, some in same.items()}
+    return [same[r][0].reason if n == 1 else f"{r} ({n} cases)" for r, n in cases.items()]
+
+
+def list_cases_not_loaded(records: Records) -> list[tuple[str, str]]:
+    """Return (cases that did not load, reason), grouped by reason, and the number of steps of each sequence."""
+    cases = [
+        (f"{some[0].case} and {format_count(len(some) - 1, 'more case')}", reason)
+        if len(some) > 1
+        else (some[0].case, some[0].reason)
+        for reason, some in _group_by_reason(records.left_out.get("", ())).items()
+    ]
+    for name, some in records.left_out.items():
+        if name:
+            cases.append((f"{format_count(len(some), 'step')} of {name}", some[0].reason))
+    return cases

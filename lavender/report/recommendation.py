@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,36 +10,21 @@ import pandas as pd
 
 from lavender.base.deadline import format_seconds
 from lavender.io.stored import SUFFIXES
-from lavender.report.contents import Contents
-from lavender.report.engine import INSIDE
-from lavender.report.ranking import STRUCTURE_ORDER, rank_solvers, select_ranked_runs
-from lavender.report.records import format_tolerance
-from lavender.report.text import format_count, format_left_out_count, format_residual
+from lavender.report.render import Statement
+from lavender.report.tables import (
+    INSIDE,
+    STRUCTURE_ORDER,
+    Contents,
+    is_plug_in,
+    rank_solvers,
+    select_ranked_runs,
+)
+from lavender.report.text import format_count, format_residual, format_tolerance
 from lavender.report.timing import format_call
-from lavender.solvers import registry
 from lavender.suite import FAMILIES
 
 MAX_NAMED = 2  # A sentence names up to this many ties, misses or plug-ins.
 PLURALS = {"mesh": "meshes"}
-
-
-@dataclass(frozen=True)
-class Statement:
-    """A sentence, and the lines of Python that it describes, as they were timed."""
-
-    text: str
-    code: tuple[str, ...] = ()
-
-    @property
-    def call_line(self) -> str:
-        """The line of `code` with the call, without the lines of a loop around it; empty if there is no code."""
-        return next((line.strip() for line in self.code if "lv.solve" in line), "")
-
-
-def is_plug_in(solver: str) -> bool:
-    """Return whether a solver is not part of lavender: a plug-in of the user, installed here or not."""
-    spec = registry.specs().get(solver)
-    return spec is None or not spec.builtin
 
 
 def recommend(report: Contents) -> tuple[Statement, ...]:
@@ -162,8 +146,8 @@ def _describe_cases(report: Contents, names: Sequence[str]) -> str:
     if sequences:
         of = sequences[0] if len(sequences) == 1 else f"your {format_count(len(sequences), 'sequence')}"
         n_lost = sum(len(lost.get(name, ())) for name in sequences)
-        return f"the {format_count(len(names), 'step')} of {of}{format_left_out_count(n_lost)}"
-    left_out = format_left_out_count(len(lost.get("", ())))
+        return f"the {format_count(len(names), 'step')} of {of}{_format_left_out_count(n_lost)}"
+    left_out = _format_left_out_count(len(lost.get("", ())))
     many, n = len(names) > 1, len(names)
     if report.is_stopped:
         return f"the {format_count(n, 'problem')} measured so far{left_out}"
@@ -189,3 +173,8 @@ def _add_engine(text: str, engine: Any, first: Any) -> str:
     if first is None or (-engine["solved"], engine["mean"]) < (-first["solved"], first["mean"]):
         return f"First is the engine's own {engine['solver']}: it {solves}. {text}"
     return f"{text} The engine's own {engine['solver']} {solves}."
+
+
+def _format_left_out_count(lost: int) -> str:
+    """Return a remark in parentheses that `lost` cases are left out of a number; empty if none is left out."""
+    return f" ({lost} left out)" if lost else ""

@@ -2,76 +2,28 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
-import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from functools import cache
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from lavender.base.arrays import format_html_table
 from lavender.base.errors import InputError, require_packages
 from lavender.judge.solution import CLAIM_CHECKS, CONFIRMED
+from lavender.report.text import escape_unprintable, format_tolerance
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
 # Statuses of a run that returned no solution, in addition to the statuses of a solve.
 ERROR, KILLED, CRASHED = "ERROR", "KILLED", "CRASHED"
-MAX_FILE_NAME_LENGTH = 120  # [characters] File systems accept 255 bytes, including a suffix.
-
-
-def format_tolerance(tolerance: float) -> str:
-    """Format a tolerance without leading zeros in its exponent: 1e-3, not 1e-03; 0 as 0."""
-    if tolerance == 0.0:
-        return "0"
-    mantissa, _, exponent = f"{tolerance:.3e}".partition("e")
-    mantissa = mantissa.rstrip("0").rstrip(".")
-    return f"{mantissa}e{int(exponent)}"
 
 
 def describe_target(mode: str, tol: float, max_iter: int) -> str:
     """Describe the target of a run: "to 1e-6", or "16 iterations"."""
     return f"{max_iter} iterations" if mode == "budget" else f"to {format_tolerance(tol)}"
-
-
-def make_file_name(name: str) -> str:
-    """Convert a name to one that every file system and URL fragment accepts; a hash keeps long names distinct."""
-    short = re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("_.") or "figure"
-    if len(short) <= MAX_FILE_NAME_LENGTH:
-        return short
-    digest = hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:12]
-    return f"{short[: MAX_FILE_NAME_LENGTH - 13]}-{digest}"
-
-
-#: Characters that no text of a report contains: controls, lone surrogates, line ends, marks of writing direction.
-_UNPRINTABLE = re.compile(
-    "[\x00-\x1f\x7f-\x9f\u2028\u2029\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
-)
-_ESCAPE_SEQUENCES = {"\n": "\\n", "\t": "\\t", "\r": "\\r"}
-
-
-def escape_unprintable(text: str, lines: bool = False) -> str:
-    """Replace characters that a terminal, file or page cannot show by their codes.
-
-    A byte of a file name that is not UTF-8 (a lone surrogate in Python's string) is written as this byte. With
-    `lines`, line ends and tabs are kept, as in messages; without, the result is one line.
-    """
-    if text.isprintable():
-        return text
-
-    def escape(match: re.Match[str]) -> str:
-        if lines and match[0] in "\n\t":
-            return match[0]
-        code = ord(match[0])
-        if 0xDC80 <= code <= 0xDCFF:
-            code -= 0xDC00
-        return _ESCAPE_SEQUENCES.get(match[0]) or (f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}")
-
-    return _UNPRINTABLE.sub(escape, text)
 
 
 def _make_printable(value: Any, lines: bool = False) -> Any:
@@ -515,15 +467,6 @@ class Records:
             if getattr(entry, "solver", "") in ("", *wanted):
                 selection.add(entry)
         return selection
-
-    def __repr__(self) -> str:
-        return f"<Records: {len(self)} runs of {len(self.cases)} cases, {self.source or 'in memory'}>"
-
-    def _repr_html_(self) -> str:
-        """Return a table of the numbers of runs and cases, for notebooks."""
-        solvers = sorted(set(self._columns["solver"]))
-        facts = {"runs": len(self), "cases": len(self.cases), "solvers": ", ".join(solvers)}
-        return format_html_table(facts, self.source or "Records")
 
 
 #: Columns of texts that occur many times.

@@ -24,12 +24,18 @@ from lavender.base.errors import InputError, LavenderError, require_packages
 from lavender.problem import Problem, check_problem
 from lavender.report import machine
 from lavender.report.cases import Item, Source, describe_case, hash_problem, resolve_item, resolve_sources
-from lavender.report.plan import CampaignPlan, Plan, list_passes
 from lavender.report.records import CaseInfo, Entry, Record, Records, Run, Skip, describe_target
 from lavender.report.store import Store, open_store
-from lavender.report.timing import LONG_TIME, Task, limit_to_one_thread, measure_task
-from lavender.report.worker import Worker
-from lavender.report.workers import check_workers, connect_backend, map_unordered
+from lavender.report.timing import (
+    LONG_TIME,
+    CampaignPlan,
+    Plan,
+    Task,
+    limit_to_one_thread,
+    list_passes,
+    measure_task,
+)
+from lavender.report.workers import Worker, check_workers, connect_backend, map_unordered
 from lavender.solvers import registry
 from lavender.solvers.registry import SolverSpec
 

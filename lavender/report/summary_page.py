@@ -1,20 +1,16 @@
-"""Write a page of tables and figures under one sentence, its short form on a terminal, and its numbers as JSON."""
+"""Keep pages of tables of texts for `lavender.audit` until it uses `lavender.report.render`."""
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lavender.io.stored import make_folder, write_text
-from lavender.report.figures import Figure, list_solvers
-from lavender.report.page import create_environment
-from lavender.report.plotting import draw_figures, number_styles
+from lavender.report.figures import Figure
+from lavender.report.render import Section, Statement, print_page, render_page, write_files
 from lavender.report.table import Table
-from lavender.report.terminal import print_table
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -22,15 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PageSection:
-    """A heading with its tables, figures and lines to copy.
-
-    Parameters
-    ----------
-    title, tables, figures, note : heading, tables, figures, note
-    code : lines to copy
-    short : number of rows of the first table that a terminal shows
-    terminal_table : table that a terminal shows instead of the first rows of the first table
-    """
+    """A heading with its tables, figures and lines to copy; see `lavender.report.render.Section`."""
 
     title: str
     tables: Sequence[Table] = ()
@@ -40,25 +28,10 @@ class PageSection:
     short: int = 0
     terminal_table: Table | None = None
 
-    @property
-    def is_shown(self) -> bool:
-        """Whether the section has contents: a table with rows, a figure with curves, or lines to copy."""
-        has_contents = any(t.rows for t in self.tables) or any(f.curves for f in self.figures)
-        return has_contents or bool(self.code) or not (self.tables or self.figures)
-
 
 @dataclass(frozen=True)
 class SummaryPage:
-    """A title, the sentence that summarises the page, sections, and numbers for programs.
-
-    Parameters
-    ----------
-    title, head : title, summarising sentence
-    sections : sections
-    numbers : content of numbers.json
-    stopped : whether the measurement ended early, so that all numbers describe only its completed part
-    warning : a sentence on the measurement, such as a busy machine
-    """
+    """A title, the sentence that summarises the page, sections, and numbers for programs."""
 
     title: str
     head: str
@@ -67,37 +40,30 @@ class SummaryPage:
     stopped: bool = False
     warning: str = ""
 
+    @property
+    def _sections(self) -> list[Section]:
+        """The sections with DataFrames."""
+        return [
+            Section(
+                title=s.title, frames=[t.frame for t in s.tables], note=s.note, figures=s.figures, code=s.code,
+                short=s.short, short_frame=None if s.terminal_table is None else s.terminal_table.frame,
+            )
+            for s in self.sections
+        ]  # fmt: skip
+
     def render_html(self, folder: Path | None = None) -> str:
-        """Return one file without external parts; every text is escaped. With `folder`, also write figures there."""
-        figures = [f for part in self.sections for f in part.figures if f.curves]
-        styles = number_styles(list_solvers(figures))
-        sections = [
-            (part, draw_figures([f for f in part.figures if f.curves], styles, folder))
-            for part in self.sections
-            if part.is_shown
-        ]
-        template = create_environment().get_template("summary_page.html.j2")
-        return str(template.render(title=self.title, page=self, sections=sections))
+        """Return the page as HTML."""
+        stopped = "Stopped before the end: the numbers contain only the completed part." * self.stopped
+        warnings = [text for text in (self.warning, stopped) if text]
+        return render_page(
+            self.title, [Statement(self.head)], self._sections, warnings=warnings, folder=folder
+        )
 
     def write(self, folder: str | os.PathLike[str]) -> Path:
         """Write `index.html`, `numbers.json` and `figures/*.svg`; return the path of the page."""
-        folder = make_folder(folder)
-        write_text(folder / "index.html", self.render_html(folder / "figures"))
-        write_text(folder / "numbers.json", json.dumps(self.numbers, indent=1) + "\n")
-        return folder / "index.html"
+        page = self.render_html(Path(folder) / "figures")
+        return write_files(Path(folder), {"index.html": page, "numbers.json": self.numbers}) / "index.html"
 
     def print_short(self, console: Console) -> None:
         """Print the sentence, lines to copy, and the first rows of each section's first table."""
-        console.print(self.head, style="bold", highlight=False, markup=False)
-        if self.warning:
-            console.print(self.warning, style="yellow", highlight=False, markup=False)
-        for part in self.sections:
-            for line in part.code:
-                console.print(f"    {line}", highlight=False, markup=False, soft_wrap=True)
-            if part.code and part.note:
-                console.print(part.note, highlight=False, markup=False)
-            tables = [t.with_rows(part.short) for t in part.tables[:1]]
-            for table in tables if part.terminal_table is None else [part.terminal_table]:
-                if table.rows:
-                    console.print()
-                    print_table(console, table, cut=True)
+        print_page(console, [Statement(self.head)], self._sections, [self.warning] if self.warning else [])

@@ -1,19 +1,15 @@
-"""Define tables of texts, which the terminal, pages and Markdown show.
-
-All times of a table have one unit, and all sizes of a table have one format.
-"""
+"""Keep tables of texts for `lavender.audit` until it uses DataFrames and `lavender.report.render`."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
-from lavender.report.text import NONE, format_sizes, format_times_in_one_unit
+from lavender.report.text import format_sizes, format_times_in_one_unit
 
-#: Heads of the columns that contain words; all other columns contain numbers.
-WORDS = frozenset({"case", "solver", "status", "structure", "target", "message", "worst row", "reason"})
+if TYPE_CHECKING:
+    from rich.console import Console
 
 
 @dataclass(frozen=True)
@@ -30,7 +26,7 @@ class Cell:
 
     @classmethod
     def size(cls, value: float) -> Cell:
-        """Create the cell of a number of any magnitude; the table chooses its format."""
+        """Create the cell of a number of any magnitude."""
         return cls(value, "size")
 
 
@@ -40,7 +36,7 @@ class Table:
 
     heads: Sequence[str]
     rows: Sequence[Sequence[str | Cell]]
-    words: frozenset[str] = field(default=WORDS, repr=False)  # Heads of the columns that contain words.
+    words: frozenset[str] = field(default=frozenset(), repr=False)
 
     def __post_init__(self) -> None:
         """Write all times in one unit, which the heads name, and all sizes in one format."""
@@ -57,51 +53,27 @@ class Table:
         object.__setattr__(self, "heads", heads)
         object.__setattr__(self, "rows", rows)
 
-    @classmethod
-    def from_frame(cls, frame: Any) -> Table:
-        """Create a table from a DataFrame: columns of floats with the unit [s] are times, with another unit sizes."""
-        heads: list[str] = []
-        columns: list[list[str | Cell]] = []
-        words: set[str] = set()
-        for head, values in frame.items():
-            name, kind = str(head), values.dtype.kind
-            is_time = kind == "f" and name.endswith(" [s]")
-            heads.append(name.removesuffix(" [s]") if is_time else name)
-            words |= set() if kind in "iuf" else {heads[-1]}
-            if is_time:
-                columns.append([Cell.time(float(x)) for x in values])
-            elif kind == "f" and name.endswith(("[-]", "[m/s]", "[√J]")):
-                columns.append([Cell.size(float(x)) for x in values])
-            else:
-                columns.append([NONE if x != x else f"{x:g}" if kind == "f" else str(x) for x in values])
-        return cls(heads, [list(row) for row in zip(*columns, strict=True)], words=frozenset(words))
-
     def without_columns(self, *heads: str) -> Table:
         """Return the table without some of its columns."""
         columns = [i for i, head in enumerate(self.heads) if head not in heads]
         rows = [[row[i] for i in columns] for row in self.rows]
-        return Table([self.heads[i] for i in columns], rows, self.words)
-
-    def with_rows(self, n: int) -> Table:
-        """Return the table with its first n rows."""
-        return replace(self, rows=self.rows[:n])
-
-    def is_numeric_column(self, head: str) -> bool:
-        """Return whether a column has numbers, which are aligned to the right."""
-        return head not in self.words
+        return Table([self.heads[i] for i in columns], rows)
 
     @property
     def cell_texts(self) -> list[list[str]]:
         """The text of each cell, as every format shows it."""
         return [[str(cell) for cell in row] for row in self.rows]
 
-    def format_markdown(self) -> list[str]:
-        """Return the lines of the table in Markdown."""
-        lines = ["| " + " | ".join(self.heads) + " |", "|---" * len(self.heads) + "|"]
-        return lines + ["| " + " | ".join(map(escape_markdown, row)) + " |" for row in self.cell_texts]
+    @property
+    def frame(self) -> Any:
+        """The texts as a DataFrame."""
+        import pandas as pd
+
+        return pd.DataFrame(self.cell_texts, columns=list(self.heads), dtype=object)
 
 
-def escape_markdown(text: str) -> str:
-    """Return a text on one line, with Markdown and HTML in it escaped."""
-    text = " ".join(text.split()).replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
-    return re.sub(r"([\\`*\[\]|])", r"\\\1", text)
+def print_table(console: Console, table: Table, optional: Sequence[str] = ()) -> None:
+    """Print the texts of a table."""
+    from lavender.report import render
+
+    render.print_table(console, table.frame, optional=optional)

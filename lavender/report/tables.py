@@ -1,4 +1,4 @@
-"""Make the tables of a report: group-bys of its frame of runs, with units in the names of columns.
+"""Rank the runs of a report and make its tables: group-bys of its frame of runs, with units in the names of columns.
 
 The time of a solver to a tolerance on a case is the shortest time of its runs to this or a tighter tolerance with a
 judged residual of at most the tolerance. Runs with a fixed budget do not count, since a reader cannot choose the budget
@@ -7,32 +7,150 @@ in advance. Single cases count from a cold start, steps of a sequence with carri
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import pandas as pd
 
 from lavender.base.deadline import format_seconds
-from lavender.judge.residuals import at_floor
+from lavender.io.stored import ENGINE, SUFFIXES, read_whole_file
+from lavender.judge.residuals import AT_FLOOR, UNCONVERGED, WRONG, at_floor
 from lavender.judge.solution import CONFIRMED, CONTRADICTED, NOT_PROVEN
-from lavender.report.ranking import MAX_NOISE, PREFERRED_SOLVER, get_times, rank_solvers, select_starts
-from lavender.report.records import Skip, describe_target, format_tolerance
-from lavender.report.text import format_count, format_residual
-
-if TYPE_CHECKING:
-    from lavender.report.contents import Contents
+from lavender.problem.derived import cached_property
+from lavender.report import machine
+from lavender.report.records import Records, Skip, describe_target
+from lavender.report.text import escape_unprintable, format_count, format_residual, format_tolerance
+from lavender.solvers import registry
 
 Frame: TypeAlias = pd.DataFrame
+INSIDE = "inside the engine, warm-started, without copy and judge"
 SERVED_RESIDUAL = 0.5  # A case is served if at most this fraction of the start's residual remains.
 # A solver is recommended for a time or budget if it serves at least this share of the cases.
 SERVED_QUANTILE = 0.9
+# Columns with equal values in all runs of a pass over a sequence.
+PASS_COLUMNS = ["solver", "mode", "tol", "max_iter", "start"]
 RESIDUAL_NOISE_FACTOR = 2.0  # Residuals within this factor count as equal.
 DEATHS = ("ERROR", "KILLED", "CRASHED")
 # An exponent is fitted to at least so many cases and ratio of rows.
 MIN_FIT_CASES, MIN_FIT_SIZE_RATIO = 4, 4.0
+# [s] Added to times in geometric means. In shorter calls, the overhead of Python dominates.
+MEAN_TIME_SHIFT = 1e-5
+# Times within noise count as equal. Noise is twice the difference of median and minimum of the repetitions, relative to
+# the minimum, and within these bounds.
+MIN_NOISE, MAX_NOISE = 0.05, 0.25
+PREFERRED_SOLVER = "auto"  # Listed first among equally good solvers, as its users need not choose a method.
+STRUCTURE_ORDER = (
+    *("separate", "chain", "mesh", "stack", "pile", "dense"),
+    *("redundant", "friction", "large mass ratio", "asymmetric"),
+)
+
+
+# -- ranking -----------------------------------------------------------------------------------------------
+
+
+def select_ranked_runs(frame: Frame) -> Frame:
+    """Return the runs that rankings count: to a tolerance, if there are any, in the order "given"."""
+    mode = "tol" if (frame["mode"] == "tol").any() else "budget"
+    return select_starts(frame[frame["mode"] == mode])
+
+
+def select_starts(frame: Frame) -> Frame:
+    """Return the runs from the start that counts: cold, or carried over the steps of a sequence."""
+    runs = frame[frame["order"] == "given"]
+    single = runs["step"] < 0
+    carries = runs["solver"].isin(runs.loc[runs["start"] == "carried", "solver"].unique())
+    start = runs["start"].astype(str)
+    return runs[np.where(single | ~carries, start == "cold", start == "carried")]
+
+
+def group_cases_by_structure(frame: Frame) -> dict[str, list[str]]:
+    """Group single cases by structure, and steps by their sequence. A case is in the group of each of its words.
+
+    If the cases of a word have several laws, each law is a group: "pile, coulomb". Words of the same cases form one
+    group: "stack / friction".
+    """
+    cases = frame.drop_duplicates("case")[["case", "structure", "law", "sequence"]].astype(str)
+    single = cases[cases["sequence"] == ""]
+    words = single.assign(word=single["structure"].str.split(", ")).explode("word")
+    names: dict[tuple[str, ...], list[str]] = {}
+    order = {word: i for i, word in enumerate(STRUCTURE_ORDER)}
+    for word, some in sorted(words.groupby("word"), key=lambda x: (order.get(x[0], len(order)), x[0])):
+        laws = some["law"].value_counts().index
+        for law in laws:
+            members = tuple(some.loc[some["law"] == law, "case"])
+            names.setdefault(members, []).append(word if len(laws) == 1 else f"{word}, {law}")
+    groups = {" / ".join(words): list(members) for members, words in names.items()}
+    steps = cases[cases["sequence"] != ""].groupby("sequence")["case"].agg(list)
+    return {**groups, **{f"sequence {name}": members for name, members in steps.items()}}
+
+
+def compute_mean(times: Any, axis: int = 0) -> Any:
+    """Compute the geometric mean of times [s], shifted by `MEAN_TIME_SHIFT`; of a frame or series without nan."""
+    return np.exp(np.log(np.add(times, MEAN_TIME_SHIFT)).mean(axis=axis)) - MEAN_TIME_SHIFT
+
+
+def get_times(frame: Frame, tolerance: float) -> Frame:
+    """Return the time [s] of each solver (row) on each case (column) to a tolerance: nan if it did not reach it."""
+    return _get_times_of_runs(select_ranked_runs(frame), tolerance)
+
+
+def _get_times_of_runs(runs: Frame, tolerance: float) -> Frame:
+    """Compute `get_times` from ranked runs."""
+    reached = runs[(runs["tol"] <= tolerance) & (runs["relative"] <= tolerance)].assign(
+        time=lambda x: x["time"].fillna(0.0)
+    )
+    times = reached.groupby(["solver", "case"], observed=True)["time"].min().unstack()
+    return times.reindex(index=sorted(map(str, runs["solver"].unique())), columns=list(runs["case"].unique()))
+
+
+def rank_solvers(frame: Frame, tolerance: float) -> Frame:
+    """Rank solvers by the number of cases that they bring to a tolerance, then by their mean time.
+
+    Solvers with a contradicted claim come last. The first rows are within noise of the best (`tie`), `auto` first.
+
+    Returns
+    -------
+    DataFrame
+        By solver: `solved`, `cases`, `mean` [s] and `worst` [s] of the solved cases, `hardest` (case), `tie`.
+    """
+    runs = select_ranked_runs(frame)
+    times = _get_times_of_runs(runs, tolerance)
+    ratio = (runs["time_median"] / runs["time"] - 1.0).groupby(runs["solver"], observed=True).median()
+    false = frame.loc[frame["claim_check"] == CONTRADICTED, "solver"].unique()
+    ranking = pd.DataFrame({
+        "solved": times.notna().sum(axis=1), "cases": times.shape[1], "worst": times.max(axis=1),
+        "mean": compute_mean(times, axis=1),
+        "hardest": times.fillna(-1.0).idxmax(axis=1) if len(times.columns) else "",
+        "false": times.index.isin(false), "noise": (2.0 * ratio).reindex(times.index).clip(MIN_NOISE, MAX_NOISE),
+    }, index=times.index)  # fmt: skip
+    ranking = ranking.sort_values(["false", "solved", "mean"], ascending=[True, False, True], kind="stable")
+    first = ranking.iloc[:1]
+    equal = [ranking[name] == value for name in ("false", "solved") for value in first[name]]
+    noise = ranking["noise"].fillna(MIN_NOISE)
+    near = ranking["mean"] <= first["mean"].max() * (1.0 + np.maximum(noise, noise.iloc[:1].max()))
+    tie = np.logical_and.reduce([*equal, near, ranking["solved"] > 0]) if len(ranking) else []
+    preferred = ranking.index == PREFERRED_SOLVER
+    ranking = ranking.assign(tie=tie, later=~(preferred & tie))
+    return ranking.sort_values(["tie", "later"], ascending=[False, True], kind="stable").drop(columns="later")
+
+
+def is_plug_in(solver: str) -> bool:
+    """Return whether a solver is not part of lavender: a plug-in of the user, installed here or not."""
+    spec = registry.specs().get(solver)
+    return spec is None or not spec.builtin
+
+
+def choose_time_budgets(times: Frame) -> tuple[float, ...]:
+    """Return three decades of time [s] about the median over the cases of the fastest time."""
+    fastest = times.min().dropna()
+    fastest = fastest[fastest > 0.0]
+    middle = math.ceil(math.log10(fastest.median())) if len(fastest) else -3
+    return tuple(10.0**k for k in (middle - 1, middle, middle + 1))
 
 
 def count_solved(solved: int, cases: int) -> str:
@@ -43,6 +161,216 @@ def count_solved(solved: int, cases: int) -> str:
 def compute_quantiles(groups: Any, q: float | list[float]) -> Any:
     """Compute quantiles of groups of residuals, interpolated linearly; inf if they lie between infinite residuals."""
     return groups.quantile(q).fillna(math.inf)
+
+
+# -- answers of engines ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class EngineAnswers:
+    """Answers of an engine to one folder of recorded steps.
+
+    Parameters
+    ----------
+    folder : str
+        Path of the folder, as in the records.
+    left_out : int
+        Number of steps that could not be recorded.
+    lines : DataFrame
+        One row for each answer: file, rows, seconds [s], relative, velocity [m/s] and worst (nan and "" if they were
+        not recorded), verdict and solver.
+    """
+
+    folder: str
+    left_out: int
+    lines: pd.DataFrame
+
+    @property
+    def solver(self) -> str:
+        """Name of the engine's solver, the most frequent one."""
+        return str(self.lines["solver"].mode()[0]).replace("NEWTON", "Newton")
+
+    @property
+    def above_floor(self) -> int:
+        """Number of answers above the round-off floor."""
+        return int((self.lines["verdict"] != AT_FLOOR).sum())
+
+    @property
+    def unconverged(self) -> int:
+        """Number of answers with an error above the recording's threshold that rounding does not explain."""
+        return int(self.lines["verdict"].isin([UNCONVERGED, WRONG]).sum())
+
+    def contains(self, source: str) -> bool:
+        """Return whether the source of a case is a file of the engine's folder."""
+        return str(Path(source).parent) == self.folder
+
+    def rank(self, records: Records, cases: Sequence[str], tolerance: float) -> dict[str, Any] | None:
+        """Return the engine's result on cases as solvers are ranked; None if it did not answer every case."""
+        sources = [records.cases[name].source for name in cases]
+        timed = (
+            self.lines[self.lines["seconds"] >= 0.0].drop_duplicates("file", keep="last").set_index("file")
+        )
+        answers = timed.reindex([Path(s).name for s in sources if self.contains(s)])
+        if not cases or answers["seconds"].isna().any() or len(answers) < len(cases):
+            return None
+        is_solved = answers["relative"] <= tolerance
+        mean = float(compute_mean(answers["seconds"][is_solved]))
+        return {"solver": self.solver, "solved": int(is_solved.sum()), "cases": len(cases), "mean": mean}
+
+
+def read_engine_answers(sources: Sequence[str], records: Records) -> list[EngineAnswers]:
+    """Read the engine's answers in the folders among `sources`, and in the folders of the records' files.
+
+    Lines that cannot be read are left out.
+    """
+    parents = (Path(x.source).parent for x in records.cases.values() if x.source.endswith(SUFFIXES))
+    engines = (_read_folder(folder) for folder in dict.fromkeys([*map(Path, sources), *parents]))
+    return [engine for engine in engines if engine is not None]
+
+
+def _read_folder(folder: Path) -> EngineAnswers | None:
+    """Read the answers in one folder; return None if it has none."""
+    path = folder / ENGINE
+    if not path.is_file():
+        return None
+    entries, left_out = [], 0
+    for line in read_whole_file(path, "the engine's answers").decode(errors="replace").splitlines():
+        try:
+            entry = json.loads(line)
+            left_out += "left_out" in entry
+            numbers = {name: float(entry[name]) for name in ("rows", "seconds", "relative")}
+            texts = {name: str(entry[name]) for name in ("verdict", "solver")}
+            texts |= {name: str(entry.get(name, "")) for name in ("file", "worst")}
+            numbers["velocity"] = float(entry.get("velocity", math.nan))
+            entries.append(numbers | {name: escape_unprintable(text) for name, text in texts.items()})
+        except (ValueError, KeyError, TypeError, RecursionError):
+            continue
+    return (
+        EngineAnswers(escape_unprintable(str(folder)), left_out, pd.DataFrame(entries)) if entries else None
+    )
+
+
+# -- contents ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Contents:
+    """Records, earlier records, and requested budgets of a report, with the frames of the runs that count.
+
+    Parameters
+    ----------
+    records : Records
+        Times are compared within the newest run alone.
+    earlier : Records, optional
+        An earlier run to compare with.
+    times : s, optional
+        Time budgets for which a solver is recommended; default: three decades about the fastest times.
+    engines : sequence of EngineAnswers
+        Answers of the engines that recorded the steps: `lavender.report.tables.read_engine_answers`.
+    """
+
+    records: Records
+    earlier: Records | None = None
+    times: Sequence[float] = ()
+    engines: Sequence[EngineAnswers] = ()
+
+    @cached_property
+    def is_stopped(self) -> bool:
+        """Whether the newest run ended before everything was measured."""
+        return bool(self.records.runs) and not list(self.records.runs.values())[-1].whole
+
+    @cached_property
+    def is_campaign(self) -> bool:
+        """Whether the newest run has no times."""
+        return bool(self.records.runs) and bool(list(self.records.runs.values())[-1].plan.get("campaign"))
+
+    @cached_property
+    def newest(self) -> pd.DataFrame:
+        """The newest run; if it was stopped, the part in which all cases have the same measurements."""
+        return self._select_finished_part()[0]
+
+    @cached_property
+    def unfinished(self) -> list[str]:
+        """Solvers of a stopped run that were not measured to the end on the shown cases."""
+        return self._select_finished_part()[1]
+
+    @property
+    def has_passes_only(self) -> bool:
+        """Whether a run was stopped in the first solver of its first sequence, so that solvers cannot be compared."""
+        return bool(len(self.newest) and self.newest["solver"].iloc[0] in self.unfinished)
+
+    def _select_finished_part(self) -> tuple[pd.DataFrame, list[str]]:
+        """Return `newest` and `unfinished`.
+
+        A stopped run has the cases on which every solver was measured. If it was stopped in its first sequence, it has
+        the solvers before the one that was measured then, or, without any, the passes before the last.
+        """
+        frame = self.records.latest_frame
+        if not (self.is_stopped and len(frame)):
+            return frame, []
+        run, last = list(self.records.runs.values())[-1], frame.iloc[-1]
+        solvers = run.plan.get("solvers", ())
+        is_running = (frame["sequence"] == (last["sequence"] or None)) & (frame["solver"] == last["solver"])
+        finished = frame[~is_running]
+        done: dict[str, set[str]] = {}
+        for case, solver in finished[["case", "solver"]].drop_duplicates().itertuples(index=False):
+            done.setdefault(case, set()).add(solver)
+        for skip in self.records.skips:
+            if skip.run == run.run:
+                info = self.records.cases.get(skip.case)
+                members = [n for n, i in self.records.cases.items() if i.sequence == skip.case]
+                for name in members if info is None else [skip.case]:
+                    done.setdefault(name, set()).add(skip.solver)
+        whole = finished[finished["case"].isin([name for name, some in done.items() if some >= set(solvers)])]
+        if len(whole) or not last["sequence"]:
+            return whole, []
+        passes = frame[(frame[PASS_COLUMNS] != last[PASS_COLUMNS]).any(axis=1)]
+        some = done.get(str(last["case"]), set())
+        return finished if len(finished) else passes, [name for name in solvers if name not in some]
+
+    @cached_property
+    def frame(self) -> pd.DataFrame:
+        """The newest run without cases that the zero impulse solves: no ranking counts them."""
+        return self.newest[~self.newest["nothing_to_do"].astype(bool)]
+
+    @cached_property
+    def earlier_frame(self) -> pd.DataFrame:
+        """The newest of the earlier runs."""
+        assert self.earlier is not None
+        return self.earlier.latest_frame
+
+    @cached_property
+    def tolerances(self) -> tuple[float, ...]:
+        """Residual tolerances, largest first."""
+        for run in reversed(list(self.records.runs.values())):
+            if run.plan.get("tolerances"):
+                return tuple(sorted(map(float, run.plan["tolerances"]), reverse=True))
+        to_tolerance = self.records.frame.query("mode == 'tol'")["tol"] if len(self.records) else ()
+        return tuple(sorted(set(to_tolerance), reverse=True)) or (1e-3, 1e-6, 1e-9)
+
+    @property
+    def tolerance(self) -> float:
+        """The middle tolerance, to which a solver is recommended."""
+        return self.tolerances[len(self.tolerances) // 2]
+
+    @cached_property
+    def time_budgets(self) -> tuple[float, ...]:
+        """Time budgets [s] for which a solver is recommended."""
+        return tuple(self.times) or choose_time_budgets(get_times(self.frame, self.tolerance))
+
+    @cached_property
+    def structures(self) -> dict[str, list[str]]:
+        """Cases by structure, and steps by sequence."""
+        return group_cases_by_structure(self.frame)
+
+    @cached_property
+    def busy_warning(self) -> str:
+        """A sentence if other processes used the processors while times were taken; else empty."""
+        if self.is_campaign or not len(self.frame):
+            return ""
+        loads = [None if x != x else float(x) for x in self.frame["load"]]
+        busy = machine.make_busy_warning(loads, int(self.frame["cores"].iloc[0]))
+        return f"{busy} The times are invalid; measure again with --no-reuse." if busy else ""
 
 
 # -- tables ------------------------------------------------------------------------------------------------

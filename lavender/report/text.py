@@ -1,14 +1,19 @@
-"""Format numbers and short texts of a report."""
+"""Format numbers and short texts of tables, pages and sentences."""
 
 from __future__ import annotations
 
+import hashlib
 import math
-from collections.abc import Iterable, Sequence
-
-from lavender.report.records import Records, Skip
+import re
+from collections.abc import Sequence
 
 TIME_UNITS = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"))
 NONE = "–"  # Shown in place of a missing number.
+MAX_FILE_NAME_LENGTH = 120  # [characters] File systems accept 255 bytes, including a suffix.
+#: Characters that no text of a report contains: controls, lone surrogates, line ends, marks of writing direction.
+UNPRINTABLE = re.compile(
+    "[\x00-\x1f\x7f-\x9f\u2028\u2029\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
+)
 
 
 def format_residual(x: float) -> str:
@@ -49,6 +54,15 @@ def format_significant_digits(x: float, digits: int = 3) -> str:
     return f"{rounded:.{max(0, digits - 1 - math.floor(math.log10(abs(rounded))))}f}"
 
 
+def format_tolerance(tolerance: float) -> str:
+    """Format a tolerance without leading zeros in its exponent: 1e-3, not 1e-03; 0 as 0."""
+    if tolerance == 0.0:
+        return "0"
+    mantissa, _, exponent = f"{tolerance:.3e}".partition("e")
+    mantissa = mantissa.rstrip("0").rstrip(".")
+    return f"{mantissa}e{int(exponent)}"
+
+
 def format_ratio(x: float) -> str:
     """Return a ratio in words: "2.0 times", "850 times"; from a million on, as a power of ten: "1e8 times"."""
     if not math.isfinite(x):
@@ -63,57 +77,6 @@ def format_count(n: int, noun: str, plural: str = "") -> str:
     return f"{n} {noun if n == 1 else plural or noun + 's'}"
 
 
-def list_diagnostics(records: Records) -> list[tuple[str, str]]:
-    """Return (case, possible mistake in its data) for all cases.
-
-    Equal diagnostics of a sequence are one entry, with its first step and the number of further steps.
-    """
-    seen: dict[tuple[str, str], list[tuple[str, str]]] = {}
-    for name, info in records.cases.items():
-        for diagnostic in info.diagnostics:
-            kind = diagnostic.partition(":")[0]
-            seen.setdefault((info.sequence or name, kind), []).append((name, diagnostic))
-    found = []
-    for (name, diagnostic), *more in seen.values():
-        found.append((f"{name} and {format_count(len(more), 'more step')}" if more else name, diagnostic))
-    return found
-
-
-def _group_by_reason(skips: Iterable[Skip]) -> dict[str, list[Skip]]:
-    """Group skips by their reason without the name of the case."""
-    same: dict[str, list[Skip]] = {}
-    for skip in skips:
-        reason = skip.reason.removeprefix("did not load: ").removeprefix(f"{skip.case}: ")
-        same.setdefault(reason, []).append(skip)
-    return same
-
-
-def list_skip_reasons(skips: Iterable[Skip]) -> list[str]:
-    """Return each different reason of some skips; if it holds for several cases, with their number."""
-    same = _group_by_reason(skips)
-    cases = {reason: len({skip.case for skip in some}) for reason, some in same.items()}
-    return [same[r][0].reason if n == 1 else f"{r} ({n} cases)" for r, n in cases.items()]
-
-
-def list_cases_not_loaded(records: Records) -> list[tuple[str, str]]:
-    """Return (cases that did not load, reason), grouped by reason, and the number of steps of each sequence."""
-    cases = [
-        (f"{some[0].case} and {format_count(len(some) - 1, 'more case')}", reason)
-        if len(some) > 1
-        else (some[0].case, some[0].reason)
-        for reason, some in _group_by_reason(records.left_out.get("", ())).items()
-    ]
-    for name, some in records.left_out.items():
-        if name:
-            cases.append((f"{format_count(len(some), 'step')} of {name}", some[0].reason))
-    return cases
-
-
-def format_left_out_count(lost: int) -> str:
-    """Return a remark in parentheses that `lost` cases are left out of a number; empty if none is left out."""
-    return f" ({lost} left out)" if lost else ""
-
-
 def format_percent(part: int, whole: int, digits: int = 0) -> str:
     """Return a rounded percentage with at least `digits` decimals.
 
@@ -122,3 +85,39 @@ def format_percent(part: int, whole: int, digits: int = 0) -> str:
     while 0 < part < whole and round(100.0 * part / whole, digits) in (0.0, 100.0):
         digits += 1
     return f"{100.0 * part / whole:.{digits}f} %"
+
+
+def escape_unprintable(text: str, lines: bool = False) -> str:
+    """Replace characters that a terminal, file or page cannot show by their codes.
+
+    A byte of a file name that is not UTF-8 (a lone surrogate in Python's string) is written as this byte. With
+    `lines`, line ends and tabs are kept, as in messages; without, the result is one line.
+    """
+    if text.isprintable():
+        return text
+
+    def escape(match: re.Match[str]) -> str:
+        if lines and match[0] in "\n\t":
+            return match[0]
+        code = ord(match[0])
+        if 0xDC80 <= code <= 0xDCFF:
+            code -= 0xDC00
+        words = {"\n": "\\n", "\t": "\\t", "\r": "\\r"}
+        return words.get(match[0]) or (f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}")
+
+    return UNPRINTABLE.sub(escape, text)
+
+
+def make_file_name(name: str) -> str:
+    """Convert a name to one that every file system and URL fragment accepts; a hash keeps long names distinct."""
+    short = re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("_.") or "figure"
+    if len(short) <= MAX_FILE_NAME_LENGTH:
+        return short
+    digest = hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:12]
+    return f"{short[: MAX_FILE_NAME_LENGTH - 13]}-{digest}"
+
+
+def escape_markdown(text: str) -> str:
+    """Return a text on one line, with Markdown and HTML in it escaped."""
+    text = " ".join(text.split()).replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    return re.sub(r"([\\`*\[\]|])", r"\\\1", text)

@@ -27,12 +27,10 @@ import lavender as lv
 from lavender import cli, io, report
 from lavender.io.stored import FOLDER_LOCK, TEMPORARY_NAME, lock_output, lock_step_folder, write_atomically, write_text
 from lavender.report import machine
-from lavender.report.files import summarise
-from lavender.report.findings import Report
-from lavender.report.page import render_page
-from lavender.report.records import KINDS, Skip, make_file_name, to_json
+from lavender.report.findings import Report, print_report, render_report, summarise
+from lavender.report.records import KINDS, Skip, to_json
 from lavender.report.store import Store
-from lavender.report.terminal import print_report
+from lavender.report.text import make_file_name
 from lavender.report.timing import format_call
 from lavender.sim.engine import run
 from lavender.sim.engine.picture import Film
@@ -710,7 +708,7 @@ def show_all(records):
         print_report(shown, Console(file=streams.StringIO(), width=140), complete=complete)
     for record in records:  # The fastest, which is shown, differs from run to run.
         assert format_call(record)
-    render_page(shown).encode("utf-8")
+    render_report(shown).encode("utf-8")
     summarise(shown).encode("utf-8")
 
 

@@ -7,8 +7,8 @@ import json
 from rich.console import Console
 
 from lavender.report import CaseInfo, Record, Records, Report, Run, Skip
-from lavender.report.engine import read_engine_answers
-from lavender.report.terminal import print_report
+from lavender.report.findings import print_report
+from lavender.report.tables import read_engine_answers
 
 TOLERANCES = (1e-3, 1e-6)
 FALSE_CLAIM = {"claim_check": "contradicted", "status_conflict": "says CONVERGED"}

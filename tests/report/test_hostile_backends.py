@@ -18,9 +18,9 @@ import lavender as lv
 from lavender import registry, report
 from lavender.base.subprocesses import unpack_answer
 from lavender.report import cases, machine, timing
-from lavender.report import worker as worker_module
+from lavender.report import workers as worker_module
 from lavender.report.timing import Task
-from lavender.report.worker import DIED_MESSAGE, Worker, parse_outcome
+from lavender.report.workers import DIED_MESSAGE, Worker, parse_outcome
 
 POSIX = pytest.mark.skipif(os.name != "posix", reason="processes and file names of POSIX")
 BACKENDS = """
@@ -170,7 +170,7 @@ def test_a_backend_that_forks_and_hangs_keeps_nobody_waiting(hostile, watchdog, 
 HANGS = """
 import sys
 from lavender import report
-from lavender.report.worker import Worker
+from lavender.report.workers import Worker
 sys.path[:0] = [sys.argv[1]]
 from test_hostile_backends import stack, task
 p = stack()
@@ -246,7 +246,7 @@ def test_workers_of_a_campaign_end_when_it_is_killed():
 
 
 def test_a_whole_run_survives_its_backends(hostile, watchdog, monkeypatch):
-    monkeypatch.setattr("lavender.report.worker.GRACE_TIME", 0.5)
+    monkeypatch.setattr("lavender.report.workers.GRACE_TIME", 0.5)
     plan = report.Plan(
         tolerances=(1e-3,), budgets=(), repeats=1, time_limit=1.0
     )  # a hundred times what they take
@@ -266,7 +266,7 @@ def test_a_check_survives_what_ends_its_process(hostile, watchdog, monkeypatch):
     assert table["x_leave"].note == DIED_MESSAGE and table.reference_note.endswith(
         f"(x_leave: TaskFailed: {died[0]}: {DIED_MESSAGE})"
     )
-    monkeypatch.setattr("lavender.report.worker.GRACE_TIME", 0.5)
+    monkeypatch.setattr("lavender.report.workers.GRACE_TIME", 0.5)
     (row,) = lv.cross_check(stack(4), "x_hang", time_limit=0.1)
     assert row.status == "KILLED"
 

@@ -9,8 +9,8 @@ from calls import robot
 import lavender as lv
 from lavender.report import resolve_sources
 from lavender.report.cases import describe_case
-from lavender.report.engine import read_engine_answers
 from lavender.report.records import Records, from_json, to_json
+from lavender.report.tables import read_engine_answers
 
 
 def test_a_report_shows_the_verdict_of_a_stored_answer_in_float32(tmp_path):

@@ -3,21 +3,38 @@
 import csv
 import dataclasses
 import html.parser
+import io
+import json
 import re
 import sys
 from xml.etree import ElementTree
 
+import pandas as pd
 import pytest
+from rich.console import Console
 from worked import python
 
 from lavender.report import Report, Skip, write
-from lavender.report.figures import Curve, Figure, build_figures, build_overall_figure
-from lavender.report.findings import SECTIONS
-from lavender.report.page import NUMBER, keep_numbers_together
-from lavender.report.plotting import PLUG_IN_COLORS, SOLVER_COLORS, assign_styles, render_svg
-from lavender.report.summary_page import PageSection, SummaryPage
-from lavender.report.table import Table
-from lavender.report.terminal import COMMAND_LINES, MAX_LINES
+from lavender.report.figures import (
+    PLUG_IN_COLORS,
+    SOLVER_COLORS,
+    Curve,
+    Figure,
+    assign_styles,
+    build_figures,
+    build_overall_figure,
+    render_svg,
+)
+from lavender.report.findings import COMMAND_LINES, MAX_LINES, SECTIONS
+from lavender.report.render import (
+    NUMBER,
+    Section,
+    Statement,
+    keep_numbers_together,
+    print_table,
+    render_page,
+    write_files,
+)
 from tests.report.synthetic import EVIL, FALSE_CLAIM, example, record, records_of, shown
 
 
@@ -86,7 +103,7 @@ def test_files_have_every_table_figure_and_run(written):
         "records.csv", "index.html", "summary.md", "figures", "tables"
     }  # fmt: skip
     assert {p.stem for p in (out / "tables").glob("*.csv")} == set(report.sections)
-    assert set(report.sections) - set(SECTIONS) == {"changes", "idle", "skipped"}
+    assert set(report.sections) - set(SECTIONS) == {"changes", "idle", "diagnostics", "skipped"}
     assert set(SECTIONS) - set(report.sections) == {"costs"}  # Two cases are too few for a fit.
     for figure in (out / "figures").iterdir():
         assert ElementTree.parse(figure).getroot().tag.endswith("svg")
@@ -132,16 +149,8 @@ def test_terminal_short_report_has_25_lines_within_the_width(cases, width):
 
 
 def test_print_table_that_is_too_wide_leaves_numbers_out_and_keeps_the_first_column():
-    import io
-
-    from rich.console import Console
-
-    from lavender.report.terminal import print_table
-
     name = "worlds/worst_of_a_long_name_1.npz"
-    table = Table(
-        ["file", *(f"number {i} [m/s]" for i in range(8))], [[name, *["1.234567"] * 8]], frozenset({"file"})
-    )
+    table = pd.DataFrame({"file": [name], **{f"number {i} [m/s]": ["1.234567"] for i in range(8)}})
     out = io.StringIO()
     print_table(Console(file=out, width=80), table, cut=True)
     text = out.getvalue()
@@ -206,17 +215,24 @@ def test_keep_numbers_together_marks_numbers_with_their_units(text, kept):
     assert str(keep_numbers_together("<b>")) == "&lt;b&gt;"
 
 
-def test_summary_page_has_its_figures_and_tables(tmp_path):
+def test_write_files_of_a_page_has_its_figures_tables_and_numbers(tmp_path):
     figure = Figure(
         "over-time", "Errors", "step", "error", (Curve.from_points("worst", "worst", [(0, 1.0), (1, 2.0)]),)
     )
-    part = PageSection("Errors", [Table(["a"], [["<x>"]])], [figure], short=1)
-    index = SummaryPage("Audit", "A sentence.", [part], {"n": 1}).write(tmp_path)
-    page = Page(index.read_text(encoding="utf-8"))
+    frame = pd.DataFrame({"a": ["<x>"], "time [s]": [2e-3]})
+    sections = [Section("Errors", [frame], figures=[figure], short=1), Section("Empty", [frame.iloc[:0]])]
+    text = render_page("Audit", [Statement("A sentence.")], sections, folder=tmp_path / "figures")
+    write_files(tmp_path, {"index.html": text, "numbers.json": {"n": 1}, "tables/errors.csv": frame})
+    page = Page((tmp_path / "index.html").read_text(encoding="utf-8"))
     assert (page.open, page.wrong, page.alts) == ([], [], [figure.description])
-    assert (tmp_path / "figures" / "over-time.svg").exists() and "&lt;x&gt;" in index.read_text(
-        encoding="utf-8"
+    assert (tmp_path / "figures" / "over-time.svg").exists() and "&lt;x&gt;" in text and "Empty" not in text
+    assert (
+        "time <span class=" not in text
+        and '<span class="n">time [ms]</span>' in text
+        and ">2.00</span>" in text
     )
+    pd.testing.assert_frame_equal(pd.read_csv(tmp_path / "tables" / "errors.csv"), frame)
+    assert json.loads((tmp_path / "numbers.json").read_text()) == {"n": 1}
 
 
 @pytest.mark.parametrize("command", ["", "lv.solve(lv.Problem.lcp([[1.0]], [1.0]))", "lv.report.run"])

@@ -9,16 +9,16 @@ import pandas as pd
 import pytest
 
 from lavender.base.deadline import format_seconds
-from lavender.report import Report, ranking, tables
-from lavender.report.engine import read_engine_answers
+from lavender.report import Report, tables
 from lavender.report.recommendation import recommend
-from lavender.report.table import Cell, Table
+from lavender.report.render import format_cells, format_markdown, list_number_heads
+from lavender.report.tables import read_engine_answers
 from lavender.report.text import format_percent
 from tests.report.synthetic import BUDGET, FALSE_CLAIM, record, records_of, shown
 
 
 def rank(*made, tolerance=1e-6, **more):
-    return ranking.rank_solvers(Report(records_of(*made, **more)).frame, tolerance)
+    return tables.rank_solvers(Report(records_of(*made, **more)).frame, tolerance)
 
 
 def test_get_times_loose_tolerance_and_budgets_do_not_count():
@@ -28,9 +28,9 @@ def test_get_times_loose_tolerance_and_budgets_do_not_count():
         record("a", "pgs", 1e-6, 1e-9, **BUDGET),
     ]
     frame = Report(records_of(*made)).frame
-    assert ranking.get_times(frame, 1e-6).loc["pgs", "a"] == 3e-5
-    assert ranking.get_times(frame, 1e-3).loc["pgs", "a"] == 1e-5
-    assert math.isnan(ranking.get_times(frame, 1e-9).loc["pgs", "a"])
+    assert tables.get_times(frame, 1e-6).loc["pgs", "a"] == 3e-5
+    assert tables.get_times(frame, 1e-3).loc["pgs", "a"] == 1e-5
+    assert math.isnan(tables.get_times(frame, 1e-9).loc["pgs", "a"])
 
 
 def test_rank_solvers_solved_cases_come_before_time_and_false_claims_last():
@@ -247,11 +247,6 @@ def test_stopped_sequence_shows_finished_solvers_then_finished_passes():
     assert set(report.frame["case"]) == {"a"} and report.unfinished == []
 
 
-def test_table_writes_all_sizes_in_one_format():
-    table = Table.from_frame(pd.DataFrame({"a [-]": [0.35, 0.2], "b [m/s]": [2.9e-3, np.nan]}))
-    assert table.rows == [["3.5e-1", "2.9e-3"], ["2.0e-1", "–"]]
-
-
 @pytest.mark.parametrize(
     ("now", "drift", "change"),
     [
@@ -342,12 +337,12 @@ def test_recommend_engine_is_ranked_by_the_same_rule(tmp_path, answers, first):
     assert text.startswith("First is the engine's own Newton") == first
     solved = sum(x <= 1e-6 for _, x in answers)
     missed = "" if solved == 2 else f" (misses {2 - solved})"
-    mean = ranking.compute_mean([t for t, x in answers if x <= 1e-6]) if solved else math.nan
+    mean = tables.compute_mean([t for t, x in answers if x <= 1e-6]) if solved else math.nan
     expected = f"solves {solved} of 2{missed} in {format_seconds(mean)}" if solved else "solves none of them"
     assert expected in text
     (row,) = tables.tabulate_engines(report).to_dict("records")
     assert row["first here"] == "auto" and row["first to 1e-6 [s]"] == pytest.approx(
-        ranking.compute_mean([4e-5, 8e-5])
+        tables.compute_mean([4e-5, 8e-5])
     )
     assert row["own to 1e-6 [s]"] == pytest.approx(mean, nan_ok=True)
 
@@ -355,19 +350,22 @@ def test_recommend_engine_is_ranked_by_the_same_rule(tmp_path, answers, first):
 # -- texts of tables ---------------------------------------------------------------------------------------
 
 
-def test_table_times_have_one_unit_and_sizes_one_format():
-    import pandas as pd
-
+def test_format_cells_times_have_one_unit_and_sizes_one_format():
     frame = pd.DataFrame({
         "solver": ["a", "b"], "time [s]": [1.5e-3, math.nan], "rows": [3, 4], "residual [-]": [1e-7, 0.5],
-        "x": [2.5, 3.0],
+        "x": [2.5, 3.0], "share": ["12 %", "3.1 %"], "none [-]": [math.nan, math.nan], "text": ["", ""],
     })  # fmt: skip
-    table = Table.from_frame(frame)
-    assert list(table.heads) == ["solver", "time [ms]", "rows", "residual [-]", "x"]
-    assert table.cell_texts == [["a", "1.50", "3", "1.0e-7", "2.5"], ["b", "–", "4", "5.0e-1", "3"]]
-    assert [table.is_numeric_column(h) for h in table.heads] == [False, True, True, True, True]
-    assert Table(["n", "t"], [["x", Cell.time(2e-6)], ["y", Cell.time(3e-6)]]).heads == ["n", "t [µs]"]
-    assert Table(["a"], [["<b>|*x*"]]).format_markdown() == ["| a |", "|---|", r"| &lt;b&gt;\|\*x\* |"]
+    texts = format_cells(frame)
+    assert list(texts) == ["solver", "time [ms]", "rows", "residual [-]", "x", "share"]
+    assert texts.to_numpy().tolist() == [
+        ["a", "1.50", "3", "1.0e-7", "2.5", "12 %"], ["b", "–", "4", "5.0e-1", "3", "3.1 %"]
+    ]  # fmt: skip
+    assert list_number_heads(texts) == set(texts) - {"solver"}
+    assert list(format_cells(pd.DataFrame({"n": ["x", "y"], "t [s]": [2e-6, 3e-6]}))) == ["n", "t [µs]"]
+    sizes = format_cells(pd.DataFrame({"a [-]": [0.35, 0.2], "b [m/s]": [2.9e-3, math.nan]}))
+    assert sizes.to_numpy().tolist() == [["3.5e-1", "2.9e-3"], ["2.0e-1", "–"]]
+    markdown = format_markdown(pd.DataFrame({"a": ["<b>|*x*"]}))
+    assert markdown == ["| a |", "|---|", r"| &lt;b&gt;\|\*x\* |"]
 
 
 def test_tables_of_200_cases_of_which_few_are_solved_are_complete():
@@ -378,6 +376,6 @@ def test_tables_of_200_cases_of_which_few_are_solved_are_complete():
         for s in ("auto", "pgs")
     ]
     report = Report(records_of(*made))
-    assert len(report.sections["runs"].frame) == 400
-    assert report.sections["runs"].frame["to 1e-3 [s]"].notna().sum() == 6
-    assert len(report.sections["failures"].frame) == 394
+    assert len(report.sections["runs"].frames[0]) == 400
+    assert report.sections["runs"].frames[0]["to 1e-3 [s]"].notna().sum() == 6
+    assert len(report.sections["failures"].frames[0]) == 394

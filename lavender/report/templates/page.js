@@ -20,7 +20,7 @@
       const key = (row) => {
         const cell = row.cells[column];
         const number = parseFloat(cell.textContent);
-        return !cell.classList.contains("n") ? cell.textContent.toLowerCase() : isNaN(number) ? Infinity : number;
+        return !cell.querySelector(".n") ? cell.textContent.toLowerCase() : isNaN(number) ? Infinity : number;
       };
       const sort = () => {
         const down = head.getAttribute("aria-sort") === "ascending";
