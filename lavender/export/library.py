@@ -14,7 +14,7 @@ from lavender.io.stored import check_writable, load_or_make_file, make_folder, w
 HERE = Path(__file__).resolve().parent
 ROOT = Path(lavender_ext.__file__).resolve().parent.parent  # The folder that contains lavender_ext.
 HEADER = HERE / "c" / "lavender.h"
-TEXTS = (".h", ".c", ".txt", ".in")
+TEXTS = (".h", ".hpp", ".c", ".txt", ".in")
 
 
 def source() -> str:

@@ -10,7 +10,7 @@ from libc.stdint cimport int32_t
 
 
 cdef extern from *:
-    """
+    r"""
     #ifndef LAVENDER_TILES
     #define LAVENDER_TILES
     /* Below 16384 entries, A stays in the caches, and copies cost more than they save. */

@@ -234,6 +234,7 @@ LAV_API int32_t lav_run_many(lav_solver *const *solvers, int32_t n, int32_t firs
 
 LAV_API int32_t lav_impulse(lav_solver *solver, double *out, int32_t n);  /* (m) N s */
 LAV_API int32_t lav_velocity(lav_solver *solver, double *out, int32_t n); /* v+, (6 n_bodies) or (nv), with v* as given */
+LAV_API int32_t lav_free_velocity(lav_solver *solver, double *out, int32_t n); /* v* of the problem that was set */
 /* The judge on any impulse (m): slack w and error e (m) where not null. An ill-conditioned M hides no residual above 1e-6. */
 LAV_API int32_t lav_judge(lav_solver *solver, const double *impulse, int32_t n, double *slack, double *error,
                           lav_verdict *out);

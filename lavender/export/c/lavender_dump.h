@@ -1,4 +1,5 @@
 /* A problem as a file of the Python package: `lavender report steps/` reads a folder of them, in the order of their names.
+ * With the impulses that the engine itself computed, `lav_dump_answer` also writes the line of the engine's result.
  *
  * An .npz archive, uncompressed: arrays as they are, to the last bit. Needs <stdio.h> and malloc, which lavender.c does not.
  */
@@ -114,8 +115,9 @@ static inline void lav_dump_rows(lav_dump_file *d, const char *const *name, cons
   free(dense), free(to), free(start);
 }
 
-/* The problem that was set in a solver, with the right-hand side that it has there. */
-static inline int32_t lav_dump(lav_solver *solver, const lav_problem *q, const char *path) {
+/* Write the problem that was set in a solver, with the right-hand side and the velocities v* that it has there, and an
+ * impulse (m) [N s] unless it is null. */
+static inline int32_t lav_dump_with(lav_solver *solver, const lav_problem *q, const char *path, const double *impulse) {
   if (!solver || !q || !path) return LAV_ERROR_NULL;
   static const char *const jac[] = {"general_jac_data", "general_jac_indices", "general_jac_indptr"};
   static const char *const mass[] = {"general_mass_data", "general_mass_indices", "general_mass_indptr"};
@@ -123,7 +125,8 @@ static inline int32_t lav_dump(lav_solver *solver, const lav_problem *q, const c
   const int32_t k = q->n_blocks, m = q->n_rows, n = q->n_bodies, c = k - q->n_joints;
   const int32_t is_bodies = q->form == LAV_BODIES, general = q->form == LAV_VELOCITIES;
   const int64_t version = 1, shape[2] = {m, m};
-  double *b = (double *)calloc(2 * (size_t)m + 1, 8);
+  const int32_t n_v = is_bodies ? 6 * n : general ? q->n_velocities : 0;
+  double *b = (double *)calloc(2 * (size_t)m + (size_t)n_v + 1, 8), *v_free = b ? b + 2 * (size_t)m : NULL;
   int32_t *whole = (int32_t *)calloc(2 * (size_t)k + 2, 4), *kind = whole + k + 1, i, j, code;
   uint32_t end[8] = {0x06054b50, 0, 0, 0, 0, 0, 0, 0};
   char meta[128], size[16];
@@ -131,6 +134,7 @@ static inline int32_t lav_dump(lav_solver *solver, const lav_problem *q, const c
   lav_verdict verdict;
   verdict.size = (uint32_t)sizeof verdict;
   code = b && whole ? lav_judge(solver, b + m, m, b, NULL, &verdict) : LAV_ERROR_WORKSPACE; /* of no impulse: w = -b */
+  if (code == LAV_OK && n_v > 0) code = lav_free_velocity(solver, v_free, n_v);
   memset(&d, 0, sizeof d);
   if (code == LAV_OK && !(d.file = fopen(path, "wb"))) code = LAV_ERROR_FILE;
   if (code != LAV_OK) {
@@ -153,12 +157,13 @@ static inline int32_t lav_dump(lav_solver *solver, const lav_problem *q, const c
   if (q->rolling) lav_dump_reals(&d, "cones_rolling", q->rolling, k, "", 1, 0.0);
   if (q->impulse) lav_dump_reals(&d, "guess", q->impulse, m, "", 1, 0.0);
   snprintf(size, sizeof size, "%d,", (int)k);
+  if (impulse) lav_dump_reals(&d, "impulse", impulse, m, "", 1, 0.0);
   if (q->key) lav_dump_array(&d, "key", "u8", size, q->key, 8 * (size_t)k);
   if (is_bodies || general) lav_dump_reals(&d, "compliance", q->compliance, m, "", 1, 0.0);
   if (is_bodies) {
     lav_dump_reals(&d, "rows_inv_mass", q->inv_mass, n, "", 1, 0.0);
     lav_dump_reals(&d, "rows_inv_inertia", q->inv_inertia, n, " 3, 3", 9, 0.0);
-    lav_dump_reals(&d, "rows_v_free", q->velocity, n, " 6", 6, 0.0);
+    lav_dump_reals(&d, "rows_v_free", v_free, n, " 6", 6, 0.0);
     lav_dump_reals(&d, "rows_jac", q->jac, whole[q->n_joints], " 12", 12, 0.0);
     lav_dump_whole(&d, "rows_joint_ptr", whole, q->n_joints + 1, "", 1);
     lav_dump_whole(&d, "rows_joint_body", q->joint_body, q->n_joints, " 2", 2);
@@ -170,7 +175,7 @@ static inline int32_t lav_dump(lav_solver *solver, const lav_problem *q, const c
   } else if (general) {
     lav_dump_rows(&d, jac, q->index_ptr, q->index, q->value, m, q->n_velocities, 0);
     lav_dump_rows(&d, mass, q->mass_ptr, q->mass_index, q->mass_value, q->n_velocities, q->n_velocities, 1);
-    lav_dump_reals(&d, "general_v_free", q->velocity, q->n_velocities, "", 1, 0.0);
+    lav_dump_reals(&d, "general_v_free", v_free, q->n_velocities, "", 1, 0.0);
   } else {
     lav_dump_rows(&d, matrix, q->index_ptr, q->index, q->value, m, m, 0);
     lav_dump_array(&d, "A_shape", "i8", "2,", shape, 16);
@@ -186,6 +191,40 @@ static inline int32_t lav_dump(lav_solver *solver, const lav_problem *q, const c
   lav_dump_numbers(&d, "42222442", end);
   free(b), free(whole);
   return fclose(d.file) != 0 || d.is_bad ? LAV_ERROR_FILE : LAV_OK;
+}
+
+/* Write the problem that was set in a solver. The arrays of q are as in the last lav_set, except for `velocity`, which is
+ * not read: it may hold the velocities after the solve. */
+static inline int32_t lav_dump(lav_solver *solver, const lav_problem *q, const char *path) {
+  return lav_dump_with(solver, q, path, NULL);
+}
+
+/* Write FOLDER/NAME.npz with the impulses (m) [N s] that the engine's own solver computed, and append the line of this
+ * result to FOLDER/engine.jsonl: its time [s] and the name of the solver, in letters, digits, spaces and -_.()+ (others
+ * become _). `lavender report FOLDER` judges these impulses and shows them among the solvers. */
+static inline int32_t lav_dump_answer(lav_solver *solver, const lav_problem *q, const char *folder, const char *name,
+                                      const double *impulse, double seconds, const char *method) {
+  const char *const texts[] = {folder, name, method};
+  char path[2100], plain[3][1024];
+  FILE *lines;
+  int32_t i, j, code, is_bad;
+  if (!q || !folder || !name || !method || !impulse) return LAV_ERROR_NULL;
+  if (!(seconds >= 0.0 && seconds < INFINITY)) return LAV_ERROR_NUMBER;
+  for (i = 0; i < 3; i++) {
+    if (strlen(texts[i]) >= sizeof plain[i]) return LAV_ERROR_FILE;
+    strcpy(plain[i], texts[i]);
+  }
+  for (i = 1; i < 3; i++)
+    for (j = 0; plain[i][j]; j++)
+      if (!strchr("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789 -_.()+", plain[i][j])) plain[i][j] = '_';
+  snprintf(path, sizeof path, "%s/%s.npz", plain[0], plain[1]);
+  code = lav_dump_with(solver, q, path, impulse);
+  if (code != LAV_OK) return code;
+  snprintf(path, sizeof path, "%s/engine.jsonl", plain[0]);
+  if (!(lines = fopen(path, "ab"))) return LAV_ERROR_FILE;
+  is_bad = fprintf(lines, "{\"file\": \"%s.npz\", \"rows\": %d, \"seconds\": %.9g, \"solver\": \"%s\"}\n", plain[1],
+                   (int)q->n_rows, seconds, plain[2]) < 0;
+  return fclose(lines) != 0 || is_bad ? LAV_ERROR_FILE : LAV_OK;
 }
 
 #endif

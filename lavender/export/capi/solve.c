@@ -373,3 +373,13 @@ int32_t lav_velocity(lav_solver *solver, double *out, int32_t n) {
   for (i = 0; i < n; i++) out[i] = solver->v_free[i] + out[i];
   return leave(solver, LAV_OK);
 }
+
+int32_t lav_free_velocity(lav_solver *solver, double *out, int32_t n) {
+  GIVE_BACK(enter(solver));
+  if (!solver->ready) return leave(solver, LAV_ERROR_NO_PROBLEM);
+  if (solver->form == LAV_MATRIX) return leave(solver, LAV_ERROR_UNSUPPORTED);
+  if (n != solver->n_v) return leave(solver, LAV_ERROR_COUNT);
+  if (!out && n > 0) return leave(solver, LAV_ERROR_NULL);
+  COPY(out, solver->v_free, n);
+  return leave(solver, LAV_OK);
+}
