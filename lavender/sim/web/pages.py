@@ -62,7 +62,7 @@ def get_or_build_module(say: Callable[[str], Any] = lambda text: None, name: str
         if reason := wasm.explain_missing_requirement():
             state = "is of other kernels" if shipped.exists() else "is not in this installation"
             raise LavenderError(f"the WebAssembly module {name} {state} and cannot be built: {reason}")
-        say(f"building the WebAssembly module {name} (about 10 s, once)")
+        say(f"building the WebAssembly module {name} (about 25 s of CPU time, once)")
         with TemporaryDirectory() as folder:
             out = Path(folder, shipped.name)
             build_module(out, name)

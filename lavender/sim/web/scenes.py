@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from lavender.base.errors import InputError
+from lavender.io.stored import as_path, check_writable, write_text
 from lavender.sim.engine import Simulation
 from lavender.sim.engine.layout import HEAD, JOINT, JOINT_KINDS, ORDER_NUMBER, SETTING, SIZE
 from lavender.sim.engine.snapshot import Snapshot
@@ -21,6 +24,7 @@ from lavender_ext.engine.arrays import CAP_CONTACT, CAP_PAIR, SHAPES, compute_ar
 #: opens with the first preset. The presets with numbers are the five experiments of docs/chapter.md; its links open
 #: them. A number is a line above the pictures: the medians of a solver value ("field") of A and B over steps first + 1
 #: to last, or if both are 0 the value of the first substep, and their ratio A/B ("AB"), B/A ("BA") or none ("").
+SCENE_VERSION = 1  # Version of the files of `write_scene`.
 PRESETS_PATH = Path(__file__).resolve().parent / "page" / "presets.json"
 
 
@@ -60,18 +64,51 @@ def describe_snapshot(start: Snapshot) -> dict[str, Any]:
     return {"size": start.size.tolist(), "arrays": arrays}
 
 
+def describe_scene(scene: Scene) -> dict[str, Any]:
+    """Return the initial state of a scene and its step sizes, as the page reads them."""
+    return {
+        "dt": scene.parameters.dt,
+        "substeps": scene.parameters.substeps,
+        "newton_substeps": scene.with_parameters(solver="newton").parameters.substeps,
+        "bodies": [body.name for body in scene.bodies],
+        **describe_snapshot(Simulation(scene).snapshot()),
+    }
+
+
+def write_scene(scene: Scene, path: str | PathLike[str], title: str = "") -> None:
+    """Write a scene to a file (.json) that the page opens with its button "Open".
+
+    Parameters
+    ----------
+    scene : Scene
+        A scene of the gallery with other parameters, or one built by hand. It must use sequential impulses.
+    path : path
+    title : str, optional
+        Name in the list of scenes; the name of the file by default.
+
+    Raises
+    ------
+    InputError
+        The scene uses another solver, is not valid, or the file cannot be written.
+    """
+    if scene.parameters.solver != "sequential_impulses":
+        raise InputError(
+            f"the scene uses {scene.parameters.solver!r}, and the page sweeps: pass a scene with the default solver "
+            "and select newton in the page"
+        )
+    title = title or as_path(path).stem
+    # Joints that open show an error of the solver better than the motion of a body.
+    measure = "gap" if scene.joints else "displacement"
+    entry = {"name": title, "title": title, "note": "", "measure": measure, **describe_scene(scene)}
+    contents = {"lavender_scene": SCENE_VERSION, "layout": describe_layout(), "scene": entry}
+    write_text(check_writable(path), json.dumps(contents, allow_nan=False, separators=(",", ":")))
+
+
 def collect_page_data() -> dict[str, Any]:
     """Return all data that the page reads: layout, scenes and presets."""
     contents = json.loads(PRESETS_PATH.read_text(encoding="utf-8"))
     for entry in contents["scenes"]:
-        scene = Scene(entry["name"])
-        entry |= {
-            "dt": scene.parameters.dt,
-            "substeps": scene.parameters.substeps,
-            "newton_substeps": Scene(entry["name"], solver="newton").parameters.substeps,
-            "bodies": [body.name for body in scene.bodies],
-            **describe_snapshot(Simulation(scene).snapshot()),
-        }
+        entry |= describe_scene(Scene(entry["name"]))
     for side in (side for preset in contents["presets"] for side in preset["sides"]):
         side |= {"warm_start": int(side["warm_start"]), "order": ORDER_NUMBER[side["order"]], "box": 0}
     return {"layout": describe_layout(), **contents}

@@ -15,7 +15,7 @@ from lavender.base.errors import InputError, LavenderError
 from lavender.sim.scene import SCENES
 from lavender.sim.web import compile as wasm
 from lavender.sim.web import pages
-from lavender.sim.web.scenes import collect_page_data, describe_snapshot
+from lavender.sim.web.scenes import PRESETS_PATH, collect_page_data, describe_snapshot, write_scene
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[2]
@@ -201,3 +201,36 @@ def test_page_scenes_are_the_start_of_native_ones():
         start = lv.Simulation(scene["name"]).snapshot()
         assert scene == scene | describe_snapshot(start)
         assert len(scene["bodies"]) == scene["size"][0]
+
+
+@needs_compiler
+def test_presets_of_the_page_have_the_results_of_the_documentation(tmp_path):
+    """Run each preset with the page's modules; compare with the tables of docs/web.md and docs/chapter-engines.md."""
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("node is not installed")
+    pages.write_page(tmp_path)
+    output = subprocess.run([node, HERE / "preset_results.mjs", tmp_path], check=True, capture_output=True, text=True)
+    results = json.loads(output.stdout)
+    page = (ROOT / "docs" / "web.md").read_text(encoding="utf-8")
+    presets = json.loads(PRESETS_PATH.read_text(encoding="utf-8"))["presets"]
+    for preset in presets:
+        if captions := results[preset["name"]]["captions"]:
+            (row,) = re.findall(rf"^\| {re.escape(preset['title'])}[^|]*\| (.*) \|$", page, re.MULTILINE)
+            a, b = row.split("; ")
+            assert captions[0] in a and captions[1] in b, (preset["name"], captions)
+    chapter = (ROOT / "docs" / "chapter-engines.md").read_text(encoding="utf-8")
+    cells = [[cell.strip(" *") for cell in line.split("|")] for line in chapter.splitlines() if line.startswith("|")]
+    alternating = {(row[3]): row[7] for row in cells if len(row) == 9}
+    few_many = {n["last"]: n["a"] / n["b"] for n in results["experiment=4"]["numbers"]}
+    assert alternating["first solve"] == f"{few_many[0]:.1f}"
+    assert (
+        alternating["steps 21–60"] == f"{few_many[60]:.0f}" and alternating["steps 181–240"] == f"{few_many[240]:.0f}"
+    )
+    cold_warm = results["experiment=5"]["numbers"][0]
+    assert alternating["steps 21–90"] == f"{cold_warm['b'] / cold_warm['a']:.0f}"
+
+
+def test_write_scene_with_another_solver_is_refused_with_the_remedy(tmp_path):
+    with pytest.raises(InputError, match="select newton in the page"):
+        write_scene(lv.Scene("stack", solver="newton"), tmp_path / "scene.json")

@@ -16,7 +16,7 @@ from newton_steps import NewtonSteps
 
 import lavender as lv
 from lavender.sim.scene import SCENES as SCENES_OF_GALLERY
-from lavender.sim.web.scenes import PRESETS_PATH
+from lavender.sim.web.scenes import PRESETS_PATH, write_scene
 
 pytestmark = pytest.mark.slow  # the module is the same whatever checks the native kernels are built with
 
@@ -243,6 +243,34 @@ def test_an_experiment_opens_by_its_link_and_tells_its_numbers(visit, preset, ph
     assert v.js("document.documentElement.scrollWidth <= innerWidth")
     pressed = v.page.locator("#experiments button[aria-pressed=true]").bounding_box()
     assert 0 <= pressed["x"] < pressed["x"] + pressed["width"] <= v.js("innerWidth")
+
+
+def test_open_a_written_scene_steps_as_the_native_engine_and_its_table_is_downloaded(visit, tmp_path):
+    scene = lv.Scene("stack", n=3, friction=0.3)
+    scene.add_sphere(0.2, mass=2.0, position=(0.0, 0.0, 4.0))
+    write_scene(scene, tmp_path / "three.json", title="Three boxes and a ball")
+    v = visit("#stack")
+    v.page.set_input_files("#file", tmp_path / "three.json")
+    v.page.wait_for_function("lavender.scene.name === 'Three boxes and a ball'")
+    v.js("lavender.advance(40)")
+    simulation = lv.Simulation(scene)
+    values = [simulation.step()[0]["solver"].tolist() for _ in range(40)]
+    assert v.values(0)[0] == values[-1]
+    with v.page.expect_download() as download:
+        v.page.click("#download")
+    table = np.genfromtxt(download.value.path(), delimiter=",", skip_header=1)
+    assert table.shape == (40, 17)
+    assert table[:, 1:9].tolist() == values  # the shortest text that reads back as the same number
+    np.testing.assert_allclose(table[:, 0], scene.parameters.dt * np.arange(1, 41))
+
+
+@pytest.mark.parametrize("text", ["{}", "no JSON", '{"lavender_scene": 1, "layout": {}, "scene": {}}'])
+def test_open_another_file_names_it_and_keeps_the_scene(visit, tmp_path, text):
+    (tmp_path / "other.json").write_text(text)
+    v = visit("#stack")
+    v.page.set_input_files("#file", tmp_path / "other.json")
+    v.page.wait_for_function("document.querySelector('#failure').textContent.includes('other.json')")
+    assert v.js("lavender.scene.name") == "stack"
 
 
 def test_plots_hold_the_native_errors(visit):

@@ -70,6 +70,9 @@ class App {
     click("snapshot", () => this.snapshot());
     click("restore", () => this.restore());
     click("push", () => this.push());
+    click("open", () => find("file").click());
+    click("download", () => this.download());
+    find("file").addEventListener("change", (event) => this.open(event.target.files[0]));
     find("scene").addEventListener("change", (event) => this.choose(event.target.value));
     find("speed").addEventListener("change", () => this.write());
     document.addEventListener("keydown", (event) => this.key(event));
@@ -340,6 +343,36 @@ class App {
     this.show(true);
   }
 
+  // Add the scene of a file to the list, and select it. The file has the layout of the kernels that wrote it.
+  async open(file) {
+    find("file").value = "";
+    try {
+      const { lavender_scene: version, layout, scene } = JSON.parse(await file.text());
+      if (version !== 1 || JSON.stringify(layout) !== JSON.stringify(this.contents.layout)) {
+        throw new Error("it was not written by lavender.sim.web.write_scene of this version");
+      }
+      const others = this.contents.scenes.filter(({ name }) => name !== scene.name);
+      this.contents.scenes = [...others, scene];
+      find("scene").replaceChildren(...this.contents.scenes.map(({ title, name }) => new Option(title, name)));
+      this.choose(scene.name);
+    } catch (error) {
+      fail(`${file.name} could not be opened: ${error.message}.`);
+    }
+  }
+
+  // Download the values of both sides over the steps that the plots show.
+  download() {
+    const head = ["time [s]", ...["A", "B"].flatMap((side) => SOLVER_FIELDS.map((field) => `${side} ${field}`))];
+    const [a, b] = this.sides.map((side) => side.history);
+    const lines = a.time.map((time, i) => [time, ...a.values[i], ...(b.values[i] ?? [])].join(","));
+    const text = [head.join(","), ...lines, ""].join("\n");
+    const link = Object.assign(document.createElement("a"), {
+      href: URL.createObjectURL(new Blob([text], { type: "text/csv" })), download: `${this.scene.name}.csv`,
+    });
+    link.click();
+    URL.revokeObjectURL(link.href);
+  }
+
   // Apply the same push on both sides; it is also the same after every reset.
   push() {
     const start = this.seed;
@@ -372,6 +405,7 @@ class App {
   // would take more time than the pictures.
   show(always) {
     this.sides.forEach((side) => side.draw());
+    find("download").disabled = this.sides[0].history.time.length === 0;
     const n = this.parts.length;
     if (always) {
       this.next = 0;
