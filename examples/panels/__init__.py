@@ -31,8 +31,17 @@ class Numbers(Mapping):
 
 
 def show(panels, numbers, print_numbers, path):
-    """Draw the panel that the file is named after. For any other name print all numbers and draw all panels."""
-    if Path(str(path)).stem not in panels:
+    """Draw the panel that the file is named after. For the script's own name print all numbers and draw all panels.
+
+    Any other name ends the script with an error that lists the panels.
+    """
+    name = Path(str(path)).stem
+    if name not in panels:
+        own = Path(print_numbers.__code__.co_filename).stem
+        if name != own:
+            raise SystemExit(
+                f"{path}: name the figure after a panel ({', '.join(panels)}), or {own} for all panels"
+            )
         print_numbers(numbers)
     save(panels, numbers, path)
     print(f"figure: {path}")

@@ -56,7 +56,13 @@ class UnknownName(LavenderError, KeyError):
         by_lower_case = {word.lower(): word for word in reversed(known)}
         lower_case = str(name).lower()
         matches = difflib.get_close_matches(lower_case, by_lower_case, n=3, cutoff=0.6)
-        matches = [lower_case] if lower_case in by_lower_case else matches
+        # Initials come first: "si" is sequential_impulses, although "sip" is closer by letters.
+        initials = [
+            word
+            for word in by_lower_case
+            if "_" in word and "".join(part[:1] for part in word.split("_")) == lower_case
+        ]
+        matches = [lower_case] if lower_case in by_lower_case else [*initials, *matches]
         similar = [by_lower_case[match] for match in matches]
         hint = f"known: {', '.join(known) or 'none'}"
         if similar and isinstance(name, str):

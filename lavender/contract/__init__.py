@@ -1,7 +1,8 @@
 """The requirements on every solver, as checks on twelve problems for built-in solvers and plug-ins."""
 
 from lavender.contract.checks import CHECKS, Check, ContractError, list_checks
-from lavender.contract.run import check_solver
+from lavender.contract.problems import make_problems
+from lavender.contract.run import Failure, check_solver
 
-__all__ = ["CHECKS", "Check", "ContractError", "check_solver", "list_checks"]
+__all__ = ["CHECKS", "Check", "ContractError", "Failure", "check_solver", "list_checks", "make_problems"]
 __dir__ = sorted(__all__).copy  # Completion shows public names only.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import traceback
 import warnings
 from collections.abc import Iterator
+from typing import NamedTuple
 
 from lavender.base.errors import format_error
 from lavender.base.subprocesses import Answer, InvalidAnswer, ProcessBackend, ProcessEnded, RemoteError
@@ -13,8 +14,23 @@ from lavender.solvers import registry
 from lavender.solvers.registry import SolverSpec
 
 
-def check_solver(name: str, timeout: float = 600.0) -> Iterator[tuple[Check, str]]:
-    """Yield each check that applies to a solver, and the sentence of its failure; empty if the requirement is met.
+class Failure(NamedTuple):
+    """Result of a check.
+
+    Parameters
+    ----------
+    text : str
+        Sentence of the failure; empty if the requirement is met.
+    problem : str
+        Name of the problem of the failure in `make_problems`, or empty.
+    """
+
+    text: str
+    problem: str = ""
+
+
+def check_solver(name: str, timeout: float = 600.0) -> Iterator[tuple[Check, Failure]]:
+    """Yield each check that applies to a solver, and its result.
 
     Each check of a plug-in with an entry point runs in another process, for at most `timeout` [s]. An unknown name
     raises UnknownName, a missing package SolverUnavailable.
@@ -29,32 +45,36 @@ def check_solver(name: str, timeout: float = 600.0) -> Iterator[tuple[Check, str
         process.close()
 
 
-def run_remotely(process: ProcessBackend, name: str, check: Check, timeout: float) -> str:
-    """Run a check in another process, and return the sentence of its failure; empty if the requirement is met."""
+def run_remotely(process: ProcessBackend, name: str, check: Check, timeout: float) -> Failure:
+    """Run a check in another process, and return its result."""
     try:
         process.start()
         answer, _ = process.call_function(name, check.name, timeout=timeout, max_bytes=0)
-        return str(answer.get("failure", "the process of the solver sent no answer"))
+        text = str(answer.get("failure", "the process of the solver sent no answer"))
+        return Failure(text, str(answer.get("problem", "")))
     except TimeoutError:
-        return f"the check did not end within {timeout:g} s; its process was killed"
+        return Failure(f"the check did not end within {timeout:g} s; its process was killed")
     except (ProcessEnded, RemoteError, InvalidAnswer) as error:
-        return f"the code of the solver ended its process ({error}), or sent no answer"
+        return Failure(f"the code of the solver ended its process ({error}), or sent no answer")
 
 
 def run_check(name: str, check: str) -> Answer:
     """Run a check by name, in the other process."""
-    return {"failure": find_failure(registry.get(name), CHECKS[check])}, ()
+    failure = find_failure(registry.get(name), CHECKS[check])
+    return {"failure": failure.text, "problem": failure.problem}, ()
 
 
-def find_failure(spec: SolverSpec, check: Check) -> str:
-    """Run a check, and return the sentence of its failure, empty if the requirement is met."""
+def find_failure(spec: SolverSpec, check: Check) -> Failure:
+    """Run a check, and return its result."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             check.run(spec)
     except ContractError as error:
-        return str(error)
+        return Failure(str(error), error.problem)
     except Exception as error:
         frame = traceback.extract_tb(error.__traceback__)[-1]
-        return f"{format_error(error)} was raised in {frame.filename}, line {frame.lineno} ({frame.name})"
-    return ""
+        return Failure(
+            f"{format_error(error)} was raised in {frame.filename}, line {frame.lineno} ({frame.name})"
+        )
+    return Failure("")

@@ -8,6 +8,7 @@ function that returns one) or with `register`.
 from __future__ import annotations
 
 import importlib.util
+import re
 import warnings
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
@@ -533,6 +534,10 @@ def register(spec: SolverSpec, *, replace: bool = False) -> None:
 def _add_spec(spec: SolverSpec, replace: bool) -> None:
     if not isinstance(spec, SolverSpec):
         raise InputError(f"spec is a {type(spec).__name__}; a lavender.SolverSpec is needed")
+    if not re.fullmatch(r"[A-Za-z0-9_.-]+", spec.name):
+        raise InputError(
+            f"the name {spec.name!r} of a solver needs letters, digits and the characters _ . - only"
+        )
     if spec.name in registered and not replace:
         raise InputError(
             f"a solver named {spec.name!r} is registered already; pass replace=True to take its place"

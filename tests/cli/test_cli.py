@@ -53,15 +53,16 @@ def test_a_problem_that_none_of_the_solvers_takes_is_not_checked(lavender):
     assert lavender("check", "granularF(n=3)", "--solvers", "sor", "newton")[0] == 0
 
 
-def test_contract_checks_a_solver_and_explains_what_it_does_not_meet(lavender, plug_in):
+def test_contract_checks_a_solver_and_explains_what_it_does_not_meet(lavender, plug_in, tmp_path):
     code, out, _ = lavender("contract", "sor")
     assert code == 0 and "NOT MET" not in out
     assert "orders_change_the_sweep" not in out  # sor has orders
     plug_in(lambda problem, impulse: lv.Claim(lv.Status.CONVERGED, 1, {"sweeps": 1}), "liar", laws={"lcp"})
-    code, out, _ = lavender("contract", "liar")
+    code, out, _ = lavender("contract", "liar", "--out", str(tmp_path / "unmet"))
     assert code == cli.EXIT_UNMET
     assert "NOT MET  Every problem that the spec accepts is solved" in out
     assert "for a stack of boxes without friction (law lcp) the result is: liar" in out
+    assert lv.load(tmp_path / "unmet" / "problems_are_solved.npz").m > 0
     code, out, _ = lavender("contract", "liar", "--list")
     assert code == 0 and "problems_are_solved, all solvers" in out and "met " not in out
     assert lavender("contract", "no such solver")[0] == cli.EXIT_BAD_INPUT

@@ -17,7 +17,7 @@ def drawn(tmp_path, capsys):
     """An example by name that has printed its numbers and saved its figure; those of the chapter: test_chapter.py."""
 
     def draw(name):
-        path = tmp_path / "figure.png"
+        path = tmp_path / f"{name}.png"
         example(name).main(str(path))
         assert path.read_bytes().startswith(b"\x89PNG")
         assert str(path) in capsys.readouterr().out
@@ -190,6 +190,14 @@ def test_the_planar_engine_holds_its_joints_and_its_circles(drawn):
     lines = source.split("# ---")[1].count("\n") - 1
     for page, words in (("own-engine", "an engine of"), ("examples", "a two-dimensional engine in")):
         assert f"{words} {lines} lines" in (DOCS / f"{page}.md").read_text(encoding="utf-8")
+
+
+def test_example_with_an_unknown_panel_lists_the_panels(tmp_path):
+    with pytest.raises(
+        SystemExit, match=r"name the figure after a panel \(paths, speed\), or engine_2d for all panels"
+    ):
+        example("engine_2d").main(str(tmp_path / "spead.png"))
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_planar_engine_runs_when_it_is_copied_alone(tmp_path):

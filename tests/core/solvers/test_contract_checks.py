@@ -241,9 +241,17 @@ class Deadband(Sweeps):
 
 
 #: Faulty solver, the check that must fail, and words of its sentence.
+class UsesTheSymmetricPart(Sweeps):
+    """Sweeps over (A + A^T) / 2 and accepts every A."""
+
+    def prepare(self, problem):
+        a = problem.dense()
+        return State(problem, 0.5 * (a + a.T))
+
+
 FAULTS = [
     (IgnoresUpperBounds, "problems_are_solved", "for rows with both bounds active (law lcp) the result is"),
-    (StopsAtZeroTolerance, "budgets_are_kept", "tol=0 and max_iter=5 must run exactly 5 iterations"),
+    (StopsAtZeroTolerance, "budgets_are_kept", "must run exactly 101 iterations"),
     (SingleNorm, "problems_are_solved", "for two islands whose b differ by 1e6 (law lcp) the result is"),
     (Symmetrises, "problems_are_solved", "for an asymmetric A (law lcp) the result is"),
     (SinglePrecision, "problems_are_solved", "CONVERGED and lv.residual"),
@@ -259,6 +267,7 @@ FAULTS = [
     (Option, "options_match_the_spec", "the options extra are in the spec or in the factory, not in both"),
     (SpendsMore, "budgets_are_kept", "max_iter=1"),
     (StopsAtTwo, "budgets_are_kept", "or the claim is wrong"),
+    (UsesTheSymmetricPart, "problems_are_solved", "for an asymmetric A"),
     (ForgetsCount, "bits_are_reproducible", "keep all changes in the state"),
     (Counts, "bits_are_reproducible", "gives other bits"),
     (OldNumbers, "bits_are_reproducible", "`update` gives other bits than `prepare`"),
@@ -280,7 +289,7 @@ def make_spec(factory, **more):
 
 
 def failure(spec, name):
-    return find_failure(spec, contract.CHECKS[name])
+    return find_failure(spec, contract.CHECKS[name]).text
 
 
 @pytest.mark.parametrize("check", [c.name for c in contract.list_checks(make_spec(Sweeps))])
@@ -325,3 +334,14 @@ def test_every_check_has_a_requirement_in_words():
     for check in contract.CHECKS.values():
         assert check.requirement.endswith(".") and check.requirement[0].isupper()
         assert check.applies_to
+
+
+@pytest.mark.parametrize("name", ["my solver", "a\nb"])
+def test_register_name_with_other_characters_raises(name):
+    with pytest.raises(lv.InputError, match="letters, digits"):
+        lv.register(make_spec(Sweeps, name=name))
+
+
+def test_unknown_solver_initials_suggest_the_name_with_these_initials():
+    with pytest.raises(lv.UnknownName, match="did you mean 'sequential_impulses'"):
+        lv.solve(lv.Problem.lcp(np.eye(2), [1.0, 1.0]), "si")
