@@ -37,8 +37,9 @@ from lavender.io.mujoco_discrete import MASS_TOLERANCE, compute_discrete_matrix
 from lavender.io.mujoco_memory import CHANGED_ADVICE, read_step
 from lavender.io.start_states import can_sleep
 from lavender.problem import FRICTION_LAWS
-from lavender.problem.cones import Cones, get_block_kinds
+from lavender.problem.cones import ROW, Cones, get_block_kinds
 from lavender.problem.generalized import Compressed
+from lavender_ext.core.blocks import concatenate_blocks
 from lavender_ext.io.mujoco_rows import copy_rows
 from lavender_ext.judge.measure import all_finite
 
@@ -264,30 +265,34 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
     triangle = model.M_colind, np.append(model.M_rowadr, len(model.M_colind))
     # Matrices of the integrator "discrete", which may have other patterns.
     matrices: dict[int, Compressed] = {}
-    no_ints = np.zeros((0, 2), np.int32), np.zeros((0, 4), np.int32)
-    no_rows: Any = np.zeros((0, nv)), np.zeros((0, 5)), *no_ints, np.zeros((0, 5))
-    rows_of_states = [no_rows] * (n + 1)  # State i is entry i + 1.
+    rows_of_states: dict[int, Any] = {}
     pending = iter(range(n))
     threads = min(check_int("threads", threads, 1, None), max(n, 1))
 
+    is_finite = np.isfinite(values).all(axis=1)
+    has_moving_surfaces, kind = bool(getattr(model, "flg_surfacevel", 0)), int(kinds[size])
+
     def work(stop: bytearray) -> None:
         data = mj.MjData(model)
+        step = read_step(model, data)
         for i in pending:
             if stop[0]:
                 break
-            if not all_finite(values[i]):
+            if not is_finite[i]:
                 continue
-            mj.mj_setState(model, data, values[i], kinds[size])
+            mj.mj_setState(model, data, values[i], kind)
             try:
                 mj.mj_forward(model, data)
             except mj.FatalError as error:
                 raise InputError(f"state {i}: MuJoCo raised an error, {error}") from None
+            if has_moving_surfaces:  # efc_vel contains their velocities, too.
+                mj.mj_mulJacVec(model, data, data.efc_vel, data.qvel)
+            step.read(data)
+            free[i], smooth[i], mass[i] = data.qvel, data.qacc_smooth, data.M
             if not all_finite(data.qacc):
                 if errors == "raise":
                     raise InputError(f"state {i}: {single.DIVERGED_TEXT}")
                 data.efc_force[:] = np.nan
-            step = read_step(model, data)
-            free[i], smooth[i], mass[i] = data.qvel, data.qacc_smooth, data.M
             if step.is_discrete:
                 try:
                     matrix = compute_discrete_matrix(mj, model, data, CHANGED_ADVICE)
@@ -295,48 +300,44 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
                     raise CapabilityError(f"state {i}: {error}") from None
                 matrices[i] = matrix.lower
                 smooth[i] += 0.0 if matrix.change is None else matrix.change
-            # MuJoCo's own efc_vel also contains the velocities of moving surfaces.
-            mj.mj_mulJacVec(model, data, data.efc_vel, data.qvel)
-            rows_of_states[i + 1] = copy_rows(step)
+            blocks = single.make_blocks(step, data, 1)
+            rows_of_states[i] = *copy_rows(step, blocks), blocks
 
     run_on_threads(work, threads)
-    counts = [[len(ints), len(contacts)] for _, _, ints, contacts, _ in rows_of_states]
-    ptr, contact_ptr = np.cumsum(counts, axis=0, dtype=np.int64).T
-    jac, numbers, ints, contacts, friction = (
-        np.concatenate(arrays) for arrays in zip(*rows_of_states, strict=True)
+    order = sorted(rows_of_states)
+    jacs, numbers, contacts, blocks_of_states = (
+        list(zip(*(rows_of_states.pop(i) for i in order), strict=True)) or [()] * 4
     )
-    rows_of_states.clear()
+    counts, contact_counts = np.zeros(n + 1, np.int64), np.zeros(n, np.int64)
+    counts[np.array(order, int) + 1] = [len(jac) for jac in jacs]
+    contact_counts[np.array(order, int)] = contacts
+    ptr = np.cumsum(counts)
+    jac = np.concatenate([np.zeros((0, nv)), *jacs])
+    inv_compliance, aref, force, velocity, scale = np.concatenate([np.zeros((0, 5)), *numbers]).T
     triangles = (mass, *triangle) if not matrices else _merge_lower_triangles(matrices, mass, triangle)
-    contacts[:, 0] += np.where(contacts[:, 0] < 0, 0, np.repeat(ptr[:-1], np.diff(contact_ptr)))
-    row_type, (inv_compliance, aref, force, loss, velocity) = ints[:, 0], numbers.T
-    elliptic = (np.zeros(len(contacts), int), contacts[:, 0], contacts[:, 1], friction)
-    used_rows = np.ones((1, len(row_type)), bool)
-    has_elliptic = (row_type == ELLIPTIC).any()
-    cones, scale = _make_blocks(row_type[None], loss[None], used_rows, elliptic if has_elliptic else None, dt)
     target, compliance, lam = dt * aref + velocity, 1.0 / inv_compliance, dt * force
-    if scale is not None:
-        s = scale[0]
-        jac *= s[:, None]
-        target, compliance, lam = target * s, compliance * s * s, lam / s
+    if (scale != 1.0).any():
+        target, compliance, lam = target * scale, compliance * scale * scale, lam / scale
+    blocks = concatenate_blocks(list(blocks_of_states))
+    block_ptr, kind, *bounds = blocks.arrays
+    is_frictionless = (kind != ROW) & (np.diff(block_ptr) == 1)
+    cones = Cones._from_blocks(blocks)
+    if is_frictionless.any():
+        cones = Cones(block_ptr, np.where(is_frictionless, ROW, kind), *bounds)
+    free += dt * smooth
     batch = Batch(
-        jac,
-        triangles,
-        free + dt * smooth,
-        target=target,
-        cones=cones,
-        compliance=compliance,
-        friction="cone",
-        row_ptr=ptr,
+        jac, triangles, free, target=target, cones=cones, compliance=compliance, friction="cone", row_ptr=ptr
     )
+
+    blocks_of_worlds = dict(zip(order, blocks_of_states, strict=True))
 
     def name_blocks_of_world(i: int) -> Any:
-        row_ints, contact_ints = ints[ptr[i] : ptr[i + 1]], contacts[contact_ptr[i] : contact_ptr[i + 1]]
-        whole = [*row_ints.T, contact_ints[:, 1], contact_ints[:, 2:].ravel()]
-        return single._make_block_names(mj, model, np.concatenate(whole), len(row_ints), 1)
+        blocks = blocks_of_worlds.get(i)
+        m = 0 if blocks is None else blocks.n_rows
+        return [] if blocks is None else single.make_block_names(mj, model, blocks.ints[2 * m + 1 :], m, 1)
 
     batch.names_of = name_blocks_of_world
-    world = np.repeat(np.arange(n), np.diff(contact_ptr))
-    batch.contact_counts = np.bincount(world[contacts[:, 0] >= 0], minlength=n)
+    batch.contact_counts = contact_counts
     return Imported(batch, lam)
 
 

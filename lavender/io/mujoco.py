@@ -37,10 +37,12 @@ from lavender.io.mujoco_discrete import MASS_TOLERANCE, compute_discrete_matrix
 from lavender.io.mujoco_memory import CHANGED_ADVICE, OTHER_MODEL_ADVICE, read_step
 from lavender.problem import Names, Problem
 from lavender.problem.cones import Cones
-from lavender.problem.generalized import MIN_TREE_ORDERING_VELOCITIES, Generalized
+from lavender.problem.generalized import Generalized
 from lavender.problem.operators import MAX_SAFE_ENTRY
+from lavender_ext.core.checks import max_abs_of_array
+from lavender_ext.core.problem import LAWS, make_generalized_data
 from lavender_ext.io import mujoco_rows
-from lavender_ext.io.mujoco_step import Step
+from lavender_ext.io.mujoco_rows import Step
 
 COMPLIANCE_TOLERANCE = 1e-9  # Largest accepted |R D - 1| [-].
 # Largest accepted difference of a product with J from MuJoCo's stored result, relative to the size of its terms.
@@ -59,7 +61,6 @@ FLOAT32_ADVICE = (
     "of that engine (efc_J, efc_D, efc_aref, ...) to lavender.io.from_efc"
 )
 LAYOUT_NOTE = "(also if opt.jacobian, which determines the layout of efc_J, was changed)"
-NO_TRIANGLE = (np.zeros(1, np.int32), np.zeros(0, np.int32))
 
 
 def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
@@ -93,62 +94,43 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
         convergence: the problem does not depend on the answer.
     """
     step = read_step(model, data)
-    cache = step.cache
+    kept, dt = step.cache, _get_timestep(step)
     if step.has_noslip:
         name += " (noslip)"
-    if cache.is_plain:
-        parts = mujoco_rows.convert_regular_step(
-            step, cache.codes, cache.first_operator, MASS_TOLERANCE, SUM_TOLERANCE, MIN_INDEPENDENT_AXIS_FRACTION,
-            COMPLIANCE_TOLERANCE, MAX_SAFE_ENTRY,
-        )  # fmt: skip
-        if parts is not None:
-            rest = _make_postponed_fields, (cache.mj, model, parts)
-            problem: Problem = Problem._from_checked_data(parts[0], "cone", name, rest)
-            return problem
-    return Problem(**_convert_step(step, data), friction="cone", name=name, copy=False)
+    mass, change = _read_mass(step, data)
+    blocks = make_blocks(step, data)
+    jac = _read_jacobian(step, data, blocks)
+    b, compliance, v_free, is_regular, gap, gaps = mujoco_rows.compute_problem_numbers(
+        step, blocks, jac, _get_velocity_before(step), SUM_TOLERANCE, COMPLIANCE_TOLERANCE, MAX_SAFE_ENTRY
+    )
+    if not is_regular:
+        _check_jacobian(*gaps)
+        if not gap <= COMPLIANCE_TOLERANCE:
+            compliance = _compute_compliance(data) * get_row_scales(blocks) * get_row_scales(blocks)
+    general = Generalized.from_compressed_rows(jac, mass, v_free, like=kept.operator)
+    operator = kept.operator = general.operator
+    rest = kept.mj, model, blocks, b, compliance, general
+    if is_regular and change is None and not operator.has_entry_above(MAX_SAFE_ENTRY):
+        view = make_generalized_data(blocks, b, operator, compliance, LAWS["cone"])
+        problem: Problem = Problem._from_checked_data(view, "cone", name, (_make_fields, rest))
+        return problem
+    if change is not None:  # MuJoCo's own a0 is as accurate as opt.tolerance only.
+        b = mark_read_only(b - dt * general.velocity_of(change))
+        general = general.with_jacobian(v_free=v_free + dt * change)
+    return Problem(**_make_fields(*rest[:3], b, compliance, general), friction="cone", name=name, copy=False)
 
 
-def _make_postponed_fields(mj: Any, model: Any, parts: tuple[Any, ...]) -> dict[str, Any]:
-    """Return the fields of a problem from the result of `mujoco_rows.convert_regular_step`."""
-    _, blocks, operator, numbers = parts
-    m = blocks.n_rows
-    general = Generalized.from_operator(operator, numbers[2 * m : 2 * m + operator.n])
-    fields = {"b": numbers[:m], "generalized": general, "compliance": numbers[m : 2 * m]}
-    return fields | _make_block_fields(mj, model, blocks)
-
-
-def _make_block_fields(mj: Any, model: Any, blocks: Any) -> dict[str, Any]:
-    """Return the fields of a problem from the result of `mujoco_rows.make_blocks`."""
+def _make_fields(
+    mj: Any, model: Any, blocks: Any, b: FloatArray, compliance: FloatArray, general: Generalized
+) -> dict[str, Any]:
+    """Return the fields of a problem; `blocks` is the result of `mujoco_rows.make_blocks`."""
     m, numbers = blocks.n_rows, blocks.numbers
     first, count = len(numbers) - m, blocks.n_blocks
     return {
-        "cones": Cones._from_blocks(blocks), "key": numbers[first : first + count].view(np.uint64),
-        "names": Names(count, lambda: _make_block_names(mj, model, blocks.ints[2 * m + 1 :], m)),
+        "b": b, "generalized": general, "compliance": compliance, "cones": Cones._from_blocks(blocks),
+        "key": numbers[first : first + count].view(np.uint64),
+        "names": Names(count, lambda: make_block_names(mj, model, blocks.ints[2 * m + 1 :], m)),
     }  # fmt: skip
-
-
-def _convert_step(step: Step, data: Any) -> dict[str, Any]:
-    """Convert a step whose data are unusual or invalid, or the first step of a model; see `convert_regular_step`."""
-    kept = step.cache
-    like, dt = kept.first_operator, _get_timestep(step)
-    mass, change = _read_mass(step, data, NO_TRIANGLE if like is None else like.mass[:2])
-    blocks, scale = _make_blocks(step, data)
-    jac = _read_jacobian(step, data, scale)
-    rhs, compliance, v_free, gap, gaps = mujoco_rows.compute_problem_numbers(
-        step, jac, scale, _get_velocity_before(step)
-    )
-    _check_jacobian(*gaps)
-    if not gap <= COMPLIANCE_TOLERANCE:
-        compliance = _compute_compliance(data) * scale * scale
-    general = Generalized.from_compressed_rows(jac, mass, v_free, like=like)
-    if like is None:
-        kept.first_operator = general.operator
-        kept.is_plain = general.order is None and step.n < MIN_TREE_ORDERING_VELOCITIES
-    if change is not None:  # MuJoCo's own a0 is as accurate as opt.tolerance only.
-        rhs = mark_read_only(rhs - dt * general.velocity_of(change))
-        general = general.with_jacobian(v_free=v_free + dt * change)
-    fields = {"b": rhs, "generalized": general, "compliance": compliance}
-    return fields | _make_block_fields(kept.mj, step.model, blocks)
 
 
 @np.errstate(over="ignore", invalid="ignore")
@@ -170,8 +152,7 @@ def scaling(model: Any, data: Any) -> FloatArray:
     """
     step = read_step(model, data)
     _get_timestep(step)
-    scale: FloatArray = _make_blocks(step, data)[1]
-    return scale
+    return get_row_scales(make_blocks(step, data))
 
 
 def acceleration(model: Any, data: Any, impulse: Any) -> FloatArray:
@@ -191,8 +172,8 @@ def acceleration(model: Any, data: Any, impulse: Any) -> FloatArray:
 def jacobian(model: Any, data: Any) -> sp.csr_array:
     """Return J (m, nv) of all constraints, whether MuJoCo stores it densely or sparsely."""
     step = read_step(model, data)
-    indptr, indices, values = _read_jacobian(step, data, np.ones(step.m))
-    return sp.csr_array((values, indices, indptr), shape=(step.m, step.n))
+    indptr, indices, values = _read_jacobian(step, data, None)
+    return sp.csr_array((values.copy(), indices.copy(), indptr.copy()), shape=(step.m, step.n))
 
 
 def _get_timestep(step: Step) -> float:
@@ -202,10 +183,8 @@ def _get_timestep(step: Step) -> float:
     return dt
 
 
-def _read_mass(step: Step, data: Any, like: Any) -> tuple[Any, Any]:
+def _read_mass(step: Step, data: Any) -> tuple[Any, Any]:
     """Return the lower triangle of the step's matrix and the correction of a0 (nv,) or None; see `DiscreteMatrix`.
-
-    The index arrays `like` are reused if they are equal.
 
     Raises
     ------
@@ -217,15 +196,22 @@ def _read_mass(step: Step, data: Any, like: Any) -> tuple[Any, Any]:
             "M of this MjData is 0, because mj_forward(model, data) was not called: call it, or step the "
             "simulation"
         )
-    result = mujoco_rows.extract_lower_triangle_of_mass(step, MASS_TOLERANCE, like)
-    if result is None:
-        raise InputError(
-            f"M_rowadr, M_rownnz and M_colind do not describe a lower triangle of M. {OTHER_MODEL_ADVICE}"
-        )
+    kept = step.cache
+    copied = mujoco_rows.copy_mass(step, kept.pattern)
+    if copied is None:
+        kept.pattern = _find_mass_pattern(step.model)
+        copied = mujoco_rows.copy_mass(step, kept.pattern)
     if step.is_discrete:
-        matrix = compute_discrete_matrix(step.cache.mj, step.model, data, CHANGED_ADVICE)
+        matrix = compute_discrete_matrix(kept.mj, step.model, data, CHANGED_ADVICE)
         return matrix.lower, matrix.change
-    mass, gap = result
+    values, gap = copied
+    mass = *kept.pattern, values
+    if not gap <= MASS_TOLERANCE:
+        # The smooth force may be small, because its terms cancel.
+        lower = abs(sp.csr_array((values, kept.pattern[1], kept.pattern[0]), shape=(step.n, step.n)))
+        product = (lower + sp.triu(lower.T, 1)) @ np.abs(data.qacc_smooth)
+        size = max_abs_of_array(product + np.abs(data.qfrc_smooth))
+        gap *= max_abs_of_array(data.qfrc_smooth) / size if size > 0.0 else 1.0
     if not gap <= MASS_TOLERANCE:
         difference = f"M qacc_smooth differs from qfrc_smooth by {gap:.1e} of their size"
         if gap <= FLOAT32_GAP:
@@ -236,15 +222,38 @@ def _read_mass(step: Step, data: Any, like: Any) -> tuple[Any, Any]:
     return mass, None
 
 
-def _read_jacobian(step: Step, data: Any, scale: FloatArray) -> Any:
-    """Return (indptr, indices, data) of J, each row times `scale` (m,).
+def _find_mass_pattern(model: Any) -> tuple[IntArray, IntArray]:
+    """Return (indptr, indices) of the lower triangle of M.
+
+    Raises
+    ------
+    InputError
+        Rows of M are not consecutive, or their columns do not ascend to the diagonal entry.
+    """
+    count, columns = model.M_rownnz, mark_read_only(model.M_colind.copy())
+    indptr = np.append(0, np.cumsum(count)).astype(np.int32)
+    is_consecutive = np.all(count > 0) and np.array_equal(indptr, np.append(model.M_rowadr, len(columns)))
+    if (
+        not is_consecutive
+        or np.any(columns < 0)
+        or np.any(columns[indptr[1:] - 1] != np.arange(len(count)))
+        or np.any((np.diff(columns) <= 0)[~np.isin(np.arange(1, len(columns)), indptr)])
+    ):
+        raise InputError(
+            f"M_rowadr, M_rownnz and M_colind do not describe a lower triangle of M. {OTHER_MODEL_ADVICE}"
+        )
+    return mark_read_only(indptr), columns
+
+
+def _read_jacobian(step: Step, data: Any, blocks: Any) -> Any:
+    """Return (indptr, indices, data) of J with the scaled rows of the blocks, or with MuJoCo's rows.
 
     Raises
     ------
     InputError
         The arrays of efc_J have the wrong size or indices out of range.
     """
-    result = mujoco_rows.read_jacobian(step, scale)
+    result = mujoco_rows.read_jacobian(step, blocks)
     if isinstance(result, tuple):
         return result
     m, n, values = step.m, step.n, np.ravel(data.efc_J)
@@ -266,9 +275,10 @@ def _read_jacobian(step: Step, data: Any, scale: FloatArray) -> Any:
     # Some rows have unsorted or repeated columns.
     indptr = np.concatenate([[0], np.cumsum(count, dtype=np.int64)])
     source = np.arange(indptr[-1]) + np.repeat(first - indptr[:-1], count)
+    scale = np.ones(m) if blocks is None else get_row_scales(blocks)
     jac = sp.csr_array((values[source] * np.repeat(scale, count), columns[source], indptr), shape=(m, n))
     jac.sum_duplicates()
-    return jac.indptr.astype(np.int32), jac.indices.astype(np.int32), jac.data
+    return jac.indptr.astype(np.int32), jac.indices.astype(np.int32), mark_read_only(jac.data)
 
 
 @np.errstate(over="ignore", invalid="ignore")
@@ -341,8 +351,8 @@ def _check_jacobian(velocity: float, row: float, push: float, finite: float) -> 
             )
 
 
-def _make_blocks(step: Step, data: Any) -> tuple[Any, FloatArray]:
-    """Return the blocks and the factor of each row.
+def make_blocks(step: Step, data: Any, max_equality_rows: int = mujoco_rows.MAX_BLOCK_ROWS) -> Any:
+    """Return the blocks; see `mujoco_rows.make_blocks`.
 
     Raises
     ------
@@ -351,31 +361,37 @@ def _make_blocks(step: Step, data: Any) -> tuple[Any, FloatArray]:
     InputError
         An index is out of range, or a friction loss or coefficient is not a bound.
     """
-    codes = step.cache.codes
-    result = mujoco_rows.make_blocks(step, codes)
+    result = mujoco_rows.make_blocks(step, max_equality_rows)
     if isinstance(result, int):  # The number of the first invalid row.
-        kind, which, known = int(data.efc_type[result]), int(data.efc_id[result]), codes.tolist()
-        if kind not in known:
+        kind, which = int(data.efc_type[result]), int(data.efc_id[result])
+        model = step.model
+        counts = [model.neq, model.nv, model.ntendon, model.njnt, model.ntendon, *3 * [data.ncon]]
+        if not 0 <= kind < len(counts):
             raise CapabilityError(
                 f"constraint row {result} is of type {kind}, which is not supported: remove this constraint "
                 "from the model"
             )
-        code = known.index(kind)
-        count = step.type_counts[code]
-        dim = f", of condim {data.contact.dim[which]}" if code > 4 and 0 <= which < count else ""
+        is_contact = kind >= 5 and 0 <= which < data.ncon
+        dim = f", of condim {data.contact.dim[which]}" if is_contact else ""
         raise InputError(
             f"constraint row {result} of {step.m} is of type {kind} and belongs to number {which} of "
-            f"{count}{dim}, which does not exist or has fewer rows. {CHANGED_ADVICE}"
+            f"{counts[kind]}{dim}, which does not exist or has fewer rows. {CHANGED_ADVICE}"
         )
     if result.fault:
         raise InputError(
             f"efc_frictionloss, or the friction of a contact, is negative or not finite. {CHANGED_ADVICE}"
         )
-    return result, result.numbers[5 * step.m : 6 * step.m]
+    return result
 
 
-def _make_block_names(
-    mj: Any, model: Any, ints: IntArray, m: int, joined: int = mujoco_rows.MAX_EQUALITY_ROWS
+def get_row_scales(blocks: Any) -> FloatArray:
+    """Return the factor of each row (m,) of the blocks of `make_blocks`."""
+    scale: FloatArray = blocks.numbers[5 * blocks.n_rows : 6 * blocks.n_rows]
+    return scale
+
+
+def make_block_names(
+    mj: Any, model: Any, ints: IntArray, m: int, joined: int = mujoco_rows.MAX_BLOCK_ROWS
 ) -> list[str]:
     """Return the names of the blocks of m rows.
 
@@ -384,11 +400,11 @@ def _make_block_names(
     """
     types, ids, contacts = ints[:m].tolist(), ints[m : 2 * m].tolist(), (len(ints) - 2 * m) // 3
     dim, geom = ints[2 * m : 2 * m + contacts], ints[2 * m + contacts :].reshape(-1, 2)
-    kinds = mj.mjtConstraint
-    single_rows = {
-        int(kinds.mjCNSTR_FRICTION_TENDON): ("friction", "tendon"),
-        int(kinds.mjCNSTR_LIMIT_JOINT): ("limit", "joint"),
-        int(kinds.mjCNSTR_LIMIT_TENDON): ("limit", "tendon"),
+    words = {
+        1: ("friction", "joint"),
+        2: ("friction", "tendon"),
+        3: ("limit", "joint"),
+        4: ("limit", "tendon"),
     }
 
     def get_name(kind: str, i: int) -> str:
@@ -398,32 +414,24 @@ def _make_block_names(
     names: list[str] = []
     i = 0
     while i < m:
-        row_type, which = types[i], ids[i]
-        size, has_edges, part = 1, False, "edge"
-        if row_type == kinds.mjCNSTR_EQUALITY:
+        row_type, which = types[i], ids[i]  # row_type is a value of mjtConstraint.
+        size, part = 1, ""  # A constraint has a block for each row if its part has a name.
+        if row_type == 0:
             while i + size < m and types[i + size] == row_type and ids[i + size] == which:
                 size += 1
-            name, has_edges = get_name("equality", which), size > joined
-            # The rows of a flex belong to edges of its mesh, the rows of a weld to axes.
-            part = "edge" if size > mujoco_rows.MAX_EQUALITY_ROWS else "axis"
-        elif row_type == kinds.mjCNSTR_FRICTION_DOF:
-            joint = int(model.dof_jntid[which])
-            axis = which - int(model.jnt_dofadr[joint])
-            is_rotational = int(model.jnt_type[joint]) < int(mj.mjtJoint.mjJNT_SLIDE)
-            name = f"friction of {get_name('joint', joint)}" + (f", axis {axis}" if is_rotational else "")
-        elif row_type in single_rows:
-            word, kind = single_rows[row_type]
+            name = get_name("equality", which)
+            if size > joined:  # The rows of a flex belong to edges of its mesh, the rows of a weld to axes.
+                part = "edge" if size > mujoco_rows.MAX_BLOCK_ROWS else "axis"
+        elif row_type in words:
+            word, kind = words[row_type]
+            which = joint = int(model.dof_jntid[which]) if row_type == 1 else which
             name = f"{word} of {get_name(kind, which)}"
+            if row_type == 1 and int(model.jnt_type[joint]) < int(mj.mjtJoint.mjJNT_SLIDE):
+                name += f", axis {ids[i] - int(model.jnt_dofadr[joint])}"
         else:
-            sides = [
-                get_name("geom", g).removeprefix("geom ") if g >= 0 else "flex" for g in geom[which].tolist()
-            ]
-            name, has_edges = (
-                f"contact {which} ({', '.join(sides)})",
-                row_type == kinds.mjCNSTR_CONTACT_PYRAMIDAL,
-            )
-            if row_type != kinds.mjCNSTR_CONTACT_FRICTIONLESS:
-                size = 2 * (int(dim[which]) - 1) if has_edges else int(dim[which])
-        names += [f"{name}, {part} {k}" for k in range(size)] if has_edges else [name]
+            sides = [get_name("geom", g)[5:] if g >= 0 else "flex" for g in geom[which].tolist()]
+            name, part = f"contact {which} ({', '.join(sides)})", "edge" if row_type == 6 else ""
+            size = 1 if row_type == 5 else 2 * (int(dim[which]) - 1) if part else int(dim[which])
+        names += [f"{name}, {part} {k}" for k in range(size)] if part else [name]
         i += size
     return names

@@ -1,7 +1,8 @@
-"""Find the members of MuJoCo's C structs that `lavender_ext.io.mujoco_step` reads, and keep constant data."""
+"""Find the arrays of MuJoCo's C structs that `lavender_ext.io.mujoco_rows` reads, and keep constant data."""
 
 from __future__ import annotations
 
+import ctypes
 import re
 from functools import cache
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 
 from lavender.base.arrays import IntArray, mark_read_only
 from lavender.base.errors import InputError
-from lavender_ext.io.mujoco_step import MEMBERS, Step
+from lavender_ext.io.mujoco_rows import ARRAYS, Step
 
 CHANGED_ADVICE = "MjData was changed since its forward pass, or belongs to another model: run mj_forward"
 OTHER_MODEL_ADVICE = (
@@ -22,29 +23,30 @@ TYPE_SIZES = {
     "*": 8, "mjtNum": 8, "double": 8, "mjtSize": 8, "size_t": 8, "uintptr_t": 8, "uint64_t": 8, "int64_t": 8,
     "int": 4, "float": 4, "mjtBool": 1, "mjtByte": 1, "char": 1,
 }  # fmt: skip
-ROW_TYPES = (
-    "EQUALITY", "FRICTION_DOF", "FRICTION_TENDON", "LIMIT_JOINT", "LIMIT_TENDON", "CONTACT_FRICTIONLESS",
-    "CONTACT_PYRAMIDAL", "CONTACT_ELLIPTIC",
-)  # fmt: skip
-# A model with rows in compressed form and several contacts, whose members are read in both ways.
-PROBE = """<mujoco><option jacobian="sparse" noslip_iterations="3" timestep="0.003"/><worldbody>
+# A model with rows in compressed form and several contacts, whose arrays are read in both ways.
+PROBE = """<mujoco><option jacobian="sparse"/><worldbody>
 <geom type="plane" size="1 1 .1"/><body pos="0 0 .09"><freejoint/><geom type="box" size=".1 .1 .1"/></body>
 </worldbody></mujoco>"""
 
 
 class ModelCache:
-    """The module MuJoCo, its numbers of the types of rows, and the operator of a model's first problem.
+    """The module MuJoCo, its layout, and what problems of one model share.
 
-    Later problems share its index arrays if their patterns are equal. `is_plain` states that its velocities keep their
-    order.
+    Attributes
+    ----------
+    offsets, contact_layout
+        Results of `find_layout`.
+    pattern : (indptr, indices)
+        Pattern of the lower triangle of M.
+    operator : Operator or None
+        Operator of the last problem. Problems share index arrays if their patterns are equal.
     """
 
     def __init__(self, mj: Any) -> None:
         self.mj = mj
-        codes = [int(getattr(mj.mjtConstraint, f"mjCNSTR_{name}")) for name in ROW_TYPES]
-        self.codes = mark_read_only(np.array(codes, np.int32))
-        self.first_operator: Any = None
-        self.is_plain = False
+        self.offsets, self.contact_layout = find_layout(mj)
+        self.pattern: tuple[IntArray, IntArray] = (np.zeros(0, np.int32), np.zeros(0, np.int32))
+        self.operator: Any = None
 
 
 _MODELS: WeakKeyDictionary[Any, ModelCache] = WeakKeyDictionary()
@@ -66,9 +68,8 @@ def read_step(model: Any, data: Any) -> Step:
     if step is None or step.model is not model:
         step = _make_step(model, data)
     if not step.read(data):  # The arrays would exceed the allocated memory.
-        m, contacts, entries, size = step.counts
         raise InputError(
-            f"nefc is {m}, ncon is {contacts} and nJ is {entries}, which do not fit into the {size} "
+            f"nefc is {data.nefc}, ncon is {data.ncon} and nJ is {data.nJ}, which do not fit into the {data.parena} "
             f"bytes that this MjData has allocated. {CHANGED_ADVICE}"
         )
     return step
@@ -86,13 +87,12 @@ def _make_step(model: Any, data: Any) -> Step:
             f"the MjData has {len(data.qvel)} degrees of freedom and the model {model.nv}; both must belong "
             "together: create the data with mujoco.MjData(model)"
         )
+    nv, bodies = model.nv, model.nbody
+    sizes = (nv, nv, nv, nv, nv, len(model.M_colind), 6 * nv, 6 * bodies)
+    if any(getattr(data, name).size != size for name, size in zip(ARRAYS, sizes, strict=False)):
+        raise InputError(f"the arrays of the MjData have other sizes than the model. {OTHER_MODEL_ADVICE}")
     kept = _MODELS.get(model) or _MODELS.setdefault(model, ModelCache(mj))
-    try:
-        step = _STEPS[data] = Step(model, data, find_offsets(mj), mj.mj_isSparse, kept)
-    except ValueError:
-        raise InputError(
-            f"the arrays of the MjData have other sizes than the model. {OTHER_MODEL_ADVICE}"
-        ) from None
+    step = _STEPS[data] = Step(model, data, kept, list_addresses)
     return step
 
 
@@ -116,54 +116,53 @@ def import_mujoco() -> Any:
 
 
 @cache
-def find_offsets(mj: Any) -> IntArray | None:
-    """Return the `offsets` of `Step`; None if MuJoCo does not describe its structs, or the attributes differ."""
-    try:
-        from mujoco.introspect.structs import STRUCTS
+def find_layout(mj: Any) -> tuple[IntArray | None, tuple[int, ...]]:
+    """Return the offsets of ARRAYS in mjData, and of dim, geom and friction in a contact with its size [bytes].
 
-        layouts = {name: _lay_out(STRUCTS, name) for name in ("mjData", "mjContact", "mjOption")}
-        layouts["mjModel"] = _lay_out(STRUCTS, "mjModel", "opt")
-        found = [_find_member(mj, layouts, *member) for member in MEMBERS]
-    except (ImportError, KeyError, AttributeError):  # A type or struct is unknown.
-        return None
-    offsets = mark_read_only(np.array(found, np.int64))
+    The first result is None if MuJoCo does not describe its structs, or attributes have other addresses:
+    `list_addresses` then finds the arrays, which takes longer.
+    """
     model = mj.MjModel.from_xml_string(PROBE)
     data = mj.MjData(model)
     mj.mj_forward(model, data)
-    steps = [Step(model, data, x, mj.mj_isSparse, None) for x in (offsets, None)]
-    for step in steps:
-        step.read(data)
-    return offsets if data.ncon > 1 and steps[0].has_equal_members(steps[1]) else None
+    contact, addresses = data.contact, list_addresses(data)
+    members = [_get_address(x) for x in (contact.dim, contact.geom, contact.friction)]
+    layout = [address - members[0] for address in members] + [contact.dim.strides[0]]
+    try:
+        from mujoco.introspect.structs import STRUCTS
+
+        places = _lay_out(STRUCTS, "mjData")[0]
+        offsets = np.array([places[name] for name in ARRAYS], np.int64)
+    except (ImportError, KeyError, AttributeError):  # A type or struct is unknown.
+        return None, tuple(layout)
+    stored = [ctypes.c_int64.from_address(data._address + int(offset)).value for offset in offsets]
+    addresses[-1] = stored[-1]  # The first contact begins before its dim.
+    if not np.array_equal(stored, addresses) or not 0 <= members[0] - stored[-1] < layout[-1]:
+        return None, tuple(layout)
+    return mark_read_only(offsets), tuple([x + members[0] - stored[-1] for x in layout[:3]] + layout[3:])
 
 
-def _find_member(mj: Any, layouts: dict[str, Any], struct: str, name: str) -> tuple[int, int]:
-    """Return offset and size [bytes] of a member; -1 and 0 if this version does not have it."""
-    if not name:
-        return layouts[struct][1], 0
-    if name.startswith("opt."):
-        offset, size = layouts["mjOption"][0][name[4:]]
-        return layouts[struct][0]["opt"][0] + offset, size
-    if name in ("efm_active", "flg_surfacevel") and not hasattr(
-        getattr(mj, struct.replace("mj", "Mj")), name
-    ):
-        return -1, 0  # Older versions do not have this member.
-    return layouts[struct][0][name]
+def list_addresses(data: Any) -> IntArray:
+    """Return the addresses of ARRAYS (22,) from attributes; the last one is the address of the first contact's dim."""
+    arrays = [getattr(data, name) for name in ARRAYS[:-1]]
+    return np.array([_get_address(x) for x in (*arrays, data.contact.dim)], np.int64)
 
 
-def _lay_out(structs: Any, name: str, last: str = "") -> tuple[dict[str, tuple[int, int]], int, int]:
-    """Return offset and size [bytes] of each member of a C struct up to member `last`, then its size and alignment."""
+def _get_address(array: Any) -> int:
+    """Return the address of an array's first entry; 0 if the array is empty."""
+    return int(array.__array_interface__["data"][0]) if array.size else 0
+
+
+def _lay_out(structs: Any, name: str) -> tuple[dict[str, int], int, int]:
+    """Return the offset of each member of a C struct [bytes], then its size and alignment."""
     members, end, alignment = {}, 0, 1
     for field in structs[name].fields:
         text = str(field.type)
         kind = "*" if "*" in text else text.replace("const ", "").split(" ")[0]
-        if kind in TYPE_SIZES:
-            size = align = TYPE_SIZES[kind]
-        else:
+        size = align = TYPE_SIZES.get(kind, 0)
+        if not size:
             _, size, align = _lay_out(structs, kind)
-        offset = -(-end // align) * align
-        members[field.name] = offset, size
-        end = offset + size * int(np.prod([int(x) for x in re.findall(r"\[(\d+)\]", text)]))
+        members[field.name] = -(-end // align) * align
+        end = members[field.name] + size * int(np.prod([int(x) for x in re.findall(r"\[(\d+)\]", text)]))
         alignment = max(alignment, align)
-        if field.name == last:
-            break
     return members, -(-end // alignment) * alignment, alignment

@@ -126,12 +126,6 @@ class Generalized:
         return new
 
     @classmethod
-    def from_operator(cls, operator: kernels.Operator, v_free: FloatArray) -> Generalized:
-        """Build the object from a factored operator in the original order of velocities and a checked v* (nv,)."""
-        attributes = {"v_free": v_free, "names": None, "order": None, "operator": operator}
-        return make_instance(cls, attributes)
-
-    @classmethod
     def from_validated(cls, jac: Compressed, mass: Compressed) -> Generalized:
         """Build the object from checked compressed rows, without v* and without factoring M.
 

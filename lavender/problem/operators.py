@@ -39,7 +39,7 @@ class Operators(ProblemData):
 
     @classmethod
     def _from_checked_data(cls, view: Data, friction: str, name: str, rest: tuple[Any, Any]) -> Any:
-        """Build a problem over J and M without copies, from data that `lavender_ext.io.mujoco_rows` has checked.
+        """Build a problem over J and M without copies, from data that `lavender.io.mujoco` has checked.
 
         The arrays are read-only, and no entry of J and M^-1 exceeds `MAX_SAFE_ENTRY`. `rest` is a function and its
         arguments; the function returns b, cones, generalized, compliance, key and names when one of them is first read.

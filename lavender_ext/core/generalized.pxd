@@ -196,11 +196,8 @@ cdef inline void multiply_abs_whitened_panel(const generalized_t* g, int32_t pan
 cdef class Operator:
     cdef generalized_t g                # without panels and compliance
     cdef readonly int failed            # the row of M with a pivot that is not positive, or -1
-    cdef tuple jac_arrays, mass_arrays  # values of `jac` and `mass`, or None before they are first read
+    cdef readonly tuple jac, mass       # arrays (indptr, indices, data) of J, and of the lower triangle of M
     cdef list keep
 
-    cdef void share_memory(self, Operator like, int32_t m, numbers, ints, const double* jval, const double* mval)
-    cdef int64_t get_factor_size(self) noexcept
-    cdef void factor_into(self, double* numbers) noexcept
     cpdef bint has_entry_above(self, double bound)
     cdef bint has_pattern(self, int32_t n, const int32_t* mptr, const int32_t* midx)

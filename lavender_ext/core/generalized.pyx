@@ -60,8 +60,8 @@ cdef class Operator:
         cdef int32_t m = <int32_t>len(jptr_) - 1, n = <int32_t>len(mptr_) - 1
         cdef const int32_t* mptr = as_int_pointer(mptr_, n + 1)
         cdef const int32_t* midx = as_int_pointer(midx_, len(midx_))
-        self.jac_arrays = (jptr_, jidx_, jval_)
-        self.mass_arrays = (mptr_, midx_, mval_)
+        self.jac = (jptr_, jidx_, jval_)
+        self.mass = (mptr_, midx_, mval_)
         self.g.mptr, self.g.midx, self.g.mval = mptr, midx, as_double_pointer(mval_, len(mval_))
         self.g.n = n
         self.g.m = m
@@ -80,53 +80,15 @@ cdef class Operator:
             self.g.lidx = self.g.parent + 4 * n
         self.keep, self.failed = [marks], -1
 
-    cdef void share_memory(self, Operator like, int32_t m, numbers, ints, const double* jval, const double* mval):
-        """Set J (m, nv) and M in shared memory; M has the pattern of `like`.
-
-        The array `ints` holds the pointers (m + 1) and the columns of J; jval and mval point into the array `numbers`.
-        """
-        self.g = like.g
-        self.g.m, self.g.jval, self.g.mval = m, jval, mval
-        self.g.jptr = <int32_t*>(<ndarray>ints).data
-        self.g.jidx = self.g.jptr + m + 1
-        self.keep, self.failed = [like.keep[0], numbers, ints, like.mass], -1
-
-    @property
-    def jac(self):
-        """Arrays (indptr, indices, data) of J."""
-        cdef Py_ssize_t m = self.g.m, first
-        if self.jac_arrays is None:
-            numbers, ints = self.keep[1], self.keep[2]
-            first = self.g.jval - <double*>(<ndarray>numbers).data
-            self.jac_arrays = (ints[:m + 1], ints[m + 1:m + 1 + self.g.jptr[m]], numbers[first:first + self.g.jptr[m]])
-        return self.jac_arrays
-
-    @property
-    def mass(self):
-        """Arrays (indptr, indices, data) of the lower triangle of M."""
-        cdef Py_ssize_t first
-        if self.mass_arrays is None:
-            numbers, pattern = self.keep[1], self.keep[3]
-            first = self.g.mval - <double*>(<ndarray>numbers).data
-            self.mass_arrays = (pattern[0], pattern[1], numbers[first:first + self.g.mptr[self.g.n]])
-        return self.mass_arrays
-
-    cdef int64_t get_factor_size(self) noexcept:
-        """Return the number of doubles that `factor_into` needs."""
-        return 4 * <int64_t>self.g.n + self.g.lptr[self.g.n] + 1
-
-    cdef void factor_into(self, double* numbers) noexcept:
-        """Compute L and D in `numbers` (`get_factor_size`), and estimate the condition of M."""
+    def factor(self):
+        """Compute L and D, and estimate the condition of M."""
         cdef int32_t n = self.g.n
+        factor = new(4 * <int64_t>n + self.g.lptr[n] + 1)
+        cdef double* numbers = <double*>(<ndarray>factor).data
+        self.keep.append(factor)
         self.failed = factor_mass(&self.g, numbers + 2 * n, numbers, numbers + n)
         if self.failed < 0:
             self.g.condition = estimate_condition(&self.g, numbers + 2 * n + self.g.lptr[n] + 1)
-
-    def factor(self):
-        """Compute L and D, and estimate the condition of M."""
-        factor = new(self.get_factor_size())
-        self.keep.append(factor)
-        self.factor_into(<double*>(<ndarray>factor).data)
 
     def share_factor(self, Operator other):
         """Share L and D of another, factored operator with the same M."""

@@ -42,9 +42,6 @@ cdef void bind_derived_row_arrays(rows_t* r, const blocks_t* p, arena_t* a) noex
 cdef int bind_body_arrays(rows_t* r, const blocks_t* p, rows) except -1
 
 
-cdef Data bind_generalized_data(Blocks blocks, Operator operator, int law, const double* b, const double* compliance, list keep)
-
-
 cdef class Data:
     cdef blocks_t blocks
     cdef csr_t csr              # valid if A is given or formed

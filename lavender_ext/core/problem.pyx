@@ -573,15 +573,8 @@ def make_generalized_data(Blocks blocks, b, Operator operator, compliance, int l
 
     law is COULOMB or CONE; b (m,) [m/s], compliance (m,) [1/kg].
     """
-    cdef Py_ssize_t m = blocks.at.n_rows
-    return bind_generalized_data(blocks, operator, law, as_double_pointer(b, m), as_double_pointer(compliance, m),
-                                 [blocks, b, operator, compliance])
-
-
-cdef Data bind_generalized_data(Blocks blocks, Operator operator, int law, const double* b, const double* compliance, list keep):
-    """Create the data of `make_generalized_data`, which keeps the objects `keep` alive."""
     cdef Data data = Data.__new__(Data)
-    data.keep = keep
+    data.keep = [blocks, b, operator, compliance]
     data.blocks = blocks.at
     data.blocks.law = law
     data.general = operator.g
@@ -589,7 +582,8 @@ cdef Data bind_generalized_data(Blocks blocks, Operator operator, int law, const
     data.single_rows = blocks.single_rows
     data.reference_energy = data.reference_velocity = data.relative_at_zero = -1.0
     data.empty, data._arrays = _NONE, [None, None, None]
-    data.blocks.b, data.general.compliance = b, compliance
+    data.blocks.b = as_double_pointer(b, blocks.at.n_rows)
+    data.general.compliance = as_double_pointer(compliance, blocks.at.n_rows)
     return data
 
 

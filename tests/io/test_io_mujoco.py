@@ -394,26 +394,44 @@ def test_solve_of_an_imported_step_leaves_its_fields_postponed():
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
 def test_from_mujoco_without_a_description_of_structs_reads_attributes(monkeypatch, cone, jacobian):
     model, data = state(cone, condim=4, jacobian=jacobian)
-    assert mujoco_memory.find_offsets(mj) is not None
+    assert mujoco_memory.find_layout(mj)[0] is not None
     from_memory = lv.io.from_mujoco(model, data)
-    monkeypatch.setattr(mujoco_memory, "find_offsets", lambda _: None)
-    other = copy.copy(data)
+    states = np.r_[data.qpos, data.qvel][None]
+    many = lv.io.from_mujoco_many(model, states)
+    monkeypatch.setitem(mujoco_memory.TYPE_SIZES, "size_t", 16)
+    layout = mujoco_memory.find_layout.__wrapped__(mj)
+    monkeypatch.setattr(mujoco_memory, "find_layout", lambda _: layout)
+    model, other = copy.copy(model), copy.copy(data)
     assert lv.io.from_mujoco(model, other) == from_memory
     assert np.array_equal(adapter.impulse(model, other), adapter.impulse(model, data))
+    assert np.array_equal(lv.io.from_mujoco_many(model, states).impulse, many.impulse)
     other.nefc = 2**30
     with pytest.raises(lv.InputError, match="do not fit into"):
         lv.io.from_mujoco(model, other)
 
 
-def test_find_offsets_of_an_unknown_type_returns_none(monkeypatch):
+def test_find_layout_of_an_unknown_type_returns_no_offsets(monkeypatch):
     monkeypatch.setattr(mujoco_memory, "TYPE_SIZES", {"int": 4})
-    assert mujoco_memory.find_offsets.__wrapped__(mj) is None
+    assert mujoco_memory.find_layout.__wrapped__(mj)[0] is None
 
 
-def test_find_offsets_of_another_layout_returns_none(monkeypatch):
+def test_find_layout_of_another_layout_returns_no_offsets(monkeypatch):
     """Offsets that do not lead to the arrays of the attributes are not used."""
     monkeypatch.setitem(mujoco_memory.TYPE_SIZES, "size_t", 16)
-    assert mujoco_memory.find_offsets.__wrapped__(mj) is None
+    assert mujoco_memory.find_layout.__wrapped__(mj)[0] is None
+
+
+@pytest.mark.parametrize("n_rows", [1, 2])
+def test_rows_claimed_without_a_forward_pass_are_refused(n_rows):
+    """A pass without constraints leaves no arrays of rows, though the arena has memory in use."""
+    model = mj.MjModel.from_xml_string(
+        "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>"
+    )
+    data = mj.MjData(model)
+    mj.mj_forward(model, data)
+    data.nefc = n_rows
+    with pytest.raises(lv.InputError, match="do not fit into"):
+        lv.io.from_mujoco(model, data)
 
 
 @pytest.mark.parametrize("name", ["nefc", "ncon", "nJ"])

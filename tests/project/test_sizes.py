@@ -35,7 +35,7 @@ BUDGETS = {
     "lavender_ext/driver lavender_ext/host": (250, 0),
     "lavender_ext/engine": (2650, 0),
     "lavender_ext/factor": (2600, 3260),
-    "lavender_ext/io": (480, 901),
+    "lavender_ext/io": (450, 472),
     "lavender_ext/judge": (2300, 2740),
     "lavender_ext/local": (950, 1100),
     "lavender_ext/newton lavender_ext/velocity_newton": (4700, 7950),
