@@ -7,14 +7,13 @@ A, are computed when the world is solved.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, overload
 
 import numpy as np
 
 from lavender.base.arrays import (
-    FLOAT_DTYPES,
     ArrayLike,
     FloatArray,
     as_array,
@@ -22,23 +21,18 @@ from lavender.base.arrays import (
     check_choice,
     check_nonnegative_magnitudes,
     check_sequence,
-    check_unmasked,
     get_common_precision,
-    get_shape,
     resolve_index,
 )
 from lavender.base.errors import InputError
 from lavender.problem import FRICTION_LAWS, Problem
 from lavender.problem.cones import Cones
 from lavender.problem.generalized import MAX_ASYMMETRY, MAX_ASYMMETRY_FLOAT32
-from lavender.problem.rows import Rows
 from lavender_ext.batch.many import PLACE, Worlds
 from lavender_ext.core.checks import are_lower_triangles_valid, are_pointers_valid
 from lavender_ext.core.problem import LAWS, clip_zero_to_bounds
 
 ERRORS = ("raise", "status")
-BODY_FIELDS = ("inv_mass", "inv_inertia", "v_free", "jac", "normal", "tangent", "arm_a", "arm_b")
-BODY_PAIRS = ("joint_body", "contact_body")
 #: Offsets and sizes of a world, as the kernels number them.
 WORLD = np.dtype([(name, np.int64) for name in sorted(PLACE, key=PLACE.__getitem__)])
 
@@ -166,109 +160,10 @@ class Batch(Sequence[Problem]):
         soft, at["soft"], _ = _flatten("compliance", compliance, n, row_shape, sizes)
         self._arrays: Any = (jac, mass, free, goal, soft, self._flatten_mu(mu))
 
-    # -- other constructors ----------------------------------------------------------------------------
-
-    @classmethod
-    def of_matrices(
-        cls,
-        A: Any,
-        b: ArrayLike,
-        *,
-        cones: Cones | Sequence[Cones],
-        mu: Any = None,
-        friction: str = "coulomb",
-    ) -> Batch:
-        """Build a batch of matrix problems; each becomes a `Problem` when it is solved.
-
-        Parameters
-        ----------
-        A : (n, m, m) 1/kg
-        b : (n, m) m/s
-        cones, mu, friction
-            As for `Batch`.
-        """
-        matrix, rhs = as_float_array("A", A), as_float_array("b", b)
-        if matrix.ndim != 3 or matrix.shape[1] != matrix.shape[2] or rhs.shape != matrix.shape[:2]:
-            raise InputError(f"A has shape {matrix.shape} and b {rhs.shape}; (n, m, m) and (n, m) are needed")
-        n, m = rhs.shape
-        batch = cls._make_empty(n, m, friction, get_common_precision(matrix, rhs))
-        batch._set_cones(cones)
-        flat, batch.at["jac"], batch._jac_row = _flatten("A", matrix, n, (m, m), None)
-        goal, batch.at["target"], _ = _flatten("b", rhs, n, (m,), None)
-        batch._arrays = flat, None, None, goal, None, batch._flatten_mu(mu)
-        return batch
-
-    @classmethod
-    def of_bodies(cls, fields: Mapping[str, Any], **bounds: Any) -> Batch:
-        """Build a batch of problems with bodies, from fields of `Rows` and bounds of `Problem.from_rows`.
-
-        Parameters
-        ----------
-        fields : mapping
-            `inv_mass` (n, bodies), `v_free` (n, bodies, 6), `normal` (n, c, 3), ... An array with the dimensions of
-            one world, such as `contact_body` (c, 2), is used for all worlds. At least one array is stacked.
-        **bounds
-            `target`, `mu`, ..., each (m,) for all worlds or (n, m); and keywords such as friction.
-
-        Raises
-        ------
-        InputError
-            A field does not exist, or stacked arrays have different lengths or are missing.
-        """
-        n_axes = {"inv_mass": 1, "inv_inertia": 3, "v_free": 2, "jac": 2, "joint_ptr": 1, "joint_body": 2, "normal": 2,
-                  "tangent": 2, "arm_a": 2, "arm_b": 2, "contact_body": 2}  # fmt: skip
-        if not isinstance(fields, Mapping):
-            raise InputError(f"fields is {fields!r:.60}; a mapping of arrays of Rows is needed")
-        unknown = set(fields) - set(n_axes)
-        if unknown:
-            raise InputError(
-                f"fields has the unknown names {sorted(unknown)}; the arrays of Rows are {', '.join(n_axes)}"
-            )
-        for name, x in (*fields.items(), *bounds.items()):
-            get_shape(name, x)
-            check_unmasked(name, x)
-        arrays = {name: np.asarray(x) for name, x in fields.items()}
-        more = {name: np.asarray(x) if np.ndim(x) else x for name, x in bounds.items() if x is not None}
-        lengths = {len(x) for name, x in arrays.items() if x.ndim == n_axes[name] + 1}
-        lengths |= {len(x) for x in more.values() if isinstance(x, np.ndarray) and x.ndim == 2}
-        if len(lengths) != 1:
-            raise InputError(
-                f"the stacked arrays have {sorted(lengths) or 'no'} worlds; at least one array with a first "
-                "axis of worlds is needed, and all such arrays must have the same number of worlds"
-            )
-        n = lengths.pop()
-        batch = cls._make_empty(n, 0, more.get("friction", "coulomb"), "float64")
-        batch._bodies = arrays, more, {name for name, x in arrays.items() if x.ndim > n_axes[name]}
-        if n:
-            first = batch[0]
-            batch.precision = first.precision
-            batch._set_equal_sizes(first.m, 6 * first.rows.n_bodies if first.rows is not None else 0)
-            batch.at["blocks"] = first.cones.n_blocks
-        return batch
-
-    @classmethod
-    def _make_empty(cls, n: int, m: int, friction: Any, precision: str) -> Batch:
-        """Build a batch of n worlds with m rows and no arrays."""
-        batch: Batch = object.__new__(cls)
-        friction = check_choice("friction", friction, FRICTION_LAWS)
-        batch._n, batch.friction, batch.precision, batch._arrays = n, friction, precision, None
-        batch._set_equal_sizes(m, 0)
-        return batch
-
-    def _set_equal_sizes(self, m: int, nv: int) -> None:
-        """Set shapes and offsets of worlds with m rows and nv velocities each."""
-        self.shape, self.velocity_shape = (self._n, m), (self._n, nv)
-        self.at, i = np.zeros(self._n, WORLD), np.arange(self._n)
-        self.at["rows"], self.at["row"], self.at["velocities"], self.at["velocity"] = m, m * i, nv, nv * i
-
     # Function that returns the names of a world's blocks.
     names_of: Callable[[int], Sequence[str]] | None = None
     contact_counts: np.ndarray | None = None  # (n,) Number of contacts with rows; None if it is not known.
     _has_shared_cones = True
-    _pattern: tuple[np.ndarray, np.ndarray] | None = None
-    _jac_row = _mass_row = 0
-    # Arguments of `of_bodies`: fields, bounds, and the names of the stacked fields.
-    _bodies: tuple[dict[str, Any], dict[str, Any], set[str]] | None = None
 
     # -- blocks ----------------------------------------------------------------------------------------
 
@@ -351,31 +246,13 @@ class Batch(Sequence[Problem]):
         i = resolve_index(i, self._n)
         if isinstance(i, list):
             return [self[j] for j in i]
-        if self._bodies is not None:
-            return self._make_body_problem(i, *self._bodies)
         world = dict(zip(WORLD.names, self.at[i].item(), strict=True))  # type: ignore[arg-type]
         jac, mass, free, target, compliance, mu = (self._get_array_of_world(world, k) for k in range(6))
         cones = self._get_cones_of_world(i, None if mu is None else as_array("mu", mu, (None,)))
-        if mass is None:
-            return Problem(target, cones, jac, friction=self.friction, precision=self.precision)
         return Problem.from_jacobian(
             jac, mass, free, target=target, cones=cones, compliance=compliance, friction=self.friction,
             precision=self.precision, names=None if self.names_of is None else self.names_of(i),
         )  # fmt: skip
-
-    def _make_body_problem(
-        self, i: int, arrays: dict[str, Any], more: dict[str, Any], stacked: set[str]
-    ) -> Problem:
-        """Build the problem of world i from the arguments of `of_bodies`."""
-        fields: dict[str, Any] = {name: x[i] if name in stacked else x for name, x in arrays.items()}
-        bounds: dict[str, Any] = {name: x[i] if np.ndim(x) == 2 else x for name, x in more.items()}
-        problem = Problem.from_rows(Rows(**fields), **bounds)
-        if i and problem.m != self.shape[1]:
-            raise InputError(
-                f"this world has {problem.m} rows, the first world {self.shape[1]}; all worlds need the "
-                "same number: give tangents=, because contacts with mu 0 have no tangents by default"
-            )
-        return problem
 
     def _get_array_of_world(self, world: dict[str, int], which: int) -> Any:
         """Return an array of a world (0: J, 1: M, 2: v*, 3: target, 4: compliance, 5: mu), or None."""
@@ -388,8 +265,6 @@ class Batch(Sequence[Problem]):
             row, dense = np.repeat(np.arange(nv), np.diff(ptr)), np.zeros((nv, nv), array.dtype)
             dense[row, col] = dense[col, row] = array[first : first + len(col)]
             return dense
-        if self._arrays[1] is None:
-            nv = m  # In a batch of matrices, the first array is A (m, m) instead of J (m, nv).
         if which < 2:
             rows, stride = ((m, self._jac_row), (nv, self._mass_row))[which]
             if not rows * nv:
@@ -405,8 +280,6 @@ class Batch(Sequence[Problem]):
 
     def start(self, i: int) -> FloatArray:
         """Return the zero impulse (m,) [N s] of world i, clipped to its bounds."""
-        if self._arrays is None:
-            return self[i].start()
         first = int(self.at[i]["cone_row"])
         rows = slice(first, first + int(self.at[i]["rows"]))
         return clip_zero_to_bounds(self.cones.lower[rows], self.cones.upper[rows])
@@ -419,52 +292,14 @@ class Batch(Sequence[Problem]):
     def make_kernel_worlds(self, impulse: FloatArray, velocity: FloatArray, cold: bool) -> Worlds:
         """Build the data of the compiled loop, which writes results to the flat arrays `impulse` and `velocity`."""
         worlds = Worlds(convert_table_for_kernel(self.at), impulse, velocity, cold)
-        if self._bodies is not None and (body_arrays := self._get_body_arrays()):
-            worlds.set_from_bodies(*body_arrays)
-        elif self._arrays is None or self.cones.has_ellipse:
+        if self.cones.has_ellipse:
             worlds.set_from_problems([], [None] * len(self), [])
         else:
-            is_single = self._arrays[1] is not None and self._arrays[1].dtype == np.float32
+            is_single = self._arrays[1].dtype == np.float32
             strides, law = (self._jac_row, self._mass_row), LAWS[self.friction]
             asymmetry = MAX_ASYMMETRY_FLOAT32 if is_single else MAX_ASYMMETRY
             worlds.set_from_arrays(self._arrays, strides, self._pattern, self.cones._blocks, law, asymmetry)
         return worlds
-
-    def _get_body_arrays(self) -> Any:
-        """Return the body arrays for the compiled loop, or None if the worlds do not share one layout."""
-        arrays, more, _ = self._bodies  # type: ignore[misc]
-        stacked = {name for name, x in more.items() if np.ndim(x) == 2}
-        if not stacked <= {"target", "compliance", "mu"} or "guess" in more or not len(self):
-            return None
-        try:
-            first = self[0]
-        except InputError:
-            return None
-        rows, n, mu = first.rows, len(self), more.get("mu", 0.0)
-        if rows is None or first.m != self.shape[1] or np.ndim(arrays.get("joint_ptr", 0)) == 2:
-            return None
-        if "mu" in stacked and (mu.shape[1] != rows.n_contacts or ((mu > 0.0) != (mu[0] > 0.0)).any()):
-            return None
-        # Arrays of the first world, which are used for all worlds unless they are stacked.
-        of_first: dict[str, Any] = {name: getattr(rows, name) for name in (*BODY_FIELDS, *BODY_PAIRS)}
-        goal = 0.0 if "target" in stacked else more.get("target", 0.0)
-        of_first["target"] = np.array(np.broadcast_to(goal, first.m), float)
-        of_first |= {"compliance": first.compliance, "mu": first.cones.mu[rows.n_joints :]}
-        with_stride = {}
-        for name, default in of_first.items():
-            x, dtype = {**arrays, **more}.get(name, default), np.int32 if name in BODY_PAIRS else np.float64
-            if np.ndim(x) <= default.ndim:
-                with_stride[name] = np.ascontiguousarray(default), 0
-            elif x.shape == (n, *default.shape) and (
-                x.dtype in FLOAT_DTYPES if dtype is np.float64 else _are_int32_indices(x)
-            ):
-                with_stride[name] = np.ascontiguousarray(x, dtype), default.size
-            else:
-                return None
-        fields = [with_stride[name] for name in (*BODY_FIELDS, "target", "compliance", "mu")]
-        pairs = [with_stride[name] for name in BODY_PAIRS]
-        sizes = rows.n_bodies, rows.n_joints, rows.n_contacts
-        return fields, pairs, *sizes, first.cones._blocks, LAWS[first.friction]
 
     def __repr__(self) -> str:
         return f"<Batch of {self._n} worlds, impulses {self.shape}, {self.precision}>"
@@ -476,11 +311,6 @@ class Batch(Sequence[Problem]):
 def convert_table_for_kernel(at: np.ndarray) -> np.ndarray:
     """Return a table of worlds (n,) as the kernels read it, (n, fields) int64, without a copy."""
     return at.view(np.int64).reshape(len(at), len(PLACE))
-
-
-def _are_int32_indices(x: np.ndarray) -> bool:
-    """Return whether all entries are integers of 32 bits."""
-    return x.dtype.kind == "i" and (x.itemsize <= 4 or bool(((x >= -(2**31)) & (x < 2**31)).all()))
 
 
 def _compute_offsets(sizes: Any) -> np.ndarray:

@@ -65,7 +65,7 @@ from lavender.base.arrays import (
 )
 from lavender.base.errors import InputError
 from lavender.problem import PRECISIONS, Problem, check_problem
-from lavender.problem.derived import cached_property
+from lavender.problem.derived import cached_property, late_field
 from lavender_ext.core.checks import make_instance
 from lavender_ext.judge import measure
 
@@ -188,6 +188,10 @@ class Residual:
     threshold: float = DEFAULT_THRESHOLD
     # Relative residual before the refinement for an ill-conditioned M.
     _float64_relative: float = field(default=math.nan, repr=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        self.error  # noqa: B018 - computes the rows, because a raw judge pass cannot be pickled
+        return self.__dict__
 
     @property
     def at_floor(self) -> bool:
@@ -544,9 +548,7 @@ def refine_residual(problem: Problem, judged: measure.Judged, tol: float) -> Res
 
 def make_residual(problem: Problem, judgement: measure.Judged) -> Residual:
     """Build a `Residual` from a raw judge pass."""
-    error, slack = judgement.error, judgement.slack
-    error.setflags(write=False)
-    slack.setflags(write=False)
+    data = judgement.data
     fields = {
         "relative": judgement.relative,
         "energy": judgement.energy,
@@ -556,14 +558,22 @@ def make_residual(problem: Problem, judgement: measure.Judged) -> Residual:
         "worst_island": judgement.island,
         "floor_energy": judgement.floor_energy,
         "worst_row": judgement.worst,
-        "energy_at_zero": problem.metric.reference_energy,
-        "velocity_at_zero": problem.metric.reference_velocity,
-        "error": error,
-        "slack": slack,
+        "energy_at_zero": data.reference_energy,
+        "velocity_at_zero": data.reference_velocity,
         "_problem": problem,
         "_impulse": judgement.impulse,
         "precision": "float64",
         "rounding": None,
         "_float64_relative": judgement.float64_relative,
+        "_rest": (_read_rows, (judgement,)),
     }
     return make_instance(Residual, fields)
+
+
+def _read_rows(judgement: measure.Judged) -> dict[str, FloatArray]:
+    """Return the fields of a `Residual` that have one number for each row."""
+    return {"error": mark_read_only(judgement.error), "slack": mark_read_only(judgement.slack)}
+
+
+for _name in ("error", "slack"):
+    setattr(Residual, _name, late_field(_name))

@@ -96,16 +96,19 @@ class late_field:
     """A field of a dataclass that is computed, if it was not set, when it is first read; set after the decoration.
 
     The attribute `_rest` of the object is a function and its arguments; the function returns the late fields by name.
+    `_late_<name>` is a function and its arguments that compute one field without the others.
     """
 
     def __init__(self, name: str) -> None:
-        self.name = name
+        self.name, self.own = name, f"_late_{name}"
 
     def __get__(self, instance: Any, owner: type) -> Any:
-        """Compute all fields that were not set, and return this one."""
+        """Compute this field, or all fields that were not set, and return this one."""
         if instance is None:
             return self
         attributes = instance.__dict__
+        if (own := attributes.get(self.own)) is not None:
+            return attributes.setdefault(self.name, own[0](*own[1]))
         rest = attributes.get("_rest")
         if rest is not None:
             function, arguments = rest

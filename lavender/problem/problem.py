@@ -16,6 +16,7 @@ from lavender.problem.builders import Builders
 from lavender.problem.cones import Cones
 from lavender.problem.derived import computed_once
 from lavender_ext.core.checks import MIN_MAGNITUDE
+from lavender_ext.small.carry import carry_impulses_by_key
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,14 +142,14 @@ class Problem(Builders):
             if before.key is None:
                 raise InputError("the problem of the previous step has no keys: build it with key=")
             return replace(self, key=keys, copy=False).carry((before, impulse))
-        for name, problem in (("this problem", self), ("the previous one", before)):
-            if problem.key is not None and len(set(problem.key.tolist())) < len(problem.key):
+        start, *repeated = self._carry(before, impulse)
+        for name, problem, repeats in zip(("this problem", "the previous one"), (self, before), repeated):  # noqa: B905
+            if repeats:
                 values, counts = np.unique(problem.key, return_counts=True)
                 raise InputError(
                     f"key {values[counts.argmax()]} of {name} names {counts.max()} blocks, so that impulses cannot be "
                     "assigned: give each block a key of its own"
                 )
-        start = self._carry(before, impulse)
         if start is None:
             keyless = " and ".join(
                 name for name, p in (("this problem", self), ("the previous one", before)) if p.key is None
@@ -160,23 +161,14 @@ class Problem(Builders):
             )
         return start
 
-    def _carry(self, before: Problem, impulse: FloatArray) -> FloatArray | None:
-        """Build a start as `carry` does; None if a problem has no keys and the blocks differ."""
-        old_cones, new_cones = before.cones, self.cones
+    def _carry(self, before: Problem, impulse: FloatArray) -> tuple[FloatArray | None, bool, bool]:
+        """Return a start as `carry` does or None, and whether this problem and `before` repeat a key."""
+        old, new = before.cones, self.cones
         if self.key is None or before.key is None:
-            same_kind = np.array_equal(old_cones.kind, new_cones.kind)
-            return impulse.copy() if same_kind and np.array_equal(old_cones.ptr, new_cones.ptr) else None
+            is_same = np.array_equal(old.kind, new.kind) and np.array_equal(old.ptr, new.ptr)
+            return (impulse.copy() if is_same else None), False, False
         start = self.start()
-        old_block_of = {key: block for block, key in enumerate(before.key.tolist())}
-        for block, key in enumerate(self.key.tolist()):
-            old_block = old_block_of.get(key)
-            if old_block is None or old_cones.kind[old_block] != new_cones.kind[block]:
-                continue
-            new_rows = slice(new_cones.ptr[block], new_cones.ptr[block + 1])
-            old_rows = slice(old_cones.ptr[old_block], old_cones.ptr[old_block + 1])
-            if new_rows.stop - new_rows.start == old_rows.stop - old_rows.start:
-                start[new_rows] = impulse[old_rows]
-        return start
+        return start, *carry_impulses_by_key(old._blocks, before.key, impulse, new._blocks, self.key, start)
 
     # -- other forms -----------------------------------------------------------------------------
 

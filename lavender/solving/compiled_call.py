@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
+from lavender.judge.residuals import make_residual
 from lavender.judge.solution import CONVERGED, TIME_LIMIT, Claim, Solution, Status
 from lavender.problem import Problem
 from lavender.solvers.costs import (
@@ -50,11 +51,7 @@ def get_call_time_fraction(problem: Problem, seconds: float) -> float:
 
 
 def solve_small(
-    problem: Problem,
-    spec: SolverSpec,
-    impulse: Any,
-    tol: float,
-    limit: float = math.inf,
+    problem: Problem, spec: SolverSpec, impulse: Any, tol: float, limit: float = math.inf
 ) -> tuple[Solution | None, tuple[int, ...] | None]:
     """Solve and judge a small problem, which `spec._tries_compiled_call`, by one compiled call.
 
@@ -104,7 +101,7 @@ def solve_small(
         if limit == math.inf or fraction < 1.0 or judged.relative == judged.roundoff_floor:
             # `Prepared` continues: time remains, or the impulses are so large that rounding hides b.
             return None, counts
-        status, judged = TIME_LIMIT, select_best_impulse(problem, judged, first, tol)
+        status, judged = TIME_LIMIT, select_best_impulse(problem, judged, first, tol).refine(math.inf)
         judged.impulse.setflags(write=False)
     # Copy the start, because the caller may change the array later.
     start_point = first if first is None or impulse is None else first.copy()
@@ -114,6 +111,7 @@ def solve_small(
         tol,
         perf_counter() - start,
         (compute_postponed_fields, (problem, spec, judged, counts, start_point, status)),
+        (make_residual, (problem, judged)),
     )
     return solution, None
 
@@ -132,4 +130,4 @@ def compute_postponed_fields(
     else:
         claim = spec.small.make_claim(problem, counts, start, judged.relative, status)
     run = FinishedRun(problem, spec, {}, judged.impulse, claim, tol=0.0)
-    return make_fields(run, judged.refine(math.inf))
+    return make_fields(run, judged)

@@ -141,7 +141,8 @@ def finish(run: FinishedRun) -> Solution:
     values = {"impulse": impulse, "tol": tol, "setup_time": run.setup_time, "solve_time": run.solve_time}
     if claim.status is CONVERGED and judged.relative <= tol and not run.refutation:
         # The other fields are computed when one of them is first read.
-        values |= {"status": CONVERGED, "_rest": (make_fields, (run, judged))}
+        late = make_residual, (problem, judged)
+        values |= {"status": CONVERGED, "_late_residual": late, "_rest": (make_fields, (run, judged))}
     else:
         verdict = check_claim(run, make_residual(problem, judged))
         values = make_fields(run, judged, verdict) | values | {"status": verdict.status}
@@ -241,7 +242,7 @@ def create_unjudged(
     keeps_start = keeps_start or tol == 0.0 or are_bit_identical(start, problem._start)
     claim = Claim(TIME_LIMIT, 0, {}, message)
     late = judge_late_fields, (problem, spec, options, start, claim, tol, keeps_start)
-    solution = Solution.with_late_fields(start, TIME_LIMIT, tol, 0.0, late, setup_time)
+    solution = Solution.with_late_fields(start, TIME_LIMIT, tol, 0.0, late, setup_time=setup_time)
     if not keeps_start:
         del solution.__dict__["impulse"]
     return solution

@@ -24,9 +24,8 @@ from lavender_ext.batch.task cimport (copy_small_judgement, compute_missing_deri
 from lavender_ext.small.limits cimport estimate_newton_cost_terms, limits_t, max_newton_cost, newton_cost_t
 from lavender_ext.small.workspace cimport grow_workspace_to, free_workspace
 from lavender_ext.batch.world cimport (BAD, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, LATE, LEFT, MASS, MU, N_ARRAYS, PLACES, READY,
-                                       AT_ROW, FIELDS, ROWS, SOFT, STARTED, TARGET, TRIED, VELOCITIES, VELOCITY,
-                                       worker_scratch_t, convert_body_world, convert_matrix_world, convert_generalized_world,
-                                       worlds_t)
+                                       AT_ROW, ROWS, SOFT, STARTED, TARGET, TRIED, VELOCITIES, VELOCITY, worker_scratch_t,
+                                       convert_generalized_world, worlds_t)
 from lavender_ext.judge.measure cimport set_zero_impulse, make_judged, count_judge_scratch
 from lavender_ext.judge.rounding cimport float32_floor_of_score, compute_squared_float32_rounding
 from lavender_ext.judge.tally cimport compute_rhs_energy_norm
@@ -280,7 +279,7 @@ cdef class Worlds:
         if pattern is not None:
             ptr, col = pattern
             self.w.mass_ptr, self.w.mass_col = &ptr[0], &col[0]
-        self.w.blocks, self.w.asymmetry, self.w.general = blocks.at, asymmetry, arrays[1] is not None
+        self.w.blocks, self.w.asymmetry = blocks.at, asymmetry
         self.w.blocks.law = law
         self.w.jac_row_stride, self.w.mass_row = strides
         self.references += [blocks, pattern, *arrays]
@@ -295,20 +294,6 @@ cdef class Worlds:
             else:
                 wide = arrays[i]
                 self.w.array[i] = &wide[0]
-
-    def set_from_bodies(self, fields, pairs, int bodies, int joints, int contacts, Blocks blocks, int law):
-        """Set the worlds from bodies: (array, stride from world to world) for each field of `bodies_t` and for the pairs."""
-        cdef int32_t i
-        self.w.blocks, self.w.general, self.w.factored = blocks.at, False, True
-        self.w.blocks.law = law
-        self.references += [blocks, fields, pairs]
-        for i in range(FIELDS):
-            array, self.w.bodies.step[i] = fields[i]
-            self.w.bodies.field[i] = as_double_pointer(array, array.size)
-        for i in range(2):
-            array, self.w.bodies.pair_step[i] = pairs[i]
-            self.w.bodies.pair[i] = as_int_pointer(array, array.size)
-        self.w.bodies.n, self.w.bodies.joints, self.w.bodies.contacts = bodies, joints, contacts
 
     def set_from_problems(self, list problems, list data, list starts):
         """Set the worlds from problems and their `list_problem_data`; None defers a problem to the caller."""
@@ -334,7 +319,7 @@ cdef class Worlds:
                 store_zero_residual(&self.tasks[i], data[i])
 
     cdef bint is_general(self, int64_t i) noexcept nogil:
-        return self.tasks[i].general if self.tasks != NULL else self.w.general
+        return self.tasks == NULL or self.tasks[i].general
 
     cdef int32_t convert_world(self, int64_t i, worker_scratch_t* scratch, workspace_t* slack_error, const derived_t* made,
                                task_t* j) noexcept nogil:
@@ -346,13 +331,8 @@ cdef class Worlds:
             if j.p.n_rows == 0:
                 return LEFT
         else:
-            j.general, j.factored = self.w.general, self.w.factored
-            if j.general:
-                code = convert_generalized_world(&self.w, i, scratch, &j.p, &j.g)
-            elif j.factored:
-                code = convert_body_world(&self.w, i, scratch, &j.p, &j.r)
-            else:
-                code = convert_matrix_world(&self.w, i, scratch, &j.p, &j.dense, &j.row)
+            j.general, j.factored = True, False
+            code = convert_generalized_world(&self.w, i, scratch, &j.p, &j.g)
             j.zero_residual[0] = -1.0
             j.by_island = NULL
             j.solved, j.limit_reached, j.cold, j.has_derived, j.lam = False, False, self.cold, False, self.lam + at[AT_ROW]
@@ -436,7 +416,7 @@ cdef class Worlds:
             return self.store_empty_world(i, &h.scratch)
         code = LEFT
         if not j.general:
-            if narrow or (late and self.tasks != NULL) or not prepare_task_for_small_call(&j, &s, &h.small):
+            if narrow or late or not prepare_task_for_small_call(&j, &s, &h.small):
                 return LEFT
             if not grow_workspace_to(&h.small.call.work, 0, count_judge_scratch(&s.v)):
                 return LEFT

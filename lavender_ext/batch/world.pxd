@@ -6,18 +6,17 @@ zeros, M = L^T D L in the given order, b = target - J v*. A world that `Generali
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcmp, memcpy, memset
 
-from lavender_ext.core.faults cimport NO_FAULT, body_tolerances_t, find_body_fault, find_friction_fault, is_valid_rhs
+from lavender_ext.core.faults cimport NO_FAULT, find_friction_fault, is_valid_rhs
 from lavender_ext.core.validate cimport find_invalid_magnitude, has_invalid_number
 from lavender_ext.core.generalized cimport multiply_jacobian_row
 from lavender_ext.core.mass cimport THIN_PADDING, compress_lower_triangle, compress_dense_rows, factor_mass, ordering_pays_off
 from lavender_ext.core.tree cimport find_tree_factor_pattern
 from lavender_ext.core.method cimport workspace_t
 from lavender_ext.core.block_types cimport blocks_t, offset_block_arrays
-from lavender_ext.core.rows cimport multiply_jacobian
 from lavender_ext.judge.rounding cimport mass_t
 from lavender_ext.small.workspace cimport grow_workspace_to
 from lavender_ext.core.thin cimport thin
-from lavender_ext.core.view cimport generalized_t, rows_t
+from lavender_ext.core.view cimport generalized_t
 
 
 cdef enum:                      # status of a world
@@ -51,34 +50,8 @@ cdef enum:
     MIN_REORDERED_VELOCITIES = 400                  # `Generalized` searches another order from this number of velocities on
 
 
-cdef enum:                      # fields of bodies
-    INV_MASS = 0
-    INV_INERTIA = 1
-    V_FREE = 2
-    JOINT_JAC = 3
-    NORMAL = 4
-    TANGENT = 5
-    ARM_A = 6
-    ARM_B = 7
-    BODY_TARGET = 8                    # target
-    BODY_COMPLIANCE = 9                # compliance
-    CONTACT_MU = 10                    # mu of the contacts
-    FIELDS = 11
-
-
-cdef struct bodies_t:
-    int32_t n, joints, contacts
-    const double* field[FIELDS]     # arrays of the first world
-    int64_t step[FIELDS]        # stride from one world to the next; 0: the array is shared
-    const int32_t* pair[2]      # bodies of joints, of contacts
-    int64_t pair_step[2]        # their strides
-
-
 cdef struct worlds_t:
     int64_t n
-    bint general                # J and M
-    bint factored               # bodies; if neither, A is stored as J and b as target
-    bodies_t bodies
     const int64_t* at           # (n, PLACES)
     const void* array[N_ARRAYS]     # J, M, v*, target, compliance, mu (NULL: mu of the blocks)
     int32_t narrow[N_ARRAYS]    # 1 for float32
@@ -300,66 +273,11 @@ cdef inline int32_t convert_generalized_world(const worlds_t* w, int64_t i, work
     return convert_world_blocks(w, at, p, b, idx + half, x + n + 2 * m)
 
 
-cdef inline int32_t convert_matrix_world(const worlds_t* w, int64_t i, worker_scratch_t* d, blocks_t* p, const double** a,
-                                         int64_t* row) noexcept nogil:
-    """Convert world i of A to p and to a (m, m) with row stride `row`, in the worker's scratch d; return READY, BAD or LEFT."""
-    cdef const int64_t* at = w.at + i * PLACES
-    cdef int32_t m = <int32_t>at[ROWS], k = <int32_t>at[BLOCKS], j
-    cdef double* b
-    if not grow_workspace_to(&d.workspace, k + 1, m + k + <int64_t>m * m):
-        return LEFT
-    b, row[0] = d.workspace.real, w.jac_row_stride
-    a[0] = convert_matrix_to_float64(w, 0, at[JAC], m, m, row, b + m + k)
-    for j in range(m):
-        if has_invalid_number(a[0] + j * row[0], m):
-            return BAD
-    convert_entries_to_float64(w, 3, at[TARGET], m, b)
-    if not is_valid_rhs(b, m):
-        return BAD
-    return convert_world_blocks(w, at, p, b, d.workspace.index, b + m)
-
-
-cdef inline int32_t convert_body_world(const worlds_t* w, int64_t i, worker_scratch_t* d, blocks_t* p, rows_t* r) noexcept nogil:
-    """Convert world i of bodies to p and r. Return READY, or LEFT if an array has a fault: `Rows` then corrects it or raises."""
-    cdef const int64_t* at = w.at + i * PLACES
-    cdef const bodies_t* o = &w.bodies
-    cdef const double* x[FIELDS]
-    cdef int32_t m = <int32_t>at[ROWS], kj = o.joints, c = o.contacts, k
-    cdef int32_t size[FIELDS]
-    cdef body_tolerances_t tolerances = body_tolerances_t(5e-10, 5e-10, 0.0, 1e-6)      # as in core/checks.pyx
-    cdef int64_t index
-    cdef double* b
-    cdef double* mu
-    size[:] = [o.n, 9 * o.n, 6 * o.n, 12 * w.blocks.ptr[kj], 3 * c, 3 * c, 3 * c, 3 * c, m, m, c]
-    if not grow_workspace_to(&d.workspace, kj + c + 1, m + kj + c):
-        return LEFT
-    for k in range(FIELDS):
-        x[k] = o.field[k] + i * o.step[k]
-        if has_invalid_number(x[k], size[k]):
-            return LEFT
-    r.n_bodies, r.n_joints, r.n_contacts = o.n, kj, c
-    r.joint_body, r.contact_body = o.pair[0] + i * o.pair_step[0], o.pair[1] + i * o.pair_step[1]
-    r.inv_mass, r.inv_inertia, r.jac, r.compliance = x[INV_MASS], x[INV_INERTIA], x[JOINT_JAC], x[BODY_COMPLIANCE]
-    r.normal, r.tangent, r.arm_a, r.arm_b = x[NORMAL], x[TANGENT], x[ARM_A], x[ARM_B]
-    if find_body_fault(r, &tolerances, &index) != NO_FAULT or find_invalid_magnitude(r.compliance, m) >= 0:
-        return LEFT
-    b, mu = d.workspace.real, d.workspace.real + m
-    memset(mu, 0, kj * sizeof(double))
-    memcpy(mu + kj, x[CONTACT_MU], c * sizeof(double))
-    if convert_world_blocks(w, at, p, b, d.workspace.index, mu, True) != READY:
-        return LEFT
-    d.free = <double*>x[V_FREE]
-    multiply_jacobian(p, r, d.free, b)
-    for k in range(m):
-        b[k] = x[BODY_TARGET][k] - b[k]
-    return READY if is_valid_rhs(b, m) else LEFT
-
-
 cdef inline int32_t convert_world_blocks(const worlds_t* w, const int64_t* at, blocks_t* p, const double* b, int32_t* ptr,
-                                         double* mu, bint has_mu=False) noexcept nogil:
+                                         double* mu) noexcept nogil:
     """Bind the blocks of a world to p, with rows numbered from 0; return READY or BAD.
 
-    A mu that is given per world replaces that of the blocks; with has_mu it is in mu already.
+    A mu that is given per world replaces that of the blocks.
     """
     cdef const blocks_t* all = &w.blocks
     cdef int32_t k, first = <int32_t>at[CONE_ROW], block = <int32_t>at[BLOCK]
@@ -369,9 +287,7 @@ cdef inline int32_t convert_world_blocks(const worlds_t* w, const int64_t* at, b
         ptr[k] = all.ptr[block + k] - first
     p.b, p.ptr, p.lower, p.upper = b, ptr, all.lower + first, all.upper + first
     offset_block_arrays(p, all, block)
-    if has_mu:
-        p.mu = mu
-    elif w.array[5] != NULL:
+    if w.array[5] != NULL:
         convert_entries_to_float64(w, 5, at[MU], p.n_blocks, mu)
         p.mu = mu
     for k in range(p.n_blocks):

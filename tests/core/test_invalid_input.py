@@ -80,21 +80,6 @@ CALLS = {
         {"J": JAC, "M": (np.ones((2, 2)), np.array([0, 1]), np.array([0, 1, 2])), "v_free": FREE, "cones": SLIDING},
         accepts_nan=True,
     ),
-    "Batch.of_matrices": Call(
-        lv.Batch.of_matrices,
-        {"A": MASS, "b": FREE, "cones": SLIDING, "mu": np.full((2, 1), 0.5), "friction": "cone"}, accepts_nan=True,
-    ),
-    "Batch.of_matrices, solved": Call(
-        lambda **arguments: lv.solve_many(lv.Batch.of_matrices(**arguments)), {"A": MASS, "b": FREE, "cones": SLIDING},
-    ),
-    "Batch.of_bodies": Call(lambda **arrays: lv.Batch.of_bodies(arrays), BODIES, any_length={"v_free"}),
-    "Batch.of_bodies, the dictionary": Call(lv.Batch.of_bodies, {"fields": BODIES}),
-    "Batch.of_bodies, bounds": Call(
-        lambda **more: lv.Batch.of_bodies(BODIES, **more),
-        {"target": np.zeros((2, N_JOINT_ROWS + 2 * N_CONTACTS)), "mu": np.zeros((2, N_CONTACTS)), "tangents": 1,
-         "friction": "coulomb", "lower": np.zeros(N_JOINT_ROWS), "compliance": np.ones(N_JOINT_ROWS + 2 * N_CONTACTS)},
-        accepts={"tangents": ("True",)},
-    ),
     "Batch.flatten_impulses": Call(
         lambda given: BATCH.flatten_impulses("impulse", given), {"given": FREE}, {"given": "impulse"}, accepts_nan=True
     ),
@@ -336,9 +321,7 @@ NOT_CALLED = {
 ) = make_tests_of_calls("core", CALLS, NOT_CALLED)
 
 
-@pytest.mark.parametrize(
-    "name", ["Batch", "Batch, triangle of M", "Batch.of_matrices", "Batch.of_bodies", "Problem.from_jacobian", "Rows"]
-)
+@pytest.mark.parametrize("name", ["Batch", "Batch, triangle of M", "Problem.from_jacobian", "Rows"])
 def test_float32_of_either_byte_order_is_single_precision(name):
     check_float32(CALLS[name])
 

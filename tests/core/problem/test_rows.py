@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from random_problems import random_bodies_and_contacts
+from random_problems import random_bodies_and_contacts, seeds
 
 import lavender as lv
 from lavender_ext.core import checks
@@ -155,6 +155,28 @@ def test_impulses_are_carried_by_key_and_new_blocks_start_from_nothing():
     ):
         with pytest.raises(lv.InputError, match=words):
             now.carry(bad, keys)
+
+
+@given(seeds)
+def test_carry_random_keys_equals_an_assignment_by_a_dict(seed):
+    rng = np.random.default_rng(seed)
+    # The highest bits of a key are the type of a block, so that many keys differ in a few high bits only.
+    pool = rng.permutation(np.uint64(2) ** rng.integers(0, 64, 60, dtype=np.uint64) + np.arange(60, dtype=np.uint64))
+
+    def step():
+        cones = [(lv.Cones.free(1), lv.Cones.contacts(0.5))[i] for i in rng.integers(0, 2, rng.integers(1, 30))]
+        blocks = sum(cones[1:], cones[0])
+        key = rng.choice(np.unique(pool), blocks.n_blocks, replace=False)
+        return lv.Problem(np.ones(blocks.n_rows), blocks, np.eye(blocks.n_rows), key=key)
+
+    before, now = step(), step()
+    impulse, wanted, old, new = rng.normal(size=before.m), now.start(), before.cones, now.cones
+    block_of_key = {key: i for i, key in enumerate(before.key.tolist())}
+    for j, key in enumerate(now.key.tolist()):
+        i = block_of_key.get(key)
+        if i is not None and old.kind[i] == new.kind[j]:
+            wanted[new.ptr[j] : new.ptr[j + 1]] = impulse[old.ptr[i] : old.ptr[i + 1]]
+    assert np.array_equal(now.carry((before, impulse)), wanted)
 
 
 def test_repr_of_rows_is_one_line_with_its_counts():

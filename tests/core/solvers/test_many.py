@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import lavender as lv
-from lavender.batch import solve as many_module
 
 DISKS = lv.Cones.contacts(0.5, count=4)
 
@@ -21,16 +20,6 @@ def worlds(n, m=12, nv=18, seed=0, dtype=np.float64):
     mass = (mass + mass.transpose(0, 2, 1)) / 2
     jac, free = rng.standard_normal((n, m, nv)), rng.standard_normal((n, nv))
     return jac.astype(dtype), mass.astype(dtype), free.astype(dtype)
-
-
-def balls(inv_mass, **more):
-    """Fields of one ball on the ground in each world."""
-    ball = {
-        "inv_mass": inv_mass, "inv_inertia": np.eye(3)[None], "v_free": -np.ones((1, 6)), "contact_body": [(-1, 0)],
-        "normal": [(0.0, 0.0, 1.0)], "tangent": [(1.0, 0.0, 0.0)], "arm_a": [(0.0, 0.0, 0.0)],
-        "arm_b": [(0.0, 0.0, -0.1)],
-    }  # fmt: skip
-    return ball | more
 
 
 def assert_same(many, i, single):
@@ -56,8 +45,7 @@ def test_what_came_of_many_is_copied_and_pickled(again):
     """Solutions, verdicts and derivatives, of a batch and of a list in which each goes another way."""
     batch = lv.Batch(*worlds(3), cones=DISKS)
     mixed = [batch[0], lv.Problem.contact(np.eye(3), np.ones(3), mu=[(0.5, 0.2)]), batch[1]]
-    matrices = lv.Batch.of_matrices(np.array([np.eye(12)] * 3), np.ones((3, 12)), cones=DISKS)
-    for given in (batch, mixed, matrices, lv.Batch.of_bodies(balls(np.ones((3, 1))), mu=0.5)):
+    for given in (batch, mixed):
         many = lv.solve_many(given, tol=1e-10)
         found = lv.residual_many(given, [s.impulse for s in many])
         twin, verdicts = again(many), again(found)
@@ -173,12 +161,24 @@ def ill_conditioned():
     return batch, [*batch]
 
 
-def of_matrices():
-    rng = np.random.default_rng(6)
-    root = rng.standard_normal((4, 6, 6))
-    a, b = root @ root.transpose(0, 2, 1) + np.eye(6), rng.standard_normal((4, 6))
-    batch = lv.Batch.of_matrices(a, b, cones=lv.Cones.contacts(0.4, count=2), friction="cone")
-    return batch, [lv.Problem.contact(a[i], b[i], [0.4, 0.4], friction="cone") for i in range(4)]
+def boxes(friction):
+    """Return stacks of two boxes of different masses, friction and targets, as bodies."""
+    rng = np.random.default_rng(5)
+    corners, up = np.array([(x, y, 0.0) for x in (-0.5, 0.5) for y in (-0.5, 0.5)]), np.array([0.0, 0.0, 0.5])
+    single = [
+        lv.Problem.from_rows(
+            lv.Rows(
+                inv_mass=rng.uniform(0.5, 2.0, 2), inv_inertia=np.tile(6.0 * np.eye(3), (2, 1, 1)),
+                v_free=[0.3, 0.0, -0.16, 0.0, 0.0, 0.0] + 0.05 * rng.standard_normal((2, 6)),
+                contact_body=np.repeat([(-1, 0), (0, 1)], 4, axis=0), normal=np.tile([0.0, 0.0, 1.0], (8, 1)),
+                tangent=np.tile([1.0, 0.0, 0.0], (8, 1)), arm_a=np.tile(corners + up, (2, 1)),
+                arm_b=np.tile(corners - up, (2, 1)),
+            ),
+            mu=rng.uniform(0.1, 1.0, 8), friction=friction, compliance=0.01, target=0.1 * rng.standard_normal(24),
+        )
+        for _ in range(6)
+    ]  # fmt: skip
+    return single, single
 
 
 def listed():
@@ -197,7 +197,8 @@ BATCHES = {
     **{name: lambda name=name: laid_out(name) for name in ("padded", "strided", "rows", "triangles", "entries")},
     **{f"zeros of M, {x.__name__}": lambda x=x: with_zeros(x) for x in (np.float64, np.float32)},
     **{f"zeros of M by {k}": lambda k=k: with_zeros_that_come_and_go(k) for k in (1, -1)},
-    "several sizes": of_several_sizes, "ill-conditioned M": ill_conditioned, "matrices": of_matrices, "a list": listed,
+    "several sizes": of_several_sizes, "ill-conditioned M": ill_conditioned, "a list": listed,
+    **{f"bodies, {law}": lambda law=law: boxes(law) for law in ("coulomb", "cone")},
 }  # fmt: skip
 
 
@@ -392,57 +393,6 @@ def test_lists_start_from_their_impulses_and_refuse_what_is_none():
         lv.residual_many(given, None)
     with pytest.raises(lv.InputError, match="problems is 3; a sequence of Problems, or a Batch"):
         lv.solve_many(3)
-
-
-def test_balls_in_arrays_have_the_impulse_and_velocity_of_the_formula():
-    v = np.array([[[0.5, 0.0, -v, 0.0, 0.0, 0.0]] for v in (1.0, 2.0, 3.0)])
-    many = lv.solve_many(lv.Batch.of_bodies(balls(np.array([[0.5], [1.0], [2.0]]), v_free=v), mu=0.5, target=0.1))
-    assert many.impulse.shape == (3, 3) and many.success.all()
-    assert many.impulse[:, 0] == pytest.approx([2.2, 2.1, 1.55], rel=1e-5)  # m (v + 0.1), s
-    assert many.velocity.reshape(3, 6)[:, 2] == pytest.approx(0.1, rel=1e-5)
-
-
-@pytest.mark.parametrize("mu", [0.0, 0.5, np.linspace(0.1, 1.0, 48).reshape(6, 8)], ids=["none", "one", "each"])
-@pytest.mark.parametrize("friction", ["coulomb", "cone"])
-def test_bodies_in_arrays_have_the_bits_of_single_solves(mu, friction, monkeypatch):
-    """Boxes of two on each other; what is wrong with one, or a little off, does not matter to the others."""
-    rng = np.random.default_rng(5)
-    corners, up = np.array([(x, y, 0.0) for x in (-0.5, 0.5) for y in (-0.5, 0.5)]), np.array([0.0, 0.0, 0.5])
-    fields = {
-        "inv_mass": rng.uniform(0.5, 2.0, (6, 2)), "inv_inertia": np.tile(6.0 * np.eye(3), (2, 1, 1)),
-        "v_free": [0.3, 0.0, -0.16, 0.0, 0.0, 0.0] + 0.05 * rng.standard_normal((6, 2, 6)),
-        "contact_body": np.tile(np.repeat([(-1, 0), (0, 1)], 4, axis=0), (6, 1, 1)),
-        "normal": np.tile([0.0, 0.0, 1.0], (6, 8, 1)), "tangent": np.tile([1.0, 0.0, 0.0], (8, 1)),
-        "arm_a": np.tile(corners + up, (2, 1)), "arm_b": np.tile(corners - up, (2, 1)),
-    }  # fmt: skip
-    more = {"mu": mu, "friction": friction, "tangents": 2 if friction == "cone" else None, "compliance": 0.01}
-    target = 0.1 * rng.standard_normal((6, 24 if np.any(mu) or friction == "cone" else 8))
-    batch = lv.Batch.of_bodies(fields, target=target, **more)
-    singles = [lv.solve(batch[i]) for i in range(6)]
-    fields["v_free"][1] = np.nan  # where it stands: the batch reads it there
-    fields["inv_mass"][2] = -1.0
-    fields["normal"][3, 0, 0] = 1e-7  # which `Rows` takes out
-    fields["contact_body"][4, 0, 1] = 9
-    alone, solve = [], many_module.solve
-    monkeypatch.setattr(many_module, "solve", lambda *of, **more: alone.append(of) or solve(*of, **more))
-    many = lv.solve_many(batch, threads=2, errors="status")
-    assert sorted(many.faults) == [1, 2, 4] and "body 9" in str(many.faults[4])
-    assert len(alone) == 1
-    for i in (0, 5):
-        assert_same(many, i, singles[i])
-        assert many.velocity[i].tobytes() == batch[i].velocity(singles[i].impulse).tobytes()
-    assert_same(many, 3, lv.solve(batch[3]))
-
-
-def test_bodies_whose_rows_differ_between_worlds_are_told_so():
-    """No mu, no tangents, unless they are asked for: ten rows went into the place of twelve."""
-    ball = balls(np.ones((2, 1)))
-    mu = np.array([[0.5], [0.0]])
-    with pytest.raises(lv.InputError, match="friction is 'wet'"):
-        lv.Batch.of_bodies(ball, friction="wet")
-    with pytest.raises(lv.InputError, match=r"world 1: this world has 1 rows, the first world 3; .* give tangents="):
-        lv.solve_many(lv.Batch.of_bodies(ball, mu=mu))
-    assert lv.solve_many(lv.Batch.of_bodies(ball, mu=mu, tangents=2)).success.all()
 
 
 def test_what_goes_wrong_on_another_thread_is_raised():
