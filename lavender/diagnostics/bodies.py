@@ -9,8 +9,6 @@ import numpy as np
 import numpy.typing as npt
 
 from lavender.base.arrays import FloatArray
-from lavender.base.lazy_import import sparse as sp
-from lavender.base.lu import factor_sparse_lu
 from lavender.diagnostics.diagnostic import Diagnostic, make_diagnostic
 from lavender.problem import Problem
 from lavender.problem.rows import Rows
@@ -20,8 +18,6 @@ MISTAKEN_READINGS = (  # Possible mistakes in problems of bodies, and in problem
     ("mass for inverse mass", "inertia for inverse inertia", "mass and inertia for their inverses"),
     ("inverse mass for mass", "inverse inertia for inertia", "inverses for mass and inertia"),
 )
-# [-] Contacts of one pair of bodies may imply centre distances that differ by this fraction of the arms.
-MAX_CENTRE_DISTANCE = 0.25
 
 
 def reconstruct_bodies(p: Problem) -> Rows | None:
@@ -90,7 +86,7 @@ def are_normals_first(p: Problem) -> bool:
 
 
 def diagnose_geometry(p: Problem) -> Iterator[Diagnostic]:
-    """Yield diagnostics about tangents before normals, normals from b to a, duplicates, and contradicting arms."""
+    """Yield diagnostics about tangents before normals, normals from b to a, and duplicates."""
     r = reconstruct_bodies(p)
     if r is None or not r.n_contacts:
         return
@@ -123,17 +119,6 @@ def diagnose_geometry(p: Problem) -> Iterator[Diagnostic]:
     if len(opposed):
         reason = "two contacts of a pair at one position have opposite normals"
         yield make_diagnostic(p, "opposed normals", reason, blocks[opposed])
-    moving = np.flatnonzero((a >= 0) & (b >= 0))
-    off = _compute_centre_deviations(r.contact_body[moving], (r.arm_a - r.arm_b)[moving], r.n_bodies)
-    wrong = moving[off > MAX_CENTRE_DISTANCE * size[moving]]
-    if len(wrong) and len(wrong) <= 0.2 * len(moving):
-        i = int(wrong[0])
-        reason = (
-            f"the arms of contact {i} put the centres of bodies {a[i]} and {b[i]} elsewhere than the other "
-        )
-        yield make_diagnostic(
-            p, "bodies", reason + "contacts do: is a wrong body given?", blocks[wrong], off=float(off.max())
-        )
 
 
 def _find_coincident(r: Rows, size: FloatArray) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
@@ -158,37 +143,6 @@ def _find_coincident(r: Rows, size: FloatArray) -> tuple[npt.NDArray[np.intp], n
         clash = same & (near <= 1e-2 * size[i]) & (dot < -0.9)
         opposed += [i[clash], j[clash]]
     return np.unique(np.concatenate(again)), np.unique(np.concatenate(opposed))
-
-
-def _compute_centre_deviations(pair: Any, between: FloatArray, n: int) -> FloatArray:
-    """Return |c_b - c_a - between| (e,) [m] for the centres c (n, 3) that minimise the sum of these distances.
-
-    The minimum of a sum of distances isolates a few wrong pairs. Iteratively reweighted least squares, 8 iterations.
-    """
-    if not len(pair):
-        return np.zeros(0)
-    at = np.arange(len(pair))
-    incidence = sp.csr_array(
-        (np.r_[-np.ones(len(pair)), np.ones(len(pair))], (np.r_[at, at], pair.T.ravel())),
-        shape=(len(pair), n),
-    )
-    to_centres = incidence.T.tocsr()
-    a, b = pair.T
-    diagonal = np.arange(n)
-    # Positions of the weights in incidence^T weight incidence. The sparse constructor adds entries with equal
-    # positions.
-    positions = (np.r_[a, b, a, b, diagonal], np.r_[a, b, b, a, diagonal])
-    scale = np.abs(between).max()
-    if not 0.0 < scale < np.inf:
-        return np.zeros(len(pair))
-    weight = np.ones(len(pair))
-    for _ in range(8):
-        entries = np.r_[weight, weight, -weight, -weight, np.full(n, 1e-9)]
-        normal = sp.csc_array((entries, positions), shape=(n, n))
-        centre = factor_sparse_lu(normal).solve(to_centres @ (weight[:, None] * (between / scale)))
-        off = np.linalg.norm(incidence @ centre - between / scale, axis=1)
-        weight = 1.0 / (off + 1e-4)
-    return scale * off
 
 
 def diagnose_masses(p: Problem) -> Iterator[Diagnostic]:
@@ -249,43 +203,6 @@ def _compute_longest_arms(r: Any) -> FloatArray:
     return size
 
 
-def diagnose_inverted_matrices(p: Problem) -> Iterator[Diagnostic]:
-    """Yield diagnostics that M is the inverse of the mass matrix, or J the transpose of the Jacobian."""
-    g = p.generalized
-    if g is None or not 3 <= g.nv <= MAX_DENSE_VELOCITIES:
-        return
-    mass = g.mass.toarray()
-    given = find_free_bodies(mass)
-    if (
-        p.m == g.nv
-        and len(given)
-        and not _are_contact_rows_orthogonal(p, g.jac, given)
-        and _are_contact_rows_orthogonal(p, g.jac.T.tocsr(), given)
-    ):
-        reason = (
-            "contacts' rows are orthogonal unit vectors of a free body in J^T and not in J: is J transposed?"
-        )
-        yield make_diagnostic(p, "J transposed", reason)
-    weight = np.abs(g.jac).max(axis=0).toarray().ravel() if p.m else np.zeros(g.nv)
-    seen = weight > 0.0
-
-    def spread(matrix: FloatArray) -> float:
-        return float(np.ptp(np.log10(matrix.diagonal()[seen] / weight[seen] ** 2)))
-
-    wide = spread(mass) if np.count_nonzero(seen) >= 3 else 0.0
-    if len(given) and not wide > 2.0:
-        return
-    inverse = np.linalg.inv(mass)
-    other = find_free_bodies(inverse)
-    if len(other) and not len(given):
-        reason = "three uncoupled velocities have equal masses in the inverse of M but not in M: was M^-1 given for M?"
-        yield make_diagnostic(p, "masses", reason, velocities=other)
-    narrow = spread(inverse) if wide > 2.0 else wide
-    if len(other) <= len(given) and narrow < 0.25 * wide:
-        reason = f"effective masses of the velocities span 10^{wide:.1f} with M and 10^{narrow:.1f} with M^-1"
-        yield make_diagnostic(p, "masses", reason + ": was M^-1 given for M?", spread=[wide, narrow])
-
-
 def find_free_bodies(mass: FloatArray) -> list[int]:
     """Return the index of the first linear velocity of each free body: the first of three uncoupled, equal masses."""
     n = len(mass)
@@ -297,17 +214,4 @@ def find_free_bodies(mass: FloatArray) -> list[int]:
     return [int(i) for i in np.flatnonzero(equal & (off <= size))]
 
 
-def _are_contact_rows_orthogonal(p: Problem, jac: Any, free: list[int]) -> bool:
-    """Return whether most contacts move some free body along three orthogonal unit vectors."""
-    c = p.cones
-    first = c.ptr[:-1][c.is_contact & (np.diff(c.ptr) == 3)]
-    eye = np.eye(3)
-    for j in free:
-        parts = [jac[i : i + 3][:, j : j + 3].toarray() for i in first]
-        unit = [np.allclose(x @ x.T, eye, atol=1e-6) for x in parts if x.any()]
-        if unit and np.mean(unit) > 0.5:
-            return True
-    return False
-
-
-CHECKS = (diagnose_geometry, diagnose_masses, diagnose_inverted_matrices)
+CHECKS = (diagnose_geometry, diagnose_masses)

@@ -20,13 +20,12 @@ G = 9.81  # [m/s^2]
 MAX_SEPARATION_TARGET = 30.0
 # [m/s] A larger target would allow an approach of more than 2 m in a step of 2 ms.
 MAX_APPROACH_TARGET = 1000.0
-# [-] A smaller ratio of target to approach speed is not a bounce: dt is a factor too many.
-MIN_RESTITUTION = 0.05
-# [-] Coefficients of restitution that are computed from velocities count as equal up to this difference.
-RESTITUTION_ROUNDING = 1e-6
-# [m/s] Approach speeds in this range suggest a target that lacks a factor dt; larger speeds suggest other units than
-# m/s.
-SUSPICIOUS_APPROACH = 30.0, 1e4
+MIN_RESTITUTION = (
+    0.05  # [-] A smaller ratio of target to approach speed is not a bounce: dt is a factor too many.
+)
+RESTITUTION_ROUNDING = (
+    1e-6  # [-] Coefficients of restitution that are computed from velocities differ by this.
+)
 
 
 def get_row_velocities_and_targets(p: Problem) -> tuple[FloatArray, FloatArray, FloatArray] | None:
@@ -120,29 +119,6 @@ def diagnose_targets(p: Problem) -> Iterator[Diagnostic]:
             )
             reason += "the target of a depth that is positive inside is +depth/dt"
             yield make_diagnostic(p, "targets", reason, np.flatnonzero(contact), target=float(tn.min()))
-
-
-def diagnose_free_velocities(p: Problem) -> Iterator[Diagnostic]:
-    """Yield a diagnostic if v* looks like an acceleration."""
-    motion, r = get_row_velocities_and_targets(p), reconstruct_bodies(p)
-    contact = np.flatnonzero(p.cones.is_contact)
-    if motion is None or not len(contact):
-        return
-    if r is not None and np.any(r.inv_mass > 0.0):
-        v = np.linalg.norm(r.v_free[r.inv_mass > 0.0, :3], axis=1)
-        if np.median(np.abs(v - G)) <= 0.01 * G:
-            reason = f"v* of bodies is {np.median(v):.3g} m/s, the number of g in m/s^2: is it v + dt a?"
-            yield make_diagnostic(p, "v_free", reason, speed=float(np.median(v)))
-            return
-    toward = -motion[0][p.cones.normal_rows]
-    slowest, fastest = SUSPICIOUS_APPROACH
-    if slowest < toward.max() < fastest:
-        i = int(np.argmax(toward))
-        reason = (
-            f"bodies approach each other with {toward[i]:.3g} m/s; v* is v + dt a: do accelerations lack dt, or is dt "
-            "in ms?"
-        )
-        yield make_diagnostic(p, "v_free", reason, contact[toward > slowest], speed=float(toward[i]))
 
 
 def diagnose_flipped_normals(p: Problem) -> Iterator[Diagnostic]:
@@ -276,16 +252,11 @@ def diagnose_state(p: Problem, velocity: Any, gap: Any, dt: float) -> Iterator[D
 
 
 def _find_bounces(target: FloatArray, before: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return a mask (c,) of the contacts with targets that are bounces and do not depend on gaps.
-
-    A target is a bounce if it is -e times the normal velocity `before` the step (c,) [m/s], with the same restitution
-    coefficient e for all of these contacts.
-    """
+    """Return a mask (c,) of targets that are -e times the normal velocities `before` (c,) [m/s], with one e for all."""
     approach = before < 0.0
-    e = np.zeros(len(target))
-    np.divide(-target, before, out=e, where=approach)
+    e = np.divide(-target, before, out=np.zeros(len(target)), where=approach)
     bounces = approach & (e > MIN_RESTITUTION) & (e <= 1.0)
     return bounces & (np.abs(e - np.median(e[bounces])) <= RESTITUTION_ROUNDING) if bounces.any() else bounces
 
 
-CHECKS = (diagnose_joint_targets, diagnose_targets, diagnose_free_velocities, diagnose_flipped_normals)
+CHECKS = (diagnose_joint_targets, diagnose_targets, diagnose_flipped_normals)

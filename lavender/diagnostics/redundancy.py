@@ -2,8 +2,8 @@
 
 If A is singular, impulses are not unique: a table on four legs. The slack w, and with it every body's velocity, is
 unique for symmetric positive semidefinite A without Coulomb friction. A = J M^-1 J^T has the rank of J. If J is known,
-its rows, scaled to length 1, are decomposed by QR with column pivoting. A diagonal entry of R is the part of a row's
-direction that is new next to the rows before it. A holds the squares of these parts.
+its rows, scaled to length 1, are made orthogonal to the rows before them. The length of the rest is the new part of a
+row's direction. A holds the squares of these parts. An island with a well-conditioned A has no redundant row.
 """
 
 from __future__ import annotations
@@ -16,13 +16,27 @@ import numpy.typing as npt
 
 from lavender.base.arrays import FloatArray, check_float
 from lavender.base.errors import CapabilityError
+from lavender.base.lazy_import import sparse as sp
+from lavender.base.lu import factor_sparse_lu
 from lavender.problem import Problem, check_problem
 from lavender.problem.ordering import group_blocks_by_island
 from lavender.solvers.islands import find_islands, get_rows_of_blocks
 
 MIN_NEW_PART = 1e-6  # Smallest new part of a direction that differs from rounding of A, or of float32 data.
-MAX_ISLAND_ROWS = 3_000  # A dense QR factorisation of this many rows takes about 20 s.
-NULL_VECTOR_TOL = 1e-9  # A row with entries of up to this in all unit null vectors is not moved by them.
+MAX_BASIS_NUMBERS = (
+    2**27
+)  # Largest number of entries of the orthonormal rows of an island and their coefficients.
+CHUNK_ROWS = 64  # Number of rows that one matrix product makes orthogonal to the rows before them.
+MIN_INVERSE_NORM = (
+    1e-9  # An island has full rank if 1 / |A^-1| exceeds this and 1e3 tol^2, with A scaled to 1.
+)
+# Rows with smaller new parts wait until all rows with larger ones are in the basis, so that rounding is not amplified.
+MIN_PARTS = (1e-2, 1e-5, 0.0)
+NULL_VECTOR_TOL = (
+    1e-9  # A row with relative entries of up to this in random null vectors is not moved by them.
+)
+# A new part below this is made orthogonal to all rows once more, because its rounding is relative to the whole row.
+MIN_ACCURATE_PART = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +49,7 @@ class Redundancy:
     tol : float
         Largest new part of a row's direction [-] that counted as redundant.
     rows : tuple of int
-        Redundant rows: each depends on rows before it.
+        Redundant rows: each depends on the other rows. Of rows that depend on each other, later ones are preferred.
     impulse_is_unique : (m,) bool
         Whether all solutions have the same impulse on a row.
     """
@@ -90,7 +104,7 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
     Raises
     ------
     InputError, CapabilityError
-        `tol` is not between 0 and 1, or an island has more than 3,000 rows.
+        `tol` is not between 0 and 1, or an island of dependent rows is too large for memory (about 10,000 velocities).
     """
     check_problem(problem)
     tol = check_float("tol", tol, low=0.0, high=1.0)
@@ -102,51 +116,95 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
     unique, dependent = np.ones(m, bool), []
     for blocks in group_blocks_by_island(*find_islands(problem)):
         island = get_rows_of_blocks(problem, blocks)
-        if len(island) > MAX_ISLAND_ROWS:
-            raise CapabilityError(f"{len(island)} rows are coupled; at most {MAX_ISLAND_ROWS} are possible")
-        part = (problem.csr[:, island] if jacobian is None else jacobian)[island]
-        scaled = _scale_rows(part[:, np.unique(part.indices)].toarray(), jacobian is None)
-        null = _find_null_vectors(scaled, tol if jacobian is not None else tol**2)
-        dependent += island[_find_last_rows(null)].tolist()
-        if len(null):
-            largest = np.abs(np.linalg.qr(null.T)[0]).max(axis=1)
-            unique[island] = problem.is_symmetric and largest <= NULL_VECTOR_TOL
+        part = sp.csr_array((problem.csr[:, island] if jacobian is None else jacobian)[island])
+        if not part.nnz:
+            dependent += island.tolist()
+            unique[island] = False
+            continue
+        scaled = _scale_rows(part[:, np.unique(part.indices)], jacobian is None)
+        if _has_full_rank(scaled, jacobian is None, tol):
+            continue
+        is_new, is_moved = _decompose_rows(scaled, tol if jacobian is not None else tol**2)
+        dependent += island[~is_new].tolist()
+        if not is_new.all():
+            unique[island] = problem.is_symmetric & ~is_moved
     rows = tuple(sorted(dependent))
     return Redundancy(problem, m - len(rows), tol, rows=rows, impulse_is_unique=unique)
 
 
-def _scale_rows(rows: FloatArray, is_delassus: bool) -> FloatArray:
+def _scale_rows(rows: sp.csr_array, is_delassus: bool) -> sp.csr_array:
     """Scale rows to length 1; first scale rows and columns of A to largest entries near 1."""
+
+    def divide(x: FloatArray) -> sp.dia_array:
+        return sp.diags_array(1.0 / np.where(x > 0.0, x, 1.0))
+
     for axis in (0, 1, 0, 1, 0, 1, 0, 1) if is_delassus else (1,):
-        largest = np.abs(rows).max(axis=axis, keepdims=True, initial=0.0) ** (0.5 if is_delassus else 1.0)
-        rows = rows / np.where(largest > 0.0, largest, 1.0)
-    length = np.linalg.norm(rows, axis=1, keepdims=True)
-    return rows / np.where(length > 0.0, length, 1.0)
+        largest = abs(rows).max(axis=axis).toarray().ravel() ** (0.5 if is_delassus else 1.0)
+        rows = divide(largest) @ rows if axis else rows @ divide(largest)
+    return sp.csr_array(divide(np.sqrt((rows * rows).sum(axis=1))) @ rows)
 
 
-def _find_null_vectors(rows: FloatArray, tol: float) -> FloatArray:
-    """Return independent y (k, m) with y rows = 0."""
-    from scipy.linalg import qr, solve_triangular
+def _has_full_rank(rows: sp.csr_array, is_delassus: bool, tol: float) -> bool:
+    """Return whether a sparse factorisation proves that no row depends on others; False if it does not."""
+    from scipy.sparse.linalg import LinearOperator, onenormest
 
-    if not rows.size:
-        return np.eye(len(rows))
-    m = len(rows)
-    r, order = qr(rows.T, mode="r", pivoting=True)
-    size = np.abs(np.diagonal(r))
-    rank = int(np.count_nonzero(size > max(tol, m * 2.0**-53) * size[0]))  # Rounding leaves about m 2^-53.
-    null = np.zeros((m - rank, m))
-    null[:, order[rank:]] = np.eye(m - rank)
-    null[:, order[:rank]] = -solve_triangular(r[:rank, :rank], r[:rank, rank:]).T
-    return null
+    m = rows.shape[0]
+    if not 0 < m <= rows.shape[1]:
+        return False
+    matrix = rows if is_delassus else rows @ rows.T
+    try:
+        factor = factor_sparse_lu(sp.csc_array(matrix))
+    except RuntimeError:  # A pivot is 0.
+        return False
+    inverse = LinearOperator((m, m), matvec=factor.solve, rmatvec=lambda x: factor.solve(x, "T"))
+    return bool(max(MIN_INVERSE_NORM, 1e3 * tol**2) * onenormest(inverse) < 1.0)
 
 
-def _find_last_rows(null: FloatArray) -> list[int]:
-    """Return a row for each null vector (k, m), by elimination from the last row: each depends on rows before it."""
-    null, last = null.copy(), []
-    for i in range(null.shape[1] - 1, -1, -1):
-        k = int(np.argmax(np.abs(null[:, i]))) if len(null) else -1
-        if k >= 0 and abs(null[k, i]) > NULL_VECTOR_TOL * np.abs(null[k]).max():
-            last.append(i)
-            pivot, null = null[k] / null[k, i], np.delete(null, k, axis=0)
-            null -= np.outer(null[:, i], pivot)
-    return last
+def _decompose_rows(rows: sp.csr_array, tol: float) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+    """Return whether each of m rows of length 1 is in a largest independent set, and whether a null vector moves it.
+
+    Gram-Schmidt is applied twice to chunks of rows. Earlier rows are preferred among those with similar new parts. The
+    null vectors, y rows = 0, are two random combinations of all.
+    """
+    from scipy.linalg import solve_triangular
+
+    m, n = rows.shape
+    size, r = min(m, n), 0
+    if size * (n + size) > MAX_BASIS_NUMBERS:
+        raise CapabilityError(
+            f"{m} rows over {n} velocities are coupled; their rank would take too much memory"
+        )
+    tol = max(tol, m * 2.0**-53)  # Rounding leaves about m 2^-53.
+    basis, lower = np.zeros((size, n)), np.zeros((size, size))  # independent rows = lower basis
+    y, dependent_sum = np.random.default_rng(0).normal(size=(2, m)), np.zeros((2, size))
+    is_new = np.zeros(m, bool)
+    pending = np.arange(m)
+    for min_part in MIN_PARTS:
+        deferred: list[int] = []
+        for at in np.split(pending, range(CHUNK_ROWS, len(pending), CHUNK_ROWS)):
+            chunk, start, coefficients = rows[at].toarray(), r, np.zeros((len(at), size))
+            for _ in range(2):
+                step = chunk @ basis[:start].T
+                chunk -= step @ basis[:start]
+                coefficients[:, :start] += step
+            for i, x, c in zip(at.tolist(), chunk, coefficients, strict=True):
+                for begin in (start, start, 0):
+                    if begin == start or tol < np.linalg.norm(x) < MIN_ACCURATE_PART:
+                        step = basis[begin:r] @ x
+                        x -= step @ basis[begin:r]
+                        c[begin:r] += step
+                length = float(np.linalg.norm(x))
+                is_new[i] = length > max(tol, min_part) and r < size
+                if is_new[i]:
+                    basis[r], c[r], lower[r] = x / length, length, c
+                    r += 1
+                elif length <= tol or r == size:
+                    dependent_sum += np.outer(y[:, i], c)
+                else:
+                    deferred.append(i)
+        pending = np.array(deferred, int)
+    y[:, is_new] = (
+        -solve_triangular(lower[:r, :r], dependent_sum[:, :r].T, lower=True, trans=1).T if r else 0.0
+    )
+    largest = np.abs(y).max(axis=0)
+    return is_new, largest > NULL_VECTOR_TOL * largest.max(initial=0.0)

@@ -135,11 +135,38 @@ def test_a_row_that_is_new_by_more_than_tol_is_kept(share):
     assert matrix.rank == (4 if share > 1e-6 else 3) and matrix.tol == 1e-6
 
 
-def test_island_above_the_limit_of_rows_raises():
-    m = 3001
+def test_redundancy_of_a_chain_of_6300_rows_finds_no_redundant_row():
+    m = 6300
     chain = sp.diags_array([-np.ones(m - 1), 2.0 * np.ones(m), -np.ones(m - 1)], offsets=[-1, 0, 1])
-    with pytest.raises(lv.CapabilityError, match="3001 rows are coupled; at most 3000"):
-        redundancy(lv.Problem.linear(chain, np.zeros(m)))
+    found = redundancy(lv.Problem.linear(chain, np.zeros(m)))
+    assert (found.rank, found.rows) == (m, ()) and found.impulse_is_unique.all()
+
+
+@pytest.mark.parametrize(("form", "n_contacts"), [("bodies", 2100), ("matrix", 300)])
+def test_redundancy_of_thousands_of_contacts_of_ten_bodies_has_rank_60(form, n_contacts):
+    """A tower of ten bodies with many contacts at each joint: six motions for each body, known by hand."""
+    rng = np.random.default_rng(4)
+    below = np.repeat(np.arange(-1, 9), n_contacts // 10)
+    arm = np.column_stack([rng.uniform(-0.5, 0.5, (n_contacts, 2)), np.full(n_contacts, -0.5)])
+    rows = touching(
+        np.column_stack([below, below + 1]), inv_mass=np.ones(10), inv_inertia=np.tile(6.0 * np.eye(3), (10, 1, 1)),
+        v_free=np.zeros((10, 6)), arm_a=arm + np.eye(3)[2], arm_b=arm,
+    )  # fmt: skip
+    problem = lv.Problem.from_rows(rows, mu=0.5, tangents=2, friction="cone")
+    found = redundancy(problem if form == "bodies" else as_matrix(problem))
+    assert (problem.m, found.rank) == (3 * n_contacts, 60)
+    independent = np.setdiff1d(np.arange(problem.m), found.rows)
+    assert np.array_equal(independent // (problem.m // 10), np.repeat(np.arange(10), 6))  # Each joint has six.
+    assert not found.impulse_is_unique.any()
+
+
+def test_redundancy_of_an_island_beyond_memory_raises():
+    """Two equal rows in an island of 20,000 rows: the basis would take 3 GiB."""
+    m = 20_000
+    jac = sp.csr_array(sp.diags_array([np.ones(m - 1), np.ones(m - 1)], offsets=[0, 1], shape=(m - 1, m)))
+    problem = lv.Problem.from_jacobian(sp.vstack([jac, jac[[0]]]), sp.eye_array(m), np.zeros(m), cones=lv.Cones.free(m))
+    with pytest.raises(lv.CapabilityError, match="too much memory"):
+        redundancy(problem)
 
 
 def test_rank_of_a_sparse_island_is_that_of_its_eigenvalues():

@@ -74,22 +74,6 @@ def test_opposed_and_repeated_contacts_are_told(name):
         assert kind in kinds(lv.Problem.from_rows(lv.Rows(**twice), mu=0.5))
 
 
-@pytest.mark.parametrize("name", ["stack", "pit"])
-def test_a_contact_of_another_body_is_told(name):
-    problem = SCENES[name]
-    rows, target = given(problem)
-    pair = rows["contact_body"]
-    count = np.bincount(pair[pair.min(axis=1) >= 0].ravel(), minlength=problem.rows.n_bodies)
-    # a contact whose bodies, and the one beside, are held by others
-    i = next(
-        i for i, (a, b) in enumerate(pair)
-        if a >= 0 and 0 <= b < len(count) - 1 and b + 1 != a and min(count[[a, b, b + 1]]) > 3
-    )  # fmt: skip
-    rows["contact_body"][i, 1] += 1
-    found = {s.kind: s for s in lv.diagnose(made(problem, rows, target))}
-    assert found["bodies"].blocks == (problem.rows.n_joints + i,)
-
-
 def test_joint_targets_behind_those_of_contacts_are_told():
     problem = SCENES["bridge"]
     rows, target = given(problem)
@@ -170,10 +154,6 @@ def test_generalised_coordinates_out_of_order_are_told():
         assert kinds(problem(j, wrong)) == {"masses"} and words in lv.diagnose(problem(j, wrong))[0].reason
     assert kinds(problem(np.concatenate([j[:-3], j[:3]]))) == set()  # one of twelve: collision detection does that
     assert kinds(problem(np.concatenate([j[:18], j[:18]]))) == {"duplicate rows"}
-    flat = j[:6, :6]  # two contacts of one box: as many rows as velocities
-    pair = lv.Cones.contacts(0.5, count=2)
-    assert kinds(lv.Problem.from_jacobian(flat, mass[:6, :6], v[:6], cones=pair)) == set()
-    assert "J transposed" in kinds(lv.Problem.from_jacobian(flat.T, mass[:6, :6], v[:6], cones=pair))
 
 
 def test_a_matrix_with_opposed_rows_is_told():
