@@ -112,7 +112,6 @@ def save(
     path: str | os.PathLike[str],
     *,
     impulse: Any = None,
-    form: str | None = None,
     drop: Collection[str] = (),
 ) -> None:
     """Write a problem; the suffix selects the format. An existing file is replaced atomically.
@@ -121,11 +120,9 @@ def save(
     ----------
     problem : Problem
     path : path
-        `.npz` (our own format) or `.hdf5`, `.h5` (FCLIB).
+        `.npz` (our own format), or `.hdf5`, `.h5` (FCLIB's local form, for which A is formed).
     impulse : (m,) N s, optional
         Stored with the problem as its solution.
-    form : {"local", "global"}, optional
-        FCLIB only: W and q, or M, H, f and w (problems with rows). Default: the form in which the problem was given.
     drop : names, optional
         FCLIB only: parts of the problem to leave out, of "names" (of blocks and velocities), "key" and "precision"
         (float32). FCLIB cannot hold them: a problem that has one of them is rejected unless `drop` names it.
@@ -140,14 +137,14 @@ def save(
     path, drop = as_path(path), check_sequence("drop", drop, "names")
     suffix = path.suffix.lower()
     if suffix == ".npz":
-        if form is not None or drop:
+        if drop:
             raise InputError(
-                "form= and drop= have no effect on an .npz file, which holds everything: leave them out, "
-                "or give a path that ends with .hdf5 (FCLIB)"
+                "drop= has no effect on an .npz file, which holds everything: leave it out, or give a path that "
+                "ends with .hdf5 (FCLIB)"
             )
         write_npz(problem, path, impulse=impulse)
     elif suffix in HDF5:
-        fclib.write(problem, path, impulse=impulse, form=form, drop=drop)
+        fclib.write(problem, path, impulse=impulse, drop=drop)
     else:
         raise InputError(
             f"{path} ends with {suffix!r}; a suffix .npz or .hdf5 is needed, which selects the format"

@@ -1,4 +1,4 @@
-"""Read and write FCLIB files (HDF5): local and global friction problems in 2D and 3D, in 3D also rolling friction.
+"""Read FCLIB files (HDF5) with local and global friction problems in 2D and 3D, and write their local form.
 
     local     u = W r + q                                         A = W, b = -q, lambda = r, w = u
     global    M v = H r + f,  u = H^T v + w                       A = H^T M^-1 H,  b = -(w + H^T M^-1 f)
@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, check_choice
+from lavender.base.arrays import FloatArray
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.lazy_import import sparse as sp
 from lavender.io.condensed import SPARSE_ENTRY_BYTES, form_dense_a
@@ -313,14 +313,9 @@ def _list_guess_groups(r: HDF5Reader) -> list[str]:
 
 
 def write(
-    problem: Problem,
-    path: str | os.PathLike[str],
-    *,
-    impulse: Any = None,
-    form: str | None = None,
-    drop: Collection[str] = (),
+    problem: Problem, path: str | os.PathLike[str], *, impulse: Any = None, drop: Collection[str] = ()
 ) -> None:
-    """Save a friction contact problem; see `lavender.io.save`.
+    """Save a friction contact problem in the local form, W = A and q = -b; see `lavender.io.save`.
 
     Raises
     ------
@@ -329,63 +324,56 @@ def write(
     """
     if not isinstance(problem, Problem):
         raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
-    if form is None:
-        has_row_with_compliance = problem.generalized is not None and np.any(problem.compliance)
-        form = "local" if problem.matrix is not None or has_row_with_compliance else "global"
-    check_choice("form", form, ("local", "global"))
     unknown = sorted(set(drop) - {"names", "key", "precision"})
     if unknown:
         raise InputError(
             f"drop names {', '.join(unknown)}; only 'names', 'key' and 'precision' may be left out"
         )
-    obstacles = _list_unsupported_data(problem, form, drop)
+    obstacles = _list_unsupported_data(problem, drop)
     if obstacles:
-        text = "; ".join(obstacles)
-        raise CapabilityError(f"FCLIB's {form} form cannot hold {text}. An .npz holds everything")
-    points: list[dict[str, FloatArray]] = []
-    for point in (impulse, problem.guess):
-        if point is None:
-            points.append({})
-            continue
-        lam = problem.impulse_array(point)
-        points.append({"r": lam, "u": problem.slack(lam)})
-        if form == "global":
-            points[-1]["v"] = problem.velocity(lam).ravel()
-    if form == "local":
-        parts: dict[str, Any] = {"W": problem.csr, "q": -problem.b}
-    else:
-        mass, v = _get_mass_and_free_velocity(problem)
-        jac = problem.jacobian
-        parts = {"M": mass, "H": sp.csr_array(jac.T), "f": mass @ v, "w": -(problem.b + jac @ v)}
-    contents = Contents(
-        int(problem.cones.ptr[1]),
-        problem.cones.mu,
-        problem.cones.rolling if problem.cones.has_rolling else None,
-        solution=points[0],
-        guesses=tuple(points[1:]) if points[1] else (),
-        info={"title": problem.name},
-        **parts,
-    )
-    write_contents(contents, path)
+        raise CapabilityError(f"FCLIB cannot hold {'; '.join(obstacles)}. An .npz holds everything")
+    h5py = import_h5py()
+    # The file is built in memory first, because HDF5 ends the process by a signal if the disk is full.
+    with h5py.File("in memory", "w", driver="core", backing_store=False) as out:
+        _write_file(out, problem, impulse)
+        out.flush()
+        image = out.id.get_file_image()
+    write_bytes(path, image)
 
 
-def _get_mass_and_free_velocity(problem: Problem) -> tuple[sp.csr_array, FloatArray]:
-    """Return M (n, n) and v* (n,) of a problem in generalised coordinates or of bodies."""
-    if problem.generalized is not None:
-        return problem.generalized.mass, problem.generalized.v_free
-    rows = problem.rows
-    assert rows is not None
-    inertia = np.linalg.inv(rows.inv_inertia)
-    blocks = np.zeros((rows.n_bodies, 6, 6))
-    blocks[:, :3, :3] = np.eye(3) / rows.inv_mass[:, None, None]
-    blocks[:, 3:, 3:] = 0.5 * (inertia + inertia.transpose(0, 2, 1))
-    mass = sp.csr_array(sp.block_diag([sp.coo_array(block) for block in blocks], format="csr"))
-    mass.eliminate_zeros()
-    return mass, rows.v_free.ravel()
+def _write_file(out: Any, problem: Problem, impulse: Any) -> None:
+    """Write all groups of the file, with the matrix in compressed rows."""
+    c = problem.cones
+    group = out.create_group(LOCAL + ROLLING if c.has_rolling else LOCAL)
+    write_array(group, "spacedim", c.ptr[1:2])
+    write_matrix(group.create_group("W"), problem.csr)
+    vectors = {"q": -problem.b, "mu": c.mu} | ({"mu_r": c.rolling} if c.has_rolling else {})
+    _write_arrays(group.create_group("vectors"), vectors)
+    if problem.name:
+        # FCLIB expects strings that end in a NUL character.
+        texts = {"title": problem.name.encode(), "description": b"", "math_info": b""}
+        info = {name: np.array(text, f"S{len(text) + 1}") for name, text in texts.items()}
+        _write_arrays(group.create_group("info"), info)
+    if impulse is not None:
+        _write_point(out, "solution", problem, impulse)
+    if problem.guess is not None:
+        write_array(out.create_group("guesses"), "number_of_guesses", np.array([1], np.int32))
+        _write_point(out, "guesses/1", problem, problem.guess)
 
 
-def _list_unsupported_data(problem: Problem, form: str, drop: Collection[str]) -> list[str]:
-    """Return everything of the problem that FCLIB's form cannot hold, each as a phrase for the error message."""
+def _write_point(out: Any, name: str, problem: Problem, impulse: Any) -> None:
+    """Write a group with an impulse and its slack."""
+    lam = problem.impulse_array(impulse)
+    _write_arrays(out.create_group(name), {"r": lam, "u": problem.slack(lam)})
+
+
+def _write_arrays(group: Any, arrays: Mapping[str, Any]) -> None:
+    for name, value in arrays.items():
+        write_array(group, name, value)
+
+
+def _list_unsupported_data(problem: Problem, drop: Collection[str]) -> list[str]:
+    """Return everything of the problem that FCLIB cannot hold, each as a phrase for the error message."""
     c, general = problem.cones, problem.generalized
     rows = ~c.contact_rows
     is_free = np.isneginf(c.lower) & np.isposinf(c.upper)
@@ -414,75 +402,4 @@ def _list_unsupported_data(problem: Problem, form: str, drop: Collection[str]) -
         (has_surrogate, "half a surrogate pair in its name (give another name)"),
         ("\0" in problem.name, "a NUL character in its name, which ends texts in FCLIB (give another name)"),
     )  # fmt: skip
-    obstacles = [text for is_present, text in table if is_present]
-    if form == "global":
-        obstacles += _list_reasons_against_global_form(problem)
-    return obstacles
-
-
-def _list_reasons_against_global_form(problem: Problem) -> list[str]:
-    """Return the reasons why the problem has no global form, each as a phrase for the error message."""
-    if problem.matrix is not None:
-        return ["a problem given as a matrix (form='local' holds it)"]
-    obstacles = []
-    if problem.compliance is not None and np.any(problem.compliance):
-        obstacles.append("compliance (form='local' holds it, added to the diagonal of W)")
-    rows = problem.rows
-    if rows is None:
-        return obstacles
-    heavy = np.flatnonzero(rows.inv_mass == 0.0)
-    if len(heavy):
-        obstacles.append(f"an infinite mass (body {heavy[0]}; form='local' holds it)")
-    value = np.linalg.eigvalsh(rows.inv_inertia) if rows.n_bodies else np.ones((0, 3))
-    stiff = np.flatnonzero(value[:, 0] <= 1e-14 * value[:, 2])
-    if len(stiff):
-        obstacles.append(f"an infinite inertia (body {stiff[0]}; form='local' holds it)")
-    return obstacles
-
-
-def write_contents(file: Contents, path: str | os.PathLike[str]) -> None:
-    """Write matrices and vectors bit for bit in FCLIB's layout, with matrices in compressed rows.
-
-    Raises
-    ------
-    InputError
-        The path cannot be written, or h5py is not installed.
-    """
-    h5py = import_h5py()
-    # The file is built in memory first, because HDF5 ends the process by a signal if the disk is full.
-    with h5py.File("in memory", "w", driver="core", backing_store=False) as out:
-        _write_file(out, file)
-        out.flush()
-        image = out.id.get_file_image()
-    write_bytes(path, image)
-
-
-def _write_file(out: Any, file: Contents) -> None:
-    """Write all groups of the file."""
-    group = out.create_group(file.group_name)
-    write_array(group, "spacedim", np.array([file.spacedim], np.int32))
-    vectors = group.create_group("vectors")
-    for name, shape in PARTS[LOCAL if file.form == "local" else GLOBAL].items():
-        part = getattr(file, name)
-        if part is not None and len(shape) == 2:
-            write_matrix(group.create_group(name), part)
-        elif part is not None:
-            write_array(vectors, name, part)
-    if any(file.info.values()):
-        info = group.create_group("info")
-        for name in ("title", "description", "math_info"):
-            text = file.info.get(name, "").encode()
-            # FCLIB expects strings that end in a NUL character.
-            write_array(info, name, np.array(text, f"S{len(text) + 1}"))
-    if file.solution:
-        _write_point(out.create_group("solution"), file.solution)
-    if file.guesses:
-        guesses = out.create_group("guesses")
-        write_array(guesses, "number_of_guesses", np.array([len(file.guesses)], np.int32))
-        for i, guess in enumerate(file.guesses):
-            _write_point(guesses.create_group(str(i + 1)), guess)
-
-
-def _write_point(group: Any, point: Mapping[str, FloatArray]) -> None:
-    for name, value in point.items():
-        write_array(group, name, value)
+    return [text for is_present, text in table if is_present]

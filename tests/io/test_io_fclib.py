@@ -13,7 +13,6 @@ from random_problems import as_matrix, dragged, random_contact_problem, seeds, s
 
 import lavender as lv
 import lavender.io
-from lavender.io import fclib
 
 h5py = pytest.importorskip("h5py", reason="FCLIB files need the extra fclib")
 
@@ -78,53 +77,16 @@ def test_a_local_file_keeps_everything_to_the_bit(tmp_path, spacedim, suffix):
 
 
 @given(seeds, st.sampled_from([2, 3, 5]))
-def test_a_global_file_keeps_the_matrices_to_the_bit_and_condenses_to_A(tmp_path_factory, seed, spacedim):
-    problem = soft(global_problem(seed, min(spacedim - 1, 2), rolling=spacedim == 5))
+def test_save_of_bodies_writes_the_local_form_with_the_bits_of_a(tmp_path_factory, seed, spacedim):
+    problem = soft(global_problem(seed, min(spacedim - 1, 2), rolling=spacedim == 5), 0.125)
     impulse = np.linspace(0.0, 1.0, problem.m)
-    path = tmp_path_factory.mktemp("global") / "p.hdf5"
+    path = tmp_path_factory.mktemp("local") / "p.hdf5"
     lavender.io.save(problem, path, impulse=impulse)
-    file = fclib.read_contents(path)
-    assert (file.form, file.spacedim) == ("global", spacedim)
-    assert np.array_equal(file.H.toarray(), problem.jacobian.toarray().T)
-    n = problem.rows.n_bodies
-    assert np.array_equal(file.M.diagonal().reshape(n, 6)[:, :3], np.repeat(1 / problem.rows.inv_mass, 3).reshape(n, 3))
-    assert np.array_equal(file.mu, problem.cones.mu)
-    # M came from inverting inertia tensors of condition below 10: a few units of rounding, amplified by 10.
-    unit = file.M @ problem.rows.inverse_mass_matrix()
-    assert np.allclose(unit.toarray(), np.eye(6 * n), rtol=0, atol=1e-13)
-    assert np.array_equal(file.solution["v"], problem.velocity(impulse).ravel())
     stored = lavender.io.read(path)
-    assert stored.format == ("fclib_global_rolling" if spacedim == 5 else "fclib_global")
+    assert stored.format == ("fclib_local_rolling" if spacedim == 5 else "fclib_local")
     assert stored.problem.cones == problem.cones and stored.impulse.tobytes() == impulse.tobytes()
-    a = problem.dense()
-    assert np.allclose(stored.problem.dense(), a, rtol=0, atol=1e-13 * np.abs(a).max())
-    assert np.allclose(stored.problem.b, problem.b, rtol=0, atol=1e-12)
-    assert stored.problem.asymmetry == 0.0
-    again = path.with_name("again.hdf5")
-    fclib.write_contents(file, again)
-    assert_same(fclib.read_contents(again), file)
-
-
-def assert_same(x, y):
-    """Every array of two contents has the same bytes, and its place in both."""
-
-    def told(thing):
-        if isinstance(thing, dict):
-            return {key: told(value) for key, value in thing.items()}
-        if isinstance(thing, (list, tuple)):
-            return [told(value) for value in thing]
-        parts = ("indptr", "indices", "data") if sp.issparse(thing) else ()
-        return [getattr(thing, part).tobytes() for part in parts] or getattr(thing, "tobytes", lambda: thing)()
-
-    assert told(dataclasses.asdict(x)) == told(dataclasses.asdict(y))
-
-
-def test_rows_may_be_saved_condensed(tmp_path):
-    problem = soft(global_problem(3), 0.125)
-    lavender.io.save(problem, tmp_path / "p.hdf5", form="local")
-    loaded = lavender.io.load(tmp_path / "p.hdf5")
-    assert np.array_equal(loaded.dense(), problem.dense())  # compliance is on the diagonal of W
-    assert np.array_equal(loaded.b, problem.b)
+    assert np.array_equal(stored.problem.dense(), problem.dense())  # compliance is on the diagonal of W
+    assert np.array_equal(stored.problem.b, problem.b)
 
 
 # -- files of others ------------------------------------------------------------------------------
@@ -189,29 +151,6 @@ def test_repeated_triplets_are_summed(tmp_path):
     assert np.array_equal(problem.dense(), np.diag([1.0, 6.0, 3.0]))
 
 
-def test_j_and_m_are_written_and_read_as_they_are(tmp_path):
-    rng = np.random.default_rng(2)
-    half = rng.normal(size=(5, 5))
-    jac, mass, v = rng.normal(size=(6, 5)), half @ half.T + np.eye(5), rng.normal(size=5)
-    cones = lv.Cones.contacts(0.5, count=2)
-    problem = lv.Problem.from_jacobian(jac, mass, v, cones=cones, target=rng.normal(size=6))
-    lavender.io.save(problem, tmp_path / "p.hdf5")
-    again = lavender.io.load(tmp_path / "p.hdf5")
-    assert lavender.io.read(tmp_path / "p.hdf5").format == "fclib_global"
-    assert again.operator == "generalized"
-    for one, two in ((again.generalized.jac, jac), (again.generalized.mass, mass)):
-        assert np.array_equal(one.toarray(), two)
-    # v* = M^-1 f with f = M v*: rounding times the condition number of M, 50
-    np.testing.assert_allclose(again.generalized.v_free, v, rtol=0.0, atol=1e-13)
-    np.testing.assert_allclose(again.b, problem.b, rtol=0.0, atol=1e-13)
-    lavender.io.save(again, tmp_path / "q.hdf5")
-    first, second = (lavender.io.fclib.read_contents(tmp_path / name) for name in ("p.hdf5", "q.hdf5"))
-    np.testing.assert_allclose(second.f, first.f, rtol=0.0, atol=1e-12)
-    soft = lv.Problem.from_jacobian(jac, mass, v, cones=cones, compliance=0.5)
-    lavender.io.save(soft, tmp_path / "s.hdf5")  # which the global form cannot hold
-    assert lavender.io.read(tmp_path / "s.hdf5").format == "fclib_local"
-
-
 def test_a_global_file_whose_m_is_no_mass_matrix_is_condensed(tmp_path):
     m, h = np.diag([2.0, 4.0, 0.5]), W.T
     m[0, 1] = 1.0
@@ -249,11 +188,6 @@ def test_both_forms_are_read_as_local(tmp_path):
 # -- refused --------------------------------------------------------------------------------------
 
 
-def one_body(**given):
-    """One contact of one body with the ground."""
-    return lv.Problem.from_rows(touching([[-1, 0]], **given), tangents=2)
-
-
 def test_what_fclib_cannot_hold_is_named(tmp_path):
     rows = soft(global_problem())
     named = lv.Problem(rows.b, rows.cones, rows=rows.rows, names=["x"] * 8, key=range(8))
@@ -262,7 +196,7 @@ def test_what_fclib_cannot_hold_is_named(tmp_path):
         single, single, single[0], cones=lv.Cones.contacts(0.5),
         dof_names=["x", "y", "z"], name="\ud800",
     )  # fmt: skip
-    heavy, pinned = one_body(inv_mass=[0.0]), one_body(inv_inertia=[np.diag([1.0, 0.0, 1.0])])
+    heavy = lv.Problem.from_rows(touching([[-1, 0]], inv_mass=[0.0]), tangents=2)
     cases = [
         (lv.Problem.lcp(np.eye(2), [1.0, 1.0]), {}, ["blocks of bounded rows .*2 bounded rows"]),
         (lv.Problem.linear(np.eye(2), [1.0, 1.0]), {}, ["blocks of bounded rows .*2 free rows"]),
@@ -275,10 +209,6 @@ def test_what_fclib_cannot_hold_is_named(tmp_path):
         (named, {"drop": ["names"]}, ["keys of blocks"]),
         (moved, {}, ["names of velocities", "precision 'float32'", "surrogate"]),
         (dataclasses.replace(named, name="whole\0"), {}, ["NUL character in its name"]),
-        (soft(rows, 0.5), {}, ["compliance"]),
-        (heavy, {}, ["infinite mass"]),
-        (pinned, {}, ["infinite inertia"]),
-        (local_problem(), {"form": "global"}, ["given as a matrix"]),
         (as_matrix(dragged(3, 4, shape="box")), {}, ["box"]),
         (dragged(0, 3), {}, ["ellipses"]),
     ]
@@ -288,11 +218,9 @@ def test_what_fclib_cannot_hold_is_named(tmp_path):
                 lavender.io.save(problem, tmp_path / "p.hdf5", **options)
     assert os.listdir(tmp_path) == []
     lavender.io.save(named, tmp_path / "p.hdf5", drop=["names", "key"])
-    lavender.io.save(heavy, tmp_path / "p.hdf5", form="local")
+    lavender.io.save(heavy, tmp_path / "p.hdf5")
     plain = dataclasses.replace(moved, name="plain")
     lavender.io.save(plain, tmp_path / "p.hdf5", drop=["names", "precision"])
-    with pytest.raises(lv.InputError, match="'local' or 'global'"):
-        lavender.io.save(rows, tmp_path / "p.hdf5", form="middle")
     with pytest.raises(lv.InputError, match="only 'names', 'key' and 'precision'"):
         lavender.io.save(rows, tmp_path / "p.hdf5", drop=["compliance"])
     with pytest.raises(lv.InputError, match=r"a lavender\.Problem is needed"):
