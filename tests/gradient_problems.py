@@ -148,21 +148,13 @@ def directions(problem, rng):
         g = problem.generalized
         mass = rng.standard_normal((g.nv, g.nv))
         return out | {"v_free": rng.standard_normal(g.nv), "J": rng.standard_normal((m, g.nv)), "M": mass + mass.T}
-    r = problem.rows
-    turn = rng.standard_normal((r.n_contacts, 3))
-    out["frames"] = np.cross(turn, r.normal), np.cross(turn, r.tangent)
-    for name in ("v_free", "jac", "arm_a", "arm_b", "inv_mass"):
-        out[name] = rng.standard_normal(getattr(r, name).shape)
-    x = rng.standard_normal(r.inv_inertia.shape)
-    return out | {"inv_inertia": x + x.transpose(0, 2, 1)}
+    return out | {"v_free": rng.standard_normal(problem.rows.v_free.shape)}
 
 
 def named(name, change):
     """The changes as `jvp` takes them."""
     if name == "bounds":
         return {"lower": change[0], "upper": change[1]}
-    if name == "frames":
-        return {"normal": change[0], "tangent": change[1]}
     return {"mu" if name == "mu of each tangent" else name: change}
 
 
@@ -197,8 +189,5 @@ def moved(problem, name, change, h):
         free = free + h * change if name == "v_free" else free
         made = lv.Generalized(jac, mass, free)
         return replace(p, generalized=made, b=target - jac @ free)
-    if name == "frames":
-        rows = replace(p.rows, normal=p.rows.normal + h * change[0], tangent=p.rows.tangent + h * change[1])
-    else:
-        rows = replace(p.rows, **{name: getattr(p.rows, name) + h * change})
+    rows = replace(p.rows, v_free=free + h * change)
     return replace(p, rows=rows, b=target - rows.jacobian(c) @ rows.v_free.ravel())

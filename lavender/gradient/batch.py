@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,11 +19,11 @@ from lavender.problem.derived import cached_property
 from lavender_ext.derivative.linear import Linears
 
 
-class _LazySequence(Sequence[Any]):
-    """Sequence with one object for each of n problems, created at its first use; `items` holds existing objects."""
+class _PerProblem(Sequence[Any]):
+    """Sequence with one object for each problem; `_items`, a list, is made when one of them is first read."""
 
-    def __init__(self, n: int, items: dict[int, Any]) -> None:
-        self._n, self._items = n, items
+    _items: list[Any]
+    _n: int
 
     def __len__(self) -> int:
         return self._n
@@ -31,24 +31,13 @@ class _LazySequence(Sequence[Any]):
     def __getitem__(self, i: Any) -> Any:
         """Return the object of problem i, or a list of objects for a slice, a mask or a list of integers."""
         i = resolve_index(i, self._n)
-        return [self._get(j) for j in i] if isinstance(i, list) else self._get(i)
-
-    def __iter__(self) -> Iterator[Any]:
-        return map(self._get, range(self._n))
-
-    def _get(self, i: int) -> Any:
-        if i not in self._items:
-            self._items[i] = self._make_item(i)
-        return self._items[i]
-
-    def _make_item(self, i: int) -> Any:
-        raise NotImplementedError
+        return [self._items[j] for j in i] if isinstance(i, list) else self._items[i]
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} of {self._n} problems>"
 
 
-class Gradients(_LazySequence, GradientArrays):
+class Gradients(_PerProblem, GradientArrays):
     """Gradients of many problems, computed by `Derivatives.vjp`: `[i]` is the `Gradient` of problem i.
 
     Attributes such as `b`, `mu` and `v_free` hold the concatenated gradients of all problems. Gradients by matrices
@@ -56,11 +45,13 @@ class Gradients(_LazySequence, GradientArrays):
     """
 
     def __init__(self, of: Derivatives, numbers: FloatArray, separate: dict[int, Gradient]) -> None:
-        super().__init__(len(of), separate)
-        self._of, self._numbers, self._is_complete = of, numbers, not separate
+        self._n, self._of, self._numbers, self._separate = len(of), of, numbers, separate
 
-    def _make_item(self, i: int) -> Gradient:
-        return Gradient(self._of._get(i), self._numbers[self._of._linears.result_slice(i)])
+    @cached_property
+    def _items(self) -> list[Gradient]:
+        parts = map(self._of._linears.result_slice, range(self._n))
+        made = (Gradient(d, self._numbers[part]) for d, part in zip(self._of._items, parts, strict=True))
+        return [self._separate.get(i, gradient) for i, gradient in enumerate(made)]
 
     if not TYPE_CHECKING:  # Hide `__getattr__` from type checkers, so that they report unknown names.
 
@@ -70,25 +61,26 @@ class Gradients(_LazySequence, GradientArrays):
                     f"the gradients of all problems have no attribute {name!r}; gradients[i] is the "
                     "gradient of problem i"
                 )
-            if self._is_complete and name in ("b", "target", "v_free"):
+            if not self._separate and name in ("b", "target", "v_free"):
                 of = self._of
                 return self._numbers[of._velocities if name == "v_free" else of._rows]
             return np.concatenate([getattr(g, name) for g in self] or [np.zeros(0)])
 
 
-class Derivatives(_LazySequence):
+class Derivatives(_PerProblem):
     """Derivatives of many problems, prepared by `lavender.derivatives`: `[i]` is the `Derivative` of problem i."""
 
     def __init__(self, problems: list[Problem], linears: Linears, separate: dict[int, Derivative]) -> None:
-        super().__init__(len(problems), dict(separate))
-        self._problems, self._linears, self._separate = problems, linears, separate
+        self._n, self._problems, self._linears, self._separate = len(problems), problems, linears, separate
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle problems and impulses only; the copy prepares the derivatives again."""
         return derivatives, (self._problems, [each._impulse for each in self])
 
-    def _make_item(self, i: int) -> Derivative:
-        return Derivative(self._problems[i], self._linears.item(i))
+    @cached_property
+    def _items(self) -> list[Derivative]:
+        get, item = self._separate.get, self._linears.item
+        return [get(i) or Derivative(problem, item(i)) for i, problem in enumerate(self._problems)]
 
     @cached_property
     def _rows(self) -> IntArray:
@@ -125,7 +117,7 @@ class Derivatives(_LazySequence):
         separate = {}
         for i in [*self._separate, *remaining]:
             try:
-                separate[i] = self._get(i).vjp(**{name: x[i] for name, x in cotangents.items()})
+                separate[i] = self._items[i].vjp(**{name: x[i] for name, x in cotangents.items()})
             except InputError as error:
                 raise InputError(f"problem {i}: {error}") from None
         return Gradients(self, numbers, separate)

@@ -11,8 +11,8 @@ import numpy.typing as npt
 from lavender.base.arrays import FloatArray, as_array, as_csr
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.lazy_import import issparse
-from lavender.gradient.chains import BodyChain, CoefficientRows
-from lavender.gradient.result import BODIES, COEFFICIENT_INPUTS, INPUTS, MATRICES, Gradient
+from lavender.gradient.chains import CoefficientRows
+from lavender.gradient.result import COEFFICIENT_INPUTS, INPUTS, MATRICES, Gradient
 from lavender.gradient.system import MAX_KERNEL_ROWS, System, factor_dense
 from lavender.judge.residuals import residual
 from lavender.judge.states import States, compute_states, judge_and_linearise_impulse
@@ -247,10 +247,6 @@ class Derivative:
         dz_de = np.where(has_friction, root * lam / e, 0.0)
         return rows, dz_de, np.where(has_friction, (root * lam + w / root) / e, 0.0)
 
-    @cached_property
-    def _body_chain(self) -> Any:
-        return BodyChain(self)
-
     def _solve(self, r: FloatArray, check: bool = False) -> FloatArray:
         """Solve G x = r on all rows; with `check`, raise CapabilityError if there is no solution."""
         x, rows = r.copy(), self._system_rows
@@ -285,7 +281,7 @@ class Derivative:
             raise CapabilityError(
                 f"{message}: {names}{', ...' if len(rows) > 3 else ''} share a load with other rows. Data "
                 "of one such row cannot change alone, because another row would then open. Use derivatives "
-                "by v_free and masses, by mu under Coulomb's law, or give these rows compliance, which "
+                "by v_free and M, by mu under Coulomb's law, or give these rows compliance, which "
                 "allows derivatives by all data"
             )
 
@@ -389,8 +385,6 @@ class Derivative:
             Changes of the data with these names, in the shapes of the data; mu also (k, 2). `b` is the change of b
             itself; for changes of `target`, `v_free` and `J`, the change of b = target - J v* is computed. A change of
             M must be symmetric.
-        jac, normal, tangent, arm_a, arm_b, inv_mass, inv_inertia : array-like, optional
-            Changes of the arrays of `Rows`.
 
         Returns
         -------
@@ -421,9 +415,7 @@ class Derivative:
             dw += data["A"] @ self._impulse
         if "compliance" in data:
             dw += data["compliance"] * self._impulse
-        dj = self._body_chain.compute_jacobian_change(data) if p.rows is not None else data.get("J")
-        if p.rows is not None and "J" in data:
-            dj = data["J"] if dj is None else dj + data["J"]
+        dj = data.get("J")
         momentum = None  # Will hold dJ^T lambda - dM v' of equation (2) in `lavender.gradient`.
         if dj is not None:
             dw += dj @ self._velocity
@@ -432,9 +424,6 @@ class Derivative:
             momentum = (0.0 if momentum is None else momentum) - data["M"] @ self._velocity_change
         if momentum is not None:
             dv += self._apply_inverse_mass(momentum)
-        if "inv_mass" in data or "inv_inertia" in data:
-            force = self._apply_jacobian_transposed(self._impulse)
-            dv += self._body_chain.apply_inverse_mass_change(data, force)
         if dv is not None and dv.any():
             dw += self._apply_jacobian(dv)
         if "v_free" in data:
@@ -483,7 +472,7 @@ class Derivative:
                 out[name] = as_array(
                     name, value, (*shape, 2) if name == "mu" and np.ndim(value) == 2 else shape
                 )
-            elif name in BODIES or name == "v_free":
+            elif name == "v_free":
                 like = getattr(p.rows if p.rows is not None else p.generalized, name)
                 out[name] = as_array(name, value, like.shape)
             else:

@@ -14,7 +14,6 @@ from lavender.problem import OPERATORS
 from lavender.problem.derived import cached_property
 
 MATRICES = ("A", "J", "M")
-BODIES = ("jac", "normal", "tangent", "arm_a", "arm_b", "inv_mass", "inv_inertia")
 # Data by which solutions can be differentiated -> forms of problems that have these data (see `OPERATORS`). In `jvp`,
 # mu may have the shape (k, 2) of `coefficients`.
 INPUTS = {
@@ -22,14 +21,13 @@ INPUTS = {
     "A": ("matrix",),
     **dict.fromkeys(("target", "v_free", "compliance", "J"), ("rows", "generalized")),
     "M": ("generalized",),
-    **dict.fromkeys(BODIES, ("rows",)),
 }
 
 
 COEFFICIENT_INPUTS = ("mu", "patch_radius", "rolling")
 # Data of single rows. If linearly dependent rows share a load, no derivative by the data of one of them exists,
 # because a change would contradict the other rows.
-ROW_INPUTS = ("b", "target", "compliance", "A", "J", "jac", "normal", "tangent", "arm_a", "arm_b")
+ROW_INPUTS = ("b", "target", "compliance", "A", "J")
 
 
 class _Input:
@@ -37,7 +35,7 @@ class _Input:
 
     def __init__(self, name: str) -> None:
         self.name, self.operators, self.is_row_input = name, INPUTS[name], name in ROW_INPUTS
-        self.compute = None if name in BODIES else getattr(Gradient, f"_by_{name}")
+        self.compute = getattr(Gradient, f"_by_{name}")
 
     def __get__(self, gradient: Any, owner: Any = None) -> Any:
         if gradient is None:
@@ -52,9 +50,6 @@ class _Input:
             derivative._check_row_changes(f"no derivative by {name} exists here")
         if name in (*COEFFICIENT_INPUTS, "coefficients") and not derivative._uses_kernel:
             derivative._check_coefficient_changes("mu" if name == "coefficients" else name)
-        if self.compute is None:
-            gradient.__dict__.update(derivative._body_chain.convert_to_body_gradients(gradient))
-            return gradient.__dict__[name]
         value = gradient.__dict__[name] = self.compute(gradient)
         return value
 
@@ -73,13 +68,6 @@ class GradientArrays:
         patch_radius: FloatArray
         rolling: FloatArray
         compliance: FloatArray
-        jac: FloatArray
-        normal: FloatArray
-        tangent: FloatArray
-        arm_a: FloatArray
-        arm_b: FloatArray
-        inv_mass: FloatArray
-        inv_inertia: FloatArray
 
 
 class Gradient(GradientArrays):
@@ -96,13 +84,12 @@ class Gradient(GradientArrays):
         compliance           (m,)
         A                    (m, m): by each entry; dense, or on the pattern of a sparse A
         J, M                 (m, nv), (nv, nv): sparse, on their patterns; M symmetric; see `full`
-        jac, normal, tangent, arm_a, arm_b, inv_mass, inv_inertia   as in `Rows`
 
-    Gradients by J, M and the arrays of bodies are for fixed target and v*. Normals and tangents are treated as free
-    vectors: for a rotation, use the component along it.
+    Gradients by J and M are for fixed target and v*. `lavender.torch` and `lavender.jax` continue them to masses,
+    arms and normals from which a program computes J and M.
 
     Accessing a gradient raises CapabilityError if the problem has no such data. It also does so if linearly dependent
-    rows share a load (`Derivative.unique.target`) and the data belong to single rows: targets, J, arms, compliance.
+    rows share a load (`Derivative.unique.target`) and the data belong to single rows: targets, J, compliance.
     Under the cone law, where a sliding contact separates at mu times its speed, this includes coefficients of sliding
     contacts.
     """
