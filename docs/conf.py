@@ -49,20 +49,13 @@ pygments_dark_style = "github-dark"
 
 # Caption -> pages, in the order of the contents.
 CONTENTS = {
-    "Start": (
-        "install quickstart concepts residual sweep choose deadlines failures cross-check "
-        "diagnose examples generated/examples"
-    ),
-    "Use": (
-        "commands report formats own-engine generalized quadratic-programs mujoco worlds engines engine-arrays "
-        "audit tune derivatives c solvers backends generated/api"
-    ),
-    "LavenderSim": "engine scenes towers web",
-    "Background": (
-        "chapter chapter-answers chapter-engines motion newtons-method auto performance peers generated/cases "
-        "generated/measured method"
-    ),
-    "Project": "architecture plugin trust platforms limitations",
+    "Start": "install quickstart concepts residual sweep",
+    "Solve": "choose deadlines solvers backends failures diagnose quadratic-programs",
+    "Your data": "own-engine c formats derivatives",
+    "Judge engines": "audit tune mujoco worlds engines engine-arrays report method cross-check commands",
+    "LavenderSim and the course": "engine chapter chapter-answers generated/examples",
+    "Background": "methods motion comparison guarantees generated/cases generated/measured",
+    "Project": "plugin architecture generated/api",
 }
 
 

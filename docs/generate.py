@@ -1,7 +1,7 @@
 """Pages made from what the package says of itself: SPECs, docstrings, examples, scenes, cases, and a small benchmark.
 
     python docs/generate.py            write docs/generated/, as the Sphinx build does
-    python docs/generate.py --pages    rewrite solvers.md, scenes.md, backends.md and engine-arrays.md of docs/
+    python docs/generate.py --pages    rewrite solvers.md, backends.md, engine-arrays.md and a table of engine.md
     python docs/generate.py --tables   measure; rewrite the tables of docs/choose.md, and the
                                        figures in docs/static/examples/
 
@@ -581,15 +581,19 @@ def measured_tables(report):
     }
 
 
-def replace_tables(page, tables):
-    """Replace the text between `<!-- table: NAME -->` and `<!-- end of table -->` of a page."""
-    text = re.sub(
+def fill_tables(text, tables):
+    """Return a page with the text between `<!-- table: NAME -->` and `<!-- end of table -->` replaced."""
+    return re.sub(
         r"(?<=<!-- table: )(\w+) -->.*?(?=<!-- end of table -->)",
         lambda found: f"{found[1]} -->\n\n{tables[found[1]]}\n\n",
-        page.read_text(encoding="utf-8"),
+        text,
         flags=re.DOTALL,
     )
-    page.write_text(text, encoding="utf-8")
+
+
+def replace_tables(page, tables):
+    """Replace the tables of the file of a page."""
+    page.write_text(fill_tables(page.read_text(encoding="utf-8"), tables), encoding="utf-8")
 
 
 # -- examples, scenes, cases, parts -----------------------------------------------------------------
@@ -650,25 +654,15 @@ def _signature(function, leave=()):
     return ", ".join(shown)
 
 
-def scene_page():
-    """Return the text of docs/scenes.md: the gallery."""
-    parts = [
-        "# Scenes",
-        "<!-- Written by `python docs/generate.py --pages`. -->",
-        (
-            "This page lists the built-in scenes of [LavenderSim](engine.md), the engine in this package, with their "
-            "parameters.\n`lavender.Scene(name, **parameters)` builds a scene. Every scene also accepts the "
-            "[parameters of all scenes](engine.md#build-a-scene)\n(`dt`, `friction`, `solver_iterations`, "
-            "`warm_start`, …). Lengths are in m, masses in kg, angles in rad."
-        ),
-    ]
+def tabulate_scenes():
+    """Return the table of the gallery of docs/engine.md."""
     lines = ["| scene, with its own parameters | description |", "|---|---|"]
     for name, build in SCENES.items():
         if build.__module__ != "lavender.sim.scene.gallery":  # a scene of a user or of a doctest
             continue
         text = " ".join(docstrings.markdown(build.__doc__).replace("|", "\\|").split())
         lines.append(f"| `{name}({_signature(build, ('scene',))})` | {text} |")
-    return "\n\n".join([*parts, "\n".join(lines)])
+    return "\n".join(lines)
 
 
 def suite_page(site):
@@ -761,7 +755,9 @@ def write(source, cache):
 
 def committed_pages():
     """Return the texts of the pages that are checked in, by file name."""
-    pages = {"solvers.md": solver_overview(), "scenes.md": scene_page(), "backends.md": backends_page()}
+    pages = {"solvers.md": solver_overview(), "backends.md": backends_page()}
+    engine = (Path(__file__).resolve().parent / "engine.md").read_text(encoding="utf-8")
+    pages["engine.md"] = fill_tables(engine, {"scenes": tabulate_scenes()})
     pages["engine-arrays.md"] = engine_arrays_page()
     return {name: text.rstrip() + "\n" for name, text in pages.items()}
 

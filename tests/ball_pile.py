@@ -2,7 +2,7 @@
 
 Balls of random number, sizes, masses and friction fall into an open box and are pressed together in steps of 1/60 s,
 each solved by `newton` to 1e-4 from the impulses of the last step. On these problems contacts under load are between
-sticking and slipping (docs/newtons-method.md).
+sticking and slipping (docs/methods.md).
 """
 
 from __future__ import annotations

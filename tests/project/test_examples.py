@@ -10,6 +10,7 @@ import lavender as lv
 from lavender.sim.engine.layout import HEAD
 
 DOCS = Path(__file__).resolve().parent.parent.parent / "docs"
+EXAMPLES = DOCS.parent / "examples"
 
 
 @pytest.fixture
@@ -188,8 +189,11 @@ def test_the_planar_engine_holds_its_joints_and_its_circles(drawn):
     assert speeds[0] == pytest.approx(module.SPEED) and speeds.min() < 0.0  # more than the motor's torque
     source = module.__loader__.get_source(module.__name__)
     lines = source.split("# ---")[1].count("\n") - 1
-    for page, words in (("own-engine", "an engine of"), ("examples", "a two-dimensional engine in")):
-        assert f"{words} {lines} lines" in (DOCS / f"{page}.md").read_text(encoding="utf-8")
+    for page, words in (
+        (DOCS / "own-engine.md", "an engine of"),
+        (EXAMPLES / "README.md", "a two-dimensional engine in"),
+    ):
+        assert f"{words} {lines} lines" in page.read_text(encoding="utf-8")
 
 
 def test_example_with_an_unknown_panel_lists_the_panels(tmp_path):

@@ -1,4 +1,4 @@
-"""The kernels in WebAssembly, and a page that runs them; described in docs/web.md."""
+"""The kernels in WebAssembly, and a page that runs them; described in docs/engine.md."""
 
 from lavender.sim.web.scenes import write_scene
 

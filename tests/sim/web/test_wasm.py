@@ -116,7 +116,7 @@ def test_the_same_sources_give_the_same_bytes_and_pointers_of_the_module_s_machi
 @pytest.mark.parametrize("name", list(wasm.PARTS))
 def test_a_module_has_the_size_that_the_page_says_and_room_to_grow(name, request):
     size = len(request.getfixturevalue({"lavender": "module", "newton": "newton_module"}[name]))
-    page = (ROOT / "docs" / "web.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "engine.md").read_text(encoding="utf-8")
     (told,) = re.findall(rf"`{name}\.wasm` \((\d+) kB\)", page)
     assert size == pytest.approx(1000 * int(told), rel=0.03)  # compilers differ by a percent or two
     assert size < 0.95 * wasm.MAX_MODULE_BYTES
@@ -205,21 +205,21 @@ def test_page_scenes_are_the_start_of_native_ones():
 
 @needs_compiler
 def test_presets_of_the_page_have_the_results_of_the_documentation(tmp_path):
-    """Run each preset with the page's modules; compare with the tables of docs/web.md and docs/chapter-engines.md."""
+    """Run each preset with the page's modules; compare with engine.md and chapter-answers.md."""
     node = shutil.which("node")
     if node is None:
         pytest.skip("node is not installed")
     pages.write_page(tmp_path)
     output = subprocess.run([node, HERE / "preset_results.mjs", tmp_path], check=True, capture_output=True, text=True)
     results = json.loads(output.stdout)
-    page = (ROOT / "docs" / "web.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "engine.md").read_text(encoding="utf-8")
     presets = json.loads(PRESETS_PATH.read_text(encoding="utf-8"))["presets"]
     for preset in presets:
         if captions := results[preset["name"]]["captions"]:
             (row,) = re.findall(rf"^\| {re.escape(preset['title'])}[^|]*\| (.*) \|$", page, re.MULTILINE)
             a, b = row.split("; ")
             assert captions[0] in a and captions[1] in b, (preset["name"], captions)
-    chapter = (ROOT / "docs" / "chapter-engines.md").read_text(encoding="utf-8")
+    chapter = (ROOT / "docs" / "chapter-answers.md").read_text(encoding="utf-8")
     cells = [[cell.strip(" *") for cell in line.split("|")] for line in chapter.splitlines() if line.startswith("|")]
     alternating = {(row[3]): row[7] for row in cells if len(row) == 9}
     few_many = {n["last"]: n["a"] / n["b"] for n in results["experiment=4"]["numbers"]}
