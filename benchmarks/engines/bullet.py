@@ -6,11 +6,11 @@ import numpy as np
 
 from benchmarks.engines import Stepping, get_collision_shape
 from lavender.base.arrays import FloatArray
-from lavender.external.running import capture_backend_output
+from lavender.external.running import quiet
 from lavender.sim.scene import Body, Joint, Plane, Scene, Sphere
 from lavender.sim.scene.parts import convert_to_rotation_matrix
 
-with capture_backend_output(noisy=True):  # PyBullet prints a line at import.
+with quiet(noisy=True):  # PyBullet prints a line at import.
     import pybullet
 
 

@@ -26,10 +26,9 @@ from benchmarks.peers.backend_time import measure_backend_time
 from lavender import registry
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
-from lavender.external.as_qp import QP, ConicRows
 from lavender.external.backend import Backend
 from lavender.external.backends import BACKENDS
-from lavender.external.forms import PROGRAM_FORMS, build_program
+from lavender.external.forms import PROGRAM_FORMS, Form, build_form
 from lavender.external.qp_solver import QPSolver, explain_refusal
 from lavender.external.running import Limits
 from lavender.judge.residuals import get_zero_impulse_reference
@@ -87,30 +86,33 @@ class Result:
 
 def _limits(eps: float, n: int, limit: float) -> Limits:
     # The gap decreases as eps^2 if impulse and slack vanish together; below 1e-18 rounding hides it.
-    return Limits(eps, max(1e-2 * eps, 1e-18), max(1e-4 * eps, 1e-16), n, limit)
+    return Limits(eps, max(1e-2 * eps, 1e-18), n, limit)
 
 
-def _impulse(qp: QP, x: FloatArray | None, zeta: FloatArray | None) -> FloatArray:
-    if x is None or len(x) != qp.n or (qp.form == "velocity" and (zeta is None or len(zeta) != len(qp.b))):
-        return qp.problem.start()
-    return qp.recover_impulse(x, np.zeros(len(qp.b)) if zeta is None else zeta, np.zeros(qp.n))
+def _impulse(form: Form, x: FloatArray | None, lam: FloatArray | None) -> FloatArray:
+    program = form.program
+    if x is None or lam is None or len(x) != len(program.q) or not np.isfinite(lam).all():
+        return form.problem.start()
+    return form.recover_impulse(*program.restore_point(x, lam))
 
 
 def _backend(backend: Backend, form: str, own: str = "") -> Contestant:
     """Return the runs of a backend called by `lavender.external`; `own`: only its own set-up and solve are timed."""
 
     def runs(problem: Problem, limit: float) -> Iterator[Call]:
-        qp = QPSolver(backend, form=form).prepare(problem)
-        if form == "velocity" and backend.needs_definite and not qp.is_definite:
+        built = QPSolver(backend, form=form).prepare(problem)
+        if form == "velocity" and backend.needs_definite and not built.is_definite:
             return
-        start = problem.start()
+        scaled = built.program.scaled
+        if backend.needs_definite:
+            scaled = scaled.make_definite(0)
 
         def once(eps: float) -> tuple[float, FloatArray]:
             begun = process_time()
             with measure_backend_time(backend.name if own else "", process_time, setup=True) as spent:
-                answer = backend.run(qp, start, _limits(eps, backend.max_iter, limit), {})
+                answer = backend.run(scaled, None, _limits(eps, backend.max_iter, limit), {})
             seconds = sum(spent) if own else process_time() - begun
-            return seconds, _impulse(qp, answer.x, answer.zeta)
+            return seconds, _impulse(built, answer.x, answer.lam)
 
         untold = backend.call is None and backend.settings is None  # has a fixed tolerance
         for eps in LADDER[:1] if untold else LADDER:
@@ -133,15 +135,20 @@ def _cone(name: str, form: str) -> Contestant:
     """Return the runs of a solver of second-order cone programs by its own interface."""
 
     def runs(problem: Problem, limit: float) -> Iterator[Call]:
-        qp = build_program(problem, form)
-        conic = ConicRows.from_program(qp)
-        rows, rhs, upper = conic.A, conic.b, sp.csc_matrix(sp.triu(qp.P))
+        built = build_form(problem, form)
+        scaled = built.program.scaled
+        # A x + s = b: equations, inequalities with the bounds, cones.
+        rows, rhs = scaled.select_rows(np.arange(len(scaled.t)), -1.0, False), -scaled.t
+        upper, n_nonneg = (
+            sp.triu(scaled.get_hessian(False), format="csc"),
+            len(rhs) - scaled.free - sum(scaled.cones),
+        )
 
         def scs(eps: float) -> tuple[Any, Any]:
             import scs
 
-            cone = {"z": qp.n_zero, "l": conic.n_nonneg, "q": list(qp.soc)}
-            data = {"P": upper, "A": rows, "b": rhs, "c": qp.q}
+            cone = {"z": scaled.free, "l": n_nonneg, "q": list(scaled.cones)}
+            data = {"P": upper, "A": rows, "b": rhs, "c": scaled.q}
             found = scs.SCS(
                 data, cone, eps_abs=eps, eps_rel=0.0, eps_infeas=1e-14, max_iters=10**7,
                 time_limit_secs=limit, verbose=False,
@@ -151,12 +158,12 @@ def _cone(name: str, form: str) -> Contestant:
         def qoco(eps: float) -> tuple[Any, Any]:
             import qoco
 
-            z = qp.n_zero
+            z = scaled.free
             solver = qoco.QOCO()
             equal = (rows[:z], rhs[:z]) if z else (None, None)
             solver.setup(
-                qp.n, len(rhs) - z, z, upper, qp.q, *equal, sp.csc_matrix(rows[z:]), rhs[z:], conic.n_nonneg,
-                len(qp.soc), np.asarray(qp.soc, np.int32), abstol=max(eps, 1e-13), reltol=1e-16, verbose=0,
+                scaled.n, len(rhs) - z, z, upper, scaled.q, *equal, sp.csc_matrix(rows[z:]), rhs[z:], n_nonneg,
+                len(scaled.cones), np.asarray(scaled.cones, np.int32), abstol=max(eps, 1e-13), reltol=1e-16, verbose=0,
                 max_iters=200,
             )  # fmt: skip
             found = solver.solve()
@@ -166,7 +173,7 @@ def _cone(name: str, form: str) -> Contestant:
             begun = process_time()
             x, y = scs(eps) if name == "scs" else qoco(eps)
             seconds = process_time() - begun
-            return seconds, _impulse(qp, x, conic.split_multipliers(np.asarray(y, float))[0])
+            return seconds, _impulse(built, np.asarray(x), np.asarray(y, float))
 
         for eps in LADDER:
             yield functools.partial(once, eps)

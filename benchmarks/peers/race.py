@@ -10,7 +10,7 @@ from time import monotonic
 from typing import Any
 
 from benchmarks.peers.adapters import SCRATCH, TARGETS, Contestant, Result
-from lavender.external.running import capture_backend_output
+from lavender.external.running import quiet
 from lavender.judge.residuals import residual
 from lavender.problem import Problem
 from lavender.report.timing import limit_to_one_thread
@@ -23,7 +23,7 @@ PATIENCE = 10.0  # s, wall time beyond four times the limit of a call after whic
 def _child(pipe: Any, contestant: Contestant, problem: Problem, limit: float) -> None:
     # Runs in its own process: sends (seconds, residual) of each setting, then None or the reason for stopping.
     try:
-        with limit_to_one_thread(contestant.name), capture_backend_output(noisy=True):
+        with limit_to_one_thread(contestant.name), quiet(noisy=True):
             least = max(min(TARGETS), 2.0 * residual(problem, problem.start()).roundoff_floor)
             for call in contestant.runs(problem, limit):
                 began = monotonic()

@@ -1,8 +1,4 @@
-"""Description of a QP backend, and one run of it by its own interface or through qpsolvers.
-
-qpsolvers returns iterates and multipliers of all backends. For some backends it solves problems without constraints by
-SciPy's LSQR instead; `build_program` adds a row to such problems.
-"""
+"""Description of a QP backend, and one run of it through qpsolvers or by its own interface."""
 
 from __future__ import annotations
 
@@ -18,21 +14,13 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.external.as_qp import QP, ConicRows
-from lavender.external.running import (
-    Answer,
-    Call,
-    Limits,
-    capture_backend_output,
-    clamp_tolerance,
-    classify_status,
-    keep_if_infeasibility_certificate,
-)
+from lavender.external.convex import ScaledProgram
+from lavender.external.running import Answer, Call, Limits, classify_status, quiet
 from lavender.judge.solution import Status
 
-# Larger programs are passed as sparse matrices. Of 398 programs, PIQP did not solve 1 if sparse, none if dense.
-MAX_PIQP_ENTRIES = 10**4
-MAX_PROXQP_ENTRIES = 10**6  # The same, of repeated calls of proxqp.
+# A backend with `prefers_dense` gets dense matrices of up to this many entries, or of MAX_DENSE_FILL times the number
+# of their nonzero entries.
+MAX_DENSE_ENTRIES, MAX_DENSE_FILL = 10**4, 4
 # A backend that replaces the handler of Ctrl-C puts the previous one back. Two of them at the same time would leave the
 # handler of one, with which Ctrl-C no longer raises KeyboardInterrupt.
 _HANDLER_LOCK = threading.Lock()
@@ -114,13 +102,17 @@ class Backend:
         Function that calls the backend's own interface. Default: the backend is called through qpsolvers.
     settings : mapping, optional
         Options to pass through qpsolvers: name -> a field of `Limits` (a str), or a fixed value. None if the backend
-        runs at its own tolerances.
+        runs at its own tolerance, or has a function `call`.
     min_tolerance : float
         Smallest tolerance that the backend accepts.
     max_iter : int
         Default limit of iterations.
     dense : bool
         Whether the backend accepts dense matrices only.
+    prefers_dense : bool
+        Whether the backend gets dense matrices if they are small or full.
+    starts : bool
+        Whether a start point is passed to the backend.
     stoppable : bool
         Whether the backend accepts a time limit.
     finite : bool
@@ -147,6 +139,8 @@ class Backend:
     min_tolerance: float = 0.0
     max_iter: int = 10_000
     dense: bool = False
+    prefers_dense: bool = False
+    starts: bool = False
     stoppable: bool = False
     finite: bool = False
     noisy: bool = False
@@ -159,86 +153,84 @@ class Backend:
         """Whether the backend needs a positive definite P, as in the velocity form."""
         return self.behaviour is not None and self.behaviour.linear_term is None
 
-    @property
-    def uses_start(self) -> bool:
-        """Whether the backend uses a start point."""
-        return self.behaviour is not None and bool(self.behaviour.start)
-
-    def run(self, qp: QP, impulse: FloatArray, limit: Limits, settings: dict[str, Any]) -> Answer:
+    def run(
+        self,
+        program: ScaledProgram,
+        start: tuple[FloatArray, FloatArray] | None,
+        limit: Limits,
+        settings: dict[str, Any],
+    ) -> Answer:
         """Run the backend once, in this process."""
         call = self.call or partial(_call_through_qpsolvers, self)
-        with _HANDLER_LOCK if self.interrupts else nullcontext():
-            return call(qp, impulse, limit, settings)
+        with _HANDLER_LOCK if self.interrupts else nullcontext(), quiet(self.noisy):
+            return call(program, start, limit, settings)
 
 
 def _call_through_qpsolvers(
-    backend: Backend, qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]
+    backend: Backend,
+    program: ScaledProgram,
+    start: tuple[FloatArray, FloatArray] | None,
+    limit: Limits,
+    extra: dict[str, Any],
 ) -> Answer:
     """Call a backend through qpsolvers."""
     import qpsolvers
 
-    eps = clamp_tolerance(limit.eps, backend.min_tolerance) if backend.min_tolerance else limit.eps
-    limits = {**vars(limit), "eps": eps}
+    limits = {**vars(limit), "eps": max(limit.eps, backend.min_tolerance)}
     options = {name: limits[x] if isinstance(x, str) else x for name, x in (backend.settings or {}).items()}
     settings = {name: x for name, x in options.items() if x is not None}  # Leave out a time limit of None.
-    size = qp.n * max(qp.n, len(qp.b))
-    dense = backend.dense or (backend.name == "piqp" and size <= MAX_PIQP_ENTRIES)
-    if backend.name == "proxqp":
-        # Its sparse code calls a few feasible programs infeasible; its dense code is slower and does so less often.
-        dense = limit.attempt > 0 and size <= MAX_PROXQP_ENTRIES
-        settings.update(_make_proxqp_start(qp, impulse) if limit.attempt == 0 else {})
-    settings.update(extra)
-    conic = ConicRows.from_program(qp) if backend.finite else None
-    matrix, rhs = (qp.A, qp.b) if conic is None else (conic.A, conic.b)
-    lb, ub = (qp.lb, qp.ub) if conic is None else (None, None)
-    # In rows: pyqpmad factors a P in columns in place, and qpsolvers then computes multipliers from its factor; qpoases
-    # reads the numbers of columns as those of rows.
-    p, rows = (np.ascontiguousarray(x.toarray()) if dense else x for x in (qp.P, matrix))
-    z = qp.n_zero  # The first rows are equalities, the others inequalities.
-    a, b = (rows[:z], rhs[:z]) if z else (None, None)
-    g, h = (rows[z:], rhs[z:]) if len(rhs) > z else (None, None)
-    problem = qpsolvers.Problem(p, qp.q, g, h, a, b, lb, ub)
+    n = program.n
+    dense = backend.dense
+    if backend.prefers_dense:
+        size, nonzeros = n * (n + len(program.t)), len(program.P[2]) + len(program.J[2])
+        dense = size <= max(MAX_DENSE_ENTRIES, MAX_DENSE_FILL * nonzeros)
+    if start is not None and backend.starts:
+        settings |= _make_start_settings(backend, program, start)
     x0 = settings.pop("initvals", None)
-    with capture_backend_output(False) as warnings:
-        solution = qpsolvers.solve_problem(problem, backend.name, initvals=x0, **settings)
+    settings |= extra
+    equations, inequalities, low, high = program.parts
+    bounds = program.list_bounds()
+    if backend.finite and bounds is not None:  # Pass bounds as rows.
+        low, high = low[low >= program.free], high[high >= program.free]
+        fixed = np.flatnonzero(program.variable[: program.free] >= 0)
+        equations, inequalities = np.append(equations, fixed), np.concatenate([inequalities, low, high])
+        bounds = None
+    lb, ub = (None, None) if bounds is None else bounds
+    a = b = g = h = None
+    if len(equations):
+        a, b = program.select_rows(equations, 1.0, dense), program.t[equations]
+    if len(inequalities):
+        g, h = program.select_rows(inequalities, -1.0, dense), -program.t[inequalities]
+    elif not len(equations) and bounds is None:
+        # Many backends need a row or a bound, and qpsolvers passes programs without them to LSQR: add 0 x <= 1.
+        g, h = program.select_rows(np.zeros(0, int), 1.0, dense), np.ones(1)
+        g.resize((1, n))
+    problem = qpsolvers.Problem(program.get_hessian(dense), program.q, g, h, a, b, lb, ub)
+    solution = qpsolvers.solve_problem(problem, backend.name, initvals=x0, **settings)
     # Collect the status, the iterate and the multipliers.
     extras = solution.extras or {}
-    status, status_text = _get_status(solution, extras)
+    status, text = _get_status(solution, extras)
     x = None if solution.x is None else np.asarray(solution.x, float).ravel()
-    sizes = {"y": z, "z": len(rhs) - z, "z_box": qp.n}
-    values = {k: np.ravel([] if getattr(solution, k) is None else getattr(solution, k)) for k in sizes}
-    found = {k: v for k, v in values.items() if len(v) == sizes[k]}
-    if ("y" not in found and z and qp.form != "impulse") or ("z" not in found and len(qp.b) > z):
-        x = None  # In the velocity form, impulses are computed from the multipliers alone.
-    zeta, xi = np.concatenate([found.get(k, np.zeros(sizes[k])) for k in "yz"]), found.get("z_box")
-    if conic is not None:
-        zeta, xi = conic.split_multipliers(zeta)
+    lam = np.zeros(len(program.t))
+    for rows, values, sign in ((equations, solution.y, -1.0), (inequalities, solution.z, 1.0)):
+        if len(rows):
+            values = np.ravel([] if values is None else values)
+            lam[rows] = sign * values[: len(rows)] if len(values) >= len(rows) else np.nan
+    if bounds is not None:
+        box = np.ravel([] if solution.z_box is None else solution.z_box)
+        of_bounds = program.join_multipliers(None, None, box if len(box) == n else np.full(n, np.nan))
+        lam = np.where(program.variable >= 0, of_bounds, lam)
     iterations = _get_iterations(extras)
-    work = {} if iterations is None else {"iterations": iterations}
-    message = status_text or "; ".join(warnings) or _describe_result(solution.found, x)
+    message = text or (
+        "solved" if solution.found else "not solved" + (", nothing returned" if x is None else "")
+    )
     if backend.settings is None:
         message += ", at its own tolerance"
     if backend.jax and not sys.modules["jax"].config.jax_enable_x64:
         message += (
             "; JAX computes in 32 bits: jax.config.update('jax_enable_x64', True) makes it compute in 64 bits"
         )
-    direction, contradiction = (
-        keep_if_infeasibility_certificate(qp, x, zeta) if status is Status.INFEASIBLE else (None, None)
-    )
-    return Answer(
-        status=status,
-        message=message,
-        x=x,
-        zeta=zeta,
-        xi=xi,
-        work=work,
-        direction=direction,
-        contradiction=contradiction,
-    )
-
-
-def _describe_result(is_solved: bool | None, x: Any) -> str:
-    return "solved" if is_solved else "not solved" if x is not None else "not solved, nothing returned"
+    return Answer(status, message, x, lam, {} if iterations is None else {"iterations": iterations})
 
 
 def _find_value(extras: Mapping[str, Any], *names: str) -> Any:
@@ -277,14 +269,17 @@ def _get_status(solution: Any, extras: Mapping[str, Any]) -> tuple[Status, str]:
     return Status.NUMERICAL_ERROR if status is Status.CONVERGED else status, text
 
 
-def _make_proxqp_start(qp: QP, impulse: FloatArray) -> dict[str, Any]:
-    """Return the settings that start proxqp, the only backend that qpsolvers can start, from an impulse (m,) [N s]."""
+def _make_start_settings(
+    backend: Backend, program: ScaledProgram, start: tuple[FloatArray, FloatArray]
+) -> dict[str, Any]:
+    """Return the settings that start a backend from x (n,) and multipliers (m,) in scaled units."""
+    x, lam = start
+    if backend.name != "proxqp":
+        return {"initvals": x}
     from proxsuite import proxqp
 
-    x, zeta, xi = qp.make_start(impulse)
-    z = zeta[qp.n_zero :]
-    if qp.lb is not None or len(qp.b) == 0:
-        z = np.concatenate([z, xi])
+    y, z, box = program.split_multipliers(lam)
+    z = z if program.list_bounds() is None else np.concatenate([z, box])
     settings = {"initvals": x, "initial_guess": proxqp.InitialGuess.WARM_START}
-    settings |= {"y": zeta[: qp.n_zero]} if qp.n_zero else {}
+    settings |= {"y": y} if len(y) else {}
     return settings | ({"z": z} if len(z) else {})

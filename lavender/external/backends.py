@@ -7,9 +7,8 @@ one cone:
 
     l_n >= 0,  |l_t| <= mu l_n,  |l_s| <= mu r l_n,  or the dual cone w_n >= a |w_t| + a_s |w_s|
 
-Some backends are called by their own interface (`native.py`), because qpsolvers returns neither their numbers of
-iterations nor their exit flags and certificates, and cannot warm-start them. The others are called through qpsolvers
-(`backend.py`).
+OSQP and Clarabel are called by their own interfaces (`native.py`), for warm starts, iteration counts and cones. The
+others are called through qpsolvers (`backend.py`).
 """
 
 from __future__ import annotations
@@ -30,13 +29,26 @@ from lavender.solvers.registry import SolverSpec
 #: Options of backends that qpsolvers calls: a str is a field of `Limits`, other values are fixed.
 PROXIMAL = {  # Without the test of the duality gap, proxqp accepts non-zero multipliers of inactive bounds.
     "eps_abs": "eps", "eps_rel": 0.0, "max_iter": "max_iter",
-    "check_duality_gap": True, "eps_duality_gap_abs": "gap", "eps_duality_gap_rel": "gap_relative",
+    "check_duality_gap": True, "eps_duality_gap_abs": "gap", "eps_duality_gap_rel": "gap",
 }  # fmt: skip
 # [-] Weight of ProxQP's proximal steps of x. With its default 1e-6, 18 of 400 solvable programs are called infeasible,
 # with 1e-2 only 3. With 0.1, 2 are, but ProxQP needs 1.6 times as many iterations.
 PROXQP_PROXIMAL_WEIGHT = 1e-2
-CVXOPT = {"feastol": "eps", "abstol": "gap", "reltol": "gap_relative", "maxiters": "max_iter"}
-ECOS = {"feastol": "eps", "abstol": "gap", "reltol": "gap_relative", "max_iters": "max_iter"}
+# [-] Added to the diagonal of P by HiGHS. With its default 1e-7, it changes the solution; without it, its active-set
+# method ends at wrong points if P is singular.
+HIGHS_REGULARIZATION = 1e-10
+DAQP = {"primal_tol": "eps", "dual_tol": 1e-12, "iter_limit": "max_iter", "time_limit": "time_limit"}
+HIGHS = {
+    "primal_feasibility_tolerance": "eps", "dual_feasibility_tolerance": "eps", "qp_iteration_limit": "max_iter",
+    "qp_regularization_value": HIGHS_REGULARIZATION, "time_limit": "time_limit",
+}  # fmt: skip
+SCS = {"eps_abs": "eps", "eps_rel": "eps", "max_iters": "max_iter", "time_limit_secs": "time_limit"}
+QPALM = {
+    "eps_abs": "eps", "eps_rel": 0.0, "eps_abs_in": 1.0, "eps_rel_in": 0.0, "eps_prim_inf": 1e-11,
+    "eps_dual_inf": 1e-11, "max_iter": "max_iter", "inner_max_iter": "max_iter", "time_limit": "time_limit",
+}  # fmt: skip
+CVXOPT = {"feastol": "eps", "abstol": "gap", "reltol": "gap", "maxiters": "max_iter"}
+ECOS = {"feastol": "eps", "abstol": "gap", "reltol": "gap", "max_iters": "max_iter"}
 GUROBI = {
     "FeasibilityTol": "eps", "OptimalityTol": "eps", "BarConvTol": "gap", "BarIterLimit": "max_iter",
     "IterationLimit": "max_iter", "Threads": 1, "TimeLimit": "time_limit",
@@ -49,7 +61,7 @@ COPT = {
     "TimeLimit": "time_limit",
 }
 QTQP = {
-    "tol_feas": "eps", "tol_gap_abs": "gap", "tol_gap_rel": "gap_relative", "max_iter": "max_iter",
+    "tol_feas": "eps", "tol_gap_abs": "gap", "tol_gap_rel": "gap", "max_iter": "max_iter",
     "collect_stats": True,
 }  # fmt: skip
 PYQPMAD = {"tolerance": "eps", "max_iter": "max_iter"}
@@ -69,7 +81,8 @@ CVXOPT_BEHAVIOUR = Behaviour(
 ADMM = "Stellato et al. 2020, OSQP: an operator splitting solver for quadratic programs"
 BACKENDS: tuple[Backend, ...] = (
     Backend("osqp", ("osqp",), "osqp", "operator splitting with polishing", ADMM,
-            call=native.call_osqp, max_iter=100_000, stoppable=True, interrupts=True,
+            call=native.call_osqp, max_iter=100_000, starts=True, stoppable=True,
+            interrupts=True,
             behaviour=Behaviour("1.1.3", conflict=1e-4, start="x and y", saddle="raises", infeasible_x="2143289344",
                 linear_term=4e-5, second_solve="other", time_limit="with set-up", notes={
                 "memory": "An object keeps its step size of earlier solves, also with warm_starting=False.",
@@ -80,7 +93,7 @@ BACKENDS: tuple[Backend, ...] = (
                 small_part=40.0,
                 second_solve="same", time_limit="without set-up")),
     Backend("piqp", ("qpsolvers", "piqp"), "piqp", "proximal interior point",
-            "Schwan, Jiang, Kuhn, Jones 2023, PIQP", settings=PROXIMAL, max_iter=250,
+            "Schwan, Jiang, Kuhn, Jones 2023, PIQP", settings=PROXIMAL, max_iter=250, prefers_dense=True,
             behaviour=Behaviour("0.7.0", conflict=1e-8, offset=0.01, saddle="right", infeasible_x="0", far_bound=1e9,
                 small_part=2.0,
                 second_solve="same", notes={
@@ -88,6 +101,7 @@ BACKENDS: tuple[Backend, ...] = (
                 "unsorted": "If the indices of a sparse P are not sorted, a solvable program is not solved."})),
     Backend("proxqp", ("qpsolvers", "proxsuite"), "proxsuite", "proximal augmented Lagrangian",
             "Bambade et al. 2022, ProxQP", settings=PROXIMAL | {"rho": PROXQP_PROXIMAL_WEIGHT},
+            prefers_dense=True, starts=True,
             behaviour=Behaviour("0.8.0", conflict=1e-5, start="x, y and z", singular="wrong", saddle="wrong",
                 infeasible_x="0",
                 linear_term=0.1, second_solve="other", notes={
@@ -95,26 +109,26 @@ BACKENDS: tuple[Backend, ...] = (
                     "rho=0.1 it is not.",
                 "dense_triangle": "This holds for a sparse P. Of a dense P, the lower triangle is read instead.",
                 "crossed_bounds": "Bounds of a variable that exclude each other (lb > ub) are reported as solved."})),
-    Backend("qpalm", ("qpalm",), "qpalm", "proximal augmented Lagrangian, semismooth Newton",
-            "Hermans, Themelis, Patrinos 2022, QPALM", call=native.call_qpalm, stoppable=True,
+    Backend("qpalm", ("qpsolvers", "qpalm"), "qpalm", "proximal augmented Lagrangian, semismooth Newton",
+            "Hermans, Themelis, Patrinos 2022, QPALM", settings=QPALM, stoppable=True,
             behaviour=Behaviour("1.3.0", conflict=1e-4, offset=0.003, start="x and y", saddle="wrong",
                 infeasible_x="0", linear_term=0.0,
                 smallest=1e-5, second_solve="other")),
-    Backend("daqp", ("daqp",), "daqp", "dual active set", "Arnström, Bemporad, Axehill 2022, DAQP",
-            call=native.call_daqp, dense=True, stoppable=True,
+    Backend("daqp", ("qpsolvers", "daqp"), "daqp", "dual active set", "Arnström, Bemporad, Axehill 2022, DAQP",
+            settings=DAQP, dense=True, starts=True, stoppable=True,
             behaviour=Behaviour("0.11.0", "all", "x", conflict=1.0, contradictory="wrong", convex_on_rows="not found",
                 linear_term=0.03, second_solve="same", time_limit="without set-up", notes={
                 "slice": "A P that is a slice of a larger array is read as if it was contiguous, and a wrong point is "
                     "reported as optimal.",
                 "flag": "Contradictory equalities end with its exit flag -6, which qpsolvers reports as solved."})),
-    Backend("highs", ("highspy",), "highspy", "null-space active set", "Huangfu, Hall 2018, HiGHS",
-            call=native.call_highs, max_iter=100_000, stoppable=True,
+    Backend("highs", ("qpsolvers", "highspy"), "highspy", "null-space active set", "Huangfu, Hall 2018, HiGHS",
+            settings=HIGHS, max_iter=100_000, stoppable=True, noisy=True,
             behaviour=Behaviour("1.16.0", "lower", conflict=1e-8, offset=0.0, convex_on_rows="not found",
                 infeasible_x="0", smallest=1e-4,
                 far_bound=1e15, second_solve="same", notes={
                 "free_row": "A free row does not avoid the zeros below 1e-4; q and bounds multiplied by 1024 do."})),
-    Backend("scs", ("scs",), "scs", "operator splitting, homogeneous embedding",
-            "O'Donoghue 2021, SCS 3", call=native.call_scs, max_iter=100_000, stoppable=True,
+    Backend("scs", ("qpsolvers", "scs"), "scs", "operator splitting, homogeneous embedding",
+            "O'Donoghue 2021, SCS 3", settings=SCS, max_iter=100_000, stoppable=True,
             interrupts=True,
             behaviour=Behaviour("3.3.1", conflict=1e-4, offset=10.0, start="x, y and s", saddle="raises",
                 infeasible_x="nan", linear_term=3e-5,
@@ -227,15 +241,15 @@ SECOND_SOLVE_PHRASES = {"same": "the same bits", "other": "other bits"}
 #: Remedy of the adapter for an observation, by field of `Behaviour`.
 ADAPTER_REMEDIES = {
     "triangle": "Both triangles of P are passed equal in every bit, or the one that is read.",
-    "start": "The arrays of a start are passed if one is given.",
-    "linear_term": "Calls with smaller tolerances follow until the judge accepts the answer.",
-    "small_part": "Calls with smaller tolerances follow until the judge accepts the answer.",
+    "start": "A start is passed to osqp, proxqp and daqp.",
+    "linear_term": "Programs are scaled to numbers near 1, and a Newton step removes the error of the tolerance.",
+    "small_part": "Programs are scaled to numbers near 1, and a Newton step removes the error of the tolerance.",
     "smallest": "Programs are scaled to numbers near 1.",
-    "far_bound": "Far bounds are left out, and are checked at the solution.",
+    "far_bound": "Far bounds are left out in the first call, and are checked at the solution.",
     "fixed_multiplier": "Bounds are passed as rows.",
-    "infeasible_x": "A claim of infeasibility returns the start, and counts only with a certificate.",
+    "infeasible_x": "A claim of infeasibility counts only with a certificate.",
     "conflict": "The judge contradicts such a claim at smaller tolerances than d.",
-    "offset": "Calls with smaller tolerances follow until the judge accepts the answer.",
+    "offset": "A Newton step removes the error of the tolerance.",
     "second_solve": "Each call makes a new object.",
     "contradictory": "The judge contradicts a wrong claim about contradictory rows.",
     "unbounded": "The judge contradicts a wrong claim about an unbounded program.",
@@ -352,8 +366,8 @@ def _make_spec(backend: Backend) -> SolverSpec:
         box_friction_laws=frozenset() if backend.needs_definite else frozenset({"cone"}),
         resumable=False,
         external=True,
-        impulse=backend.uses_start,
-        singular_programs=not (backend.needs_definite or backend.cones),
+        impulse=backend.starts,
+        singular_programs=not backend.cones,
         round_cones=backend.cones,
         supports_rolling=backend.cones,
         max_iter=backend.max_iter,

@@ -1,8 +1,8 @@
-"""Three forms of a problem as a convex program (`as_qp.QP`).
+"""Forms of a problem as a convex program (`convex.ConvexProgram`), and the impulses of its answers.
 
-Impulse form, lambda = sigma S x, S = D^-1/2 (with `unit_diagonal`, else one number for all rows):
+Impulse form, with the impulses of the unknown rows as variables:
 
-    P = S A S,  q = -S b / sigma,  bounds of lambda;  friction  |x_t| <= a x_n,  a = mu S_n / S_t
+    P = A,  q = -b,  bounds of lambda;  friction  |x_t| <= mu x_n
 
 Velocity form, from `Problem.velocity_form` (K, theta, g; y = M^1/2 times the change of velocity), S = D^-1/2:
 
@@ -14,21 +14,18 @@ Velocity form, from `Problem.velocity_form` (K, theta, g; y = M^1/2 times the ch
     only an upper bound     -w >= 0                        r = u
     disk and spin           w_n - a_s t >= a |w_t|,  t >= |w_s|;  a second disk likewise, t >= a_r |w_r|
 
-with lambda = sigma S (r + T zeta), and the rows A = -T^T K~ (without the columns of t). The unknowns are the velocities
-y, one p for each soft row, and t; J J^T is never formed.
+with lambda = S (r + T zeta) and the multipliers zeta of the rows. The unknowns are the velocities y, one p for each
+soft row, and t; J J^T is never formed.
 
-Program form, of a quadratic program (`Problem.from_qp`): the user's own P, q, A, G and bounds. S is one number for all
-variables and another for all rows, the geometric mean of r^-1/2, with r_i the largest entry of row i of (5) of
-`problem/program.py`; sigma is the root mean square of r^-1/2 times the violation of the rows of (5) at zero. All three
-are rounded to powers of PROGRAM_UNIT, so that a backend receives the user's numbers in every bit if they are near 1.
-Backends equilibrate rows and columns themselves: with a second equilibration here, piqp 0.7 reported that a feasible
-public program is infeasible.
+Program form, of a quadratic program (`Problem.from_qp`): P, q and the rows of the program itself.
+
+Rows with a known impulse are removed: lower = upper, friction with mu = 0, rows of A that are zero.
 """
 
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -36,22 +33,118 @@ import numpy as np
 from lavender.base.arrays import FloatArray, check_choice
 from lavender.base.errors import CapabilityError
 from lavender.base.lazy_import import sparse as sp
-from lavender.external.as_qp import QP, FrictionComponent, IntpArray, ScaledProblem, is_singular
+from lavender.external.convex import ConvexProgram
 from lavender.problem import Problem
+from lavender.problem.program import IntpArray, QuadraticProgram
 
 PROGRAM_FORMS = ("impulse", "velocity", "program", "auto")
-# Backends treat larger numbers as infinite, or fail.
-# [-] A row with a larger scaled |b| is assumed to stay at its bound and is removed. Active rows have a scaled b near
-# 1, and a b of 10^k costs a backend k digits. If the assumption fails, the backend is called once more with all rows.
-MAX_SCALED_RHS = 1e2
-# [-] Value of MAX_SCALED_RHS for programs with a singular P. It is larger, because |x| often exceeds the active bounds.
-MAX_SCALED_SINGULAR_RHS = 1e6
 # At and above this mass ratio, the velocity form is more accurate at all sizes.
 VELOCITY_FORM_MASS_RATIO = 1e3
 # With more rows, only the numbers of rows and of velocities show whether A is singular.
 MAX_PIVOT_ROWS = 1000
-PROGRAM_UNIT = 16.0  # Power of two, larger than the differences of scale that matter to a backend.
+# [-] A counts as singular if a squared pivot of its Cholesky factor is at most this multiple of the diagonal.
+MAX_SINGULAR_DELASSUS_PIVOT = 1e-10
 Entries = list[tuple[int, float]]  # (column, value) of each entry of a row of a matrix.
+#: A friction component in scaled unknowns, |x_t / a_t| <= x_n: the row of x_n, the rows of x_t, and a_t of each.
+FrictionComponent = tuple[int, tuple[int, ...], tuple[float, ...]]
+
+
+@dataclass(frozen=True, eq=False)
+class Form:
+    """A problem as a convex program, and the conversion of its answers to impulses.
+
+    Parameters
+    ----------
+    name : {"impulse", "velocity", "program"}
+    problem : Problem
+    program : ConvexProgram
+    unknown_rows : (k,) int
+        Rows of the problem with impulses that the program determines.
+    fixed : (m,), N s
+        Known impulses of the other rows; 0 for unknown rows.
+    recovery : (k, r) or None
+        S T of the velocity form.
+    shift : (k,) or None
+        S r of the velocity form.
+    is_definite : bool
+        Whether P is known to be positive definite.
+    """
+
+    name: str
+    problem: Problem
+    program: ConvexProgram
+    unknown_rows: IntpArray
+    fixed: FloatArray
+    recovery: sp.csr_matrix | None = None
+    shift: FloatArray | None = None
+    is_definite: bool = False
+
+    def recover_impulse(self, x: FloatArray, lam: FloatArray) -> FloatArray:
+        """Compute the impulses (m,) [N s] of a point, clipped to constant bounds."""
+        if self.name == "program":
+            return np.concatenate([x, lam]) if self.problem.has_singular_program else lam
+        cones = self.problem.cones
+        return np.clip(self._combine(x, lam, 1.0), cones.lower, cones.upper)
+
+    def list_certificates(self, x: FloatArray, lam: FloatArray) -> list[FloatArray]:
+        """Return directions (m,) of impulses that may prove that no solution exists."""
+        if self.name == "program":
+            if not self.problem.has_singular_program:
+                return [lam]
+            return [np.concatenate([np.zeros(len(x)), lam]), np.concatenate([x, np.zeros(len(lam))])]
+        y = self._combine(x, lam, 0.0)
+        # Remove rounding errors outside of the recession cone of the bounds.
+        c = self.problem.cones
+        low, high = np.where(np.isfinite(c.lower), 0.0, -np.inf), np.where(np.isfinite(c.upper), 0.0, np.inf)
+        y = np.clip(y, low, high)
+        size = np.abs(y).max(initial=0.0)
+        return [y / size] if 0.0 < size < np.inf else []
+
+    def _combine(self, x: FloatArray, lam: FloatArray, weight: float) -> FloatArray:
+        """Return x or S T lambda on the unknown rows, with the given weight of S r and of known impulses (m,)."""
+        out = weight * self.fixed
+        if self.recovery is None or self.shift is None:
+            out[self.unknown_rows] = x
+        else:
+            out[self.unknown_rows] = weight * self.shift + self.recovery @ lam
+        return out
+
+    def make_start(self, impulse: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+        """Return (x, lambda) of a start (m,) [N s]; None in the velocity form."""
+        qp, program = self.problem.qp, self.program
+        if self.recovery is not None or program.cones:
+            return None
+        if self.name == "program":
+            x, lam = qp.recover_variables(impulse), qp.select_row_multipliers(impulse)
+        else:
+            # Values and multipliers of bounds are complementary: both follow from the sum of value and slope.
+            x, lam = impulse[self.unknown_rows], np.zeros(len(program.t))
+            slope = (self.problem.csr @ impulse - self.problem.b)[self.unknown_rows]
+            diagonal = self.problem.d[self.unknown_rows]
+            at = np.flatnonzero(program.variable >= 0)
+            sign, variable = program.J[2][program.J[0][at]], program.variable[at]
+            is_active = sign * (x - slope / diagonal)[variable] <= program.t[at]
+            lam[at] = np.where(is_active, np.maximum(sign * slope[variable], 0.0), 0.0)
+            x = x.copy()
+            x[variable[is_active]] = (sign * program.t[at])[is_active]
+        return (x, lam) if np.isfinite(x).all() and np.isfinite(lam).all() else None
+
+    def recover_bound_multiplier(self, x: FloatArray, lam: FloatArray, impulse: FloatArray) -> FloatArray:
+        """Return the multipliers z (m,) [m/s] of the bounds of the impulses, with A lambda - b + z = 0.
+
+        In the impulse form, they are the backend's own; in other forms and on rows that were removed, z = -w.
+        """
+        z: FloatArray = -self.problem.slack(impulse)
+        if self.name == "impulse":
+            bounds = np.flatnonzero(self.program.variable >= 0)
+            own = np.zeros(len(x))
+            np.add.at(
+                own,
+                self.program.variable[bounds],
+                -self.program.J[2][self.program.J[0][bounds]] * lam[bounds],
+            )
+            z[self.unknown_rows] = own
+        return z
 
 
 def choose_program_form(problem: Problem, form: str, definite: bool = False) -> str:
@@ -64,8 +157,7 @@ def choose_program_form(problem: Problem, form: str, definite: bool = False) -> 
         "auto" chooses the program form for a quadratic program (`Problem.from_qp`), and else the velocity form
 
         - for bodies or J and M if `definite` is set,
-        - for bodies if m exceeds its number of unknowns, without those of soft rows, or if the mass ratio is at least
-          VELOCITY_FORM_MASS_RATIO,
+        - for bodies if m exceeds their number of unknowns or the mass ratio is at least VELOCITY_FORM_MASS_RATIO,
         - for J and M if A is singular.
     definite : bool
         Whether the backend needs a positive definite P.
@@ -109,97 +201,106 @@ def _has_singular_delassus(problem: Problem) -> bool:
     if problem.m > MAX_PIVOT_ROWS:
         return False
     root = 1.0 / np.sqrt(problem.d)
-    return is_singular(root[:, None] * problem.dense() * root)
+    try:
+        pivots = np.square(np.linalg.cholesky(root[:, None] * problem.dense() * root).diagonal())
+    except np.linalg.LinAlgError:
+        return True
+    return bool((pivots <= MAX_SINGULAR_DELASSUS_PIVOT).any())
 
 
-def build_program(problem: Problem, form: str, *, fix_far_rows: bool = False, **options: Any) -> QP:
-    """Build the program in the given form.
-
-    Parameters
-    ----------
-    problem : Problem
-    form : {"impulse", "velocity", "program"}
-    fix_far_rows : bool
-        Whether to remove rows that b pushes far into a bound (MAX_SCALED_RHS).
-    **options
-        Options of `build_impulse_form`.
-    """
-    threshold = MAX_SCALED_SINGULAR_RHS if problem.has_singular_program else MAX_SCALED_RHS
-    scaled = ScaledProblem.from_problem(problem, threshold if fix_far_rows else np.inf)
-    build: Any = {
-        "impulse": _build_impulse_form,
-        "velocity": _build_velocity_form,
-        "program": _build_program_form,
-    }
-    qp: QP = build[form](scaled, **options)
-    if len(qp.b) or (qp.lb is not None and qp.ub is not None and np.isfinite([qp.lb, qp.ub]).any()):
-        return qp
-    # Many backends need a row or a bound, and qpsolvers passes programs without them to LSQR: add 0 x <= 1.
-    values, bounds = qp.recovery[:, : qp.n], sp.csr_matrix((len(qp.root), 1 + qp.n))
-    recovery, row = sp.csr_matrix(sp.hstack([values, bounds])), sp.csc_matrix((1, qp.n))
-    return replace(qp, A=row, b=np.ones(1), n_nonneg=1, lb=None, ub=None, recovery=recovery)
+def build_form(problem: Problem, form: str) -> Form:
+    """Build a form of the problem: "impulse", "velocity" or "program"."""
+    if form == "program":
+        qp: QuadraticProgram = problem.qp
+        return Form(
+            name="program", problem=problem, program=get_program(qp), unknown_rows=np.arange(problem.m),
+            fixed=np.zeros(problem.m), is_definite=not qp.is_singular,
+        )  # fmt: skip
+    c = problem.cones
+    known = (c.lower == c.upper) & np.isfinite(c.lower)
+    fixed = np.where(known, c.lower, 0.0)
+    size = np.diff(c.ptr)
+    has_own_bound = np.repeat(~c.is_contact | (size == 1), size)
+    for i in np.asarray(problem.metric.empty, int):
+        # The row of A is zero, so w = -b, and the sign of b determines the bound. If that bound is infinite, no
+        # solution exists, which the validation of the input reports.
+        if has_own_bound[i]:
+            bound = c.upper[i] if problem.b[i] > 0.0 else c.lower[i] if problem.b[i] < 0.0 else 0.0
+            known[i] = True
+            fixed[i] = np.clip(bound if np.isfinite(bound) else 0.0, c.lower[i], c.upper[i])
+    known[c.friction_rows] = c.friction_coefficient[c.friction_rows] == 0.0
+    build = _build_impulse_form if form == "impulse" else _build_velocity_form
+    return build(problem, np.flatnonzero(~known), fixed)
 
 
-def _build_impulse_form(scaled: ScaledProblem, unit_diagonal: bool = True) -> QP:
-    """Build the impulse form: min 1/2 l.A l - b.l over the bounds or friction cones of a symmetric problem.
+def get_program(qp: QuadraticProgram) -> ConvexProgram:
+    """Return the convex program of a quadratic program, which is stored with it."""
+    program: ConvexProgram | None = qp.__dict__.get("_convex_program")
+    if program is None:
+        program = ConvexProgram(
+            P=qp.hessian, q=qp.q, J=qp.jacobian, t=qp.target, free=qp.free, variable=qp.variable_of_row
+        )
+        qp.__dict__["_convex_program"] = program
+    return program
 
-    Parameters
-    ----------
-    scaled : ScaledProblem
-    unit_diagonal : bool
-        Whether to scale by D^-1/2. If false, all rows are scaled by one number, so that P is a multiple of A.
-    """
-    problem, unknown, sigma, k = scaled.problem, scaled.unknown_rows, scaled.sigma, len(scaled.unknown_rows)
-    if not unit_diagonal and k:
-        scaled.root[:] = np.exp(np.mean(np.log(scaled.root)))
-    c, root, a = problem.cones, scaled.root, problem.csr
-    p = _mirror_lower_triangle(a[unknown][:, unknown], root)
-    q = -root * (problem.b - (a @ scaled.fixed if scaled.fixed.any() else 0.0))[unknown] / sigma
-    lb, ub = c.lower[unknown] / (root * sigma), c.upper[unknown] / (root * sigma)
-    components = scaled.list_friction_components()
+
+def _list_friction_components(
+    problem: Problem, unknown: IntpArray, root: FloatArray
+) -> list[FrictionComponent]:
+    """Return the friction components with indices of unknown rows, in unknowns scaled by S (k,)."""
+    c = problem.cones
+    index_of = np.full(problem.m, -1)
+    index_of[unknown] = np.arange(len(unknown))
+    components: list[FrictionComponent] = []
+    for block, rows in c.friction_components():
+        normal, tangents = int(index_of[c.ptr[block]]), index_of[list(rows)]
+        if tangents[0] >= 0:
+            ratios = c.friction_coefficient[list(rows)] * root[normal] / root[tangents]
+            components.append((normal, tuple(tangents.tolist()), tuple(ratios.tolist())))
+    return components
+
+
+def _build_impulse_form(problem: Problem, unknown: IntpArray, fixed: FloatArray) -> Form:
+    """Build the impulse form: min 1/2 l.A l - b.l over the bounds or friction cones of a symmetric problem."""
+    c, k, a = problem.cones, len(unknown), problem.csr
+    hessian = _mirror_lower_triangle(a[unknown][:, unknown])
+    q = -(problem.b - (a @ fixed if fixed.any() else 0.0))[unknown]
+    root = np.ones(k)
+    components = _list_friction_components(problem, unknown, root)
     linear: list[Entries] = []
     conic: list[Entries] = []
     for n, tangents, ratios in components:
-        # A pair gives s = a x_n - x_t >= 0 and s = a x_n + x_t >= 0, a disk gives s = (a x_n, x_t) in a second-order
-        # cone.
+        # A pair gives a x_n - x_t >= 0 and a x_n + x_t >= 0, a disk gives (a x_n, x_t) in a second-order cone.
         a_n = ratios[0]
         if len(tangents) == 1:
-            linear += [[(n, -a_n), (tangents[0], sign)] for sign in (1.0, -1.0)]
+            linear += [[(n, a_n), (tangents[0], sign)] for sign in (-1.0, 1.0)]
         else:
-            conic += [[(n, -a_n)], *([(t, -a_n / a_t)] for t, a_t in zip(tangents, ratios, strict=True))]
-    matrix = _build_matrix(linear + conic, k).tocsc()
-    r = matrix.shape[0]
-    return QP(
-        **vars(scaled),
-        form="impulse",
-        P=p,
-        q=q,
-        A=matrix,
-        b=np.zeros(r),
-        n_zero=0,
-        n_nonneg=len(linear),
-        soc=_list_cone_sizes(components),
-        lb=None if c.is_free else lb,
-        ub=None if c.is_free else ub,
-        recovery=sp.csr_matrix(sp.eye_array(k, k + r + k)),
-        shift=np.zeros(k),
-    )
+            conic += [[(n, a_n)], *([(t, a_n / a_t)] for t, a_t in zip(tangents, ratios, strict=True))]
+    lower, upper = c.lower[unknown], c.upper[unknown]
+    low, high = np.flatnonzero(np.isfinite(lower)), np.flatnonzero(np.isfinite(upper))
+    bounds = [[(int(i), 1.0)] for i in low] + [[(int(i), -1.0)] for i in high]
+    rows = _build_matrix(linear + bounds + conic, k)
+    none = np.full(len(linear), -1), np.full(len(conic), -1)
+    program = ConvexProgram(
+        P=_get_arrays(hessian), q=q, J=_get_arrays(rows),
+        t=np.concatenate([np.zeros(len(linear)), lower[low], -upper[high], np.zeros(len(conic))]), free=0,
+        variable=np.concatenate([none[0], low, high, none[1]]).astype(np.int32), cones=_list_cone_sizes(components),
+    )  # fmt: skip
+    return Form(name="impulse", problem=problem, program=program, unknown_rows=unknown, fixed=fixed)
 
 
-def _build_velocity_form(scaled: ScaledProblem) -> QP:
+def _build_velocity_form(problem: Problem, unknown: IntpArray, fixed: FloatArray) -> Form:
     """Build the mass-scaled velocity form of a problem with bodies or J and M."""
-    problem, unknown, root, sigma = scaled.problem, scaled.unknown_rows, scaled.root, scaled.sigma
-    form, c, k = problem.velocity_form(), problem.cones, len(unknown)
+    form, c, k, root = problem.velocity_form(), problem.cones, len(unknown), 1.0 / np.sqrt(problem.d[unknown])
     # Form K~ = [K, theta^1/2].
     jac, theta = sp.csr_matrix(form.jacobian), form.theta[unknown]
     soft = np.flatnonzero(theta > 0.0)
     root_theta = sp.csr_matrix((np.sqrt(theta[soft]), (soft, np.arange(len(soft)))), shape=(k, len(soft)))
     velocity_map = sp.csr_matrix(sp.hstack([jac[unknown], root_theta]))
-    ny = velocity_map.shape[1]
-    g = form.rhs[unknown] / sigma
+    ny, g = velocity_map.shape[1], form.rhs[unknown]
     # Classify bounded rows as free, with a lower bound, with both bounds, or with an upper bound.
-    low, high = c.lower[unknown] / (root * sigma), c.upper[unknown] / (root * sigma)
-    components = scaled.list_friction_components()
+    low, high = c.lower[unknown] / root, c.upper[unknown] / root
+    components = _list_friction_components(problem, unknown, root)
     is_bounded = np.ones(k, bool)
     is_bounded[[i for n, tangents, _ in components for i in (n, *tangents)]] = False
     has_low, has_high = is_bounded & np.isfinite(low), is_bounded & np.isfinite(high)
@@ -209,34 +310,38 @@ def _build_velocity_form(scaled: ScaledProblem) -> QP:
     t_of_row = dict(zip(both.tolist(), range(ny, ny + len(both)), strict=True))
     rows, n_friction = _list_velocity_rows(components, free, np.flatnonzero(has_low), upper, ny, t_of_row)
     n, r = ny + len(both) + n_friction, len(rows)
-    # Form the rows A = -T^T K~, and append the columns of t.
+    # Form the rows T^T K~ with the columns of t, and insert the rows t >= 0 before the cones.
     transposed = _build_matrix([multipliers for multipliers, _ in rows], k)
-    velocities = -(transposed @ velocity_map)
+    velocities = transposed @ velocity_map
     velocities.resize(r, n)
+    velocities = sp.csr_matrix(velocities - _build_matrix([slacks for _, slacks in rows], n))
+    slack_rows = _build_matrix([[(i, 1.0)] for i in range(ny, n)], n)
+    sizes = _list_cone_sizes(components)
+    first, n_slack = r - sum(sizes), n - ny
+    order = np.concatenate([np.arange(first), r + np.arange(n_slack), np.arange(first, r)]).astype(int)
+    matrix = sp.csr_matrix(sp.vstack([velocities, slack_rows]))[order]
     q = np.zeros(n)
     known = np.zeros(ny)
-    known[: jac.shape[1]] = jac.T @ (scaled.fixed / (form.scale * sigma))
+    known[: jac.shape[1]] = jac.T @ (fixed / form.scale)
     q[:ny] = -(velocity_map.T @ shift) - known
     q[ny : ny + len(both)] = high[both] - low[both]
-    velocity_map.resize(k, n)
-    is_slack = np.arange(n) >= ny
-    return QP(
-        **vars(scaled),
-        form="velocity",
-        P=sp.csc_matrix(sp.diags_array(np.where(is_slack, 0.0, 1.0))),
-        q=q,
-        A=sp.csc_matrix(velocities + _build_matrix([slacks for _, slacks in rows], n)),
-        b=-(transposed @ g),
-        n_zero=len(free),
-        n_nonneg=r - len(free) - sum(_list_cone_sizes(components)),
-        soc=_list_cone_sizes(components),
-        lb=np.where(is_slack, 0.0, -np.inf) if n > ny else None,
-        ub=np.full(n, np.inf) if n > ny else None,
-        recovery=sp.csr_matrix(sp.hstack([sp.csr_matrix((k, n)), transposed.T, sp.csr_matrix((k, n))])),
-        shift=shift,
-        slack_map=velocity_map,
-        slack_rhs=g,
-    )
+    is_velocity = np.arange(n) < ny
+    variable = np.concatenate([np.full(r, -1), np.arange(ny, n)])[order].astype(np.int32)
+    program = ConvexProgram(
+        P=_get_arrays(sp.csr_matrix(sp.diags_array(np.where(is_velocity, 1.0, 0.0)))), q=q, J=_get_arrays(matrix),
+        t=np.concatenate([transposed @ g, np.zeros(n_slack)])[order], free=len(free), variable=variable, cones=sizes,
+    )  # fmt: skip
+    recovery = sp.vstack([transposed, sp.csr_matrix((n_slack, k))]).tocsr()[order].T
+    return Form(
+        name="velocity", problem=problem, program=program, unknown_rows=unknown, fixed=fixed,
+        recovery=sp.csr_matrix(sp.diags_array(root) @ recovery), shift=root * shift, is_definite=not n_slack,
+    )  # fmt: skip
+
+
+def _get_arrays(matrix: sp.csr_matrix) -> tuple[Any, Any, Any]:
+    """Return (indptr, indices, data) of a matrix in compressed rows, with indices of 32 bits."""
+    matrix.sort_indices()
+    return matrix.indptr.astype(np.int32), matrix.indices.astype(np.int32), matrix.data.astype(float)
 
 
 def _list_velocity_rows(
@@ -262,7 +367,7 @@ def _list_velocity_rows(
     Returns
     -------
     rows, n_friction : list of (entries, entries), int
-        The rows, and the number of unknowns t of friction, which follow those of `t_of_row`.
+        The rows, and the number of unknowns t of friction, which follow `t_of_row`.
     """
     rows: list[tuple[Entries, Entries]] = [([(i, -1.0)], []) for i in free.tolist()]
     rows += [([(i, 1.0)], [(t_of_row[i], -1.0)] if i in t_of_row else []) for i in lower.tolist()]
@@ -294,99 +399,19 @@ def _list_velocity_rows(
     return rows, next(new) - first
 
 
-def _build_program_form(scaled: ScaledProblem) -> QP:
-    """Build the program form of a quadratic program."""
-    qp, unknown = scaled.problem.qp, scaled.unknown_rows
-    n, m = len(qp.q), len(qp.target)
-    # With a singular P, the first impulses are the variables.
-    offset = n if qp.is_singular else 0
-    variables = unknown[unknown < n] if offset else np.arange(n)
-    n_x, k = len(variables), len(unknown)
-    n_shared = n_x if offset else 0
-    rows = unknown[n_shared:] - offset
-    # Scale by the largest entries of the rows of (5) and their violations at x = 0.
-    sizes = np.zeros(n + m)
-    for matrix, row_first in ((qp.generalized.mass, 0), (qp.generalized.jac, n)):
-        row_of_entry = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
-        for first, index in ((row_first, row_of_entry), (0, matrix.indices)):
-            np.maximum.at(sizes, first + index, np.abs(matrix.data))
-    violation = np.concatenate([np.abs(qp.q), np.maximum(qp.target, 0.0)])
-    violation[n : n + qp.free] = np.abs(qp.target[: qp.free])
-    parts = variables, n + rows
-    roots = [1.0 / np.sqrt(sizes[part]) for part in parts]
-    squares = [(root * violation[part]) ** 2 for root, part in zip(roots, parts, strict=True)]
-    sigma = _round_unit(np.sqrt(np.mean(np.concatenate(squares))))
-    unit, row_unit = (_round_unit(np.exp(np.mean(np.log(root)))) if len(root) else 1.0 for root in roots)
-    # Classify the rows of `problem/program.py` (2): A, fixed variables, G, lower and upper bounds.
-    none = np.zeros(0, np.intp)
-    fixed, lower, upper = (none if at is None else at for at in (qp.fixed, qp.lower, qp.upper))
-    n_a, n_g = qp.free - len(fixed), m - qp.free - len(lower) - len(upper)
-    kind = np.repeat(range(5), [n_a, len(fixed), n_g, len(lower), len(upper)])[rows]
-    variable = np.concatenate([np.zeros(n_a, int), fixed, np.zeros(n_g, int), lower, upper])[rows]
-    index_of = np.zeros(n, int)
-    index_of[variables] = np.arange(n_x)
-    at, sign = index_of[variable], np.array([-1.0, -1.0, 1.0, -1.0, 1.0])[kind]
-    is_general = (kind == 0) | (kind == 2)
-    general = np.flatnonzero(is_general)
-    r = len(general)
-    root = np.where(is_general, row_unit, 1.0 / unit)
-    jac, hessian = qp.generalized.jac, qp.generalized.mass
-    if len(rows) < m or n_x < n:
-        jac, hessian = jac[rows][:, variables], hessian[variables][:, variables]
-    entries = jac.data * np.repeat(root * unit, np.diff(jac.indptr))
-    jac = sp.csr_matrix((entries, jac.indices, jac.indptr), jac.shape)
-    target = root * qp.target[rows] / sigma
-    lb, ub = np.full(n_x, -np.inf), np.full(n_x, np.inf)
-    is_lower, is_fixed, is_upper = (kind == 1) | (kind == 3), kind == 1, kind == 4
-    lb[at[is_lower]] = target[is_lower]
-    ub[at[is_fixed]] = target[is_fixed]
-    ub[at[is_upper]] = -target[is_upper]
-    # The multipliers of rows, then of bounds, in the order of the rows of the problem.
-    column = np.where(is_general, np.cumsum(is_general) - 1, r + at) + n_x
-    columns = np.concatenate([np.arange(n_shared), column])
-    recovery = (np.concatenate([np.ones(n_shared), sign]), columns, np.arange(k + 1))
-    has_bounds = r < len(rows)
-    fields = vars(scaled) | {"root": np.concatenate([np.full(n_shared, unit), root]), "sigma": sigma}
-    flip, matrix = -sign[general], jac[general] if has_bounds else jac.copy()
-    matrix.data *= np.repeat(flip, np.diff(matrix.indptr))
-    return QP(
-        **fields,
-        form="program",
-        P=sp.csc_matrix(hessian * unit**2),
-        q=qp.q[variables] * unit / sigma,
-        A=sp.csc_matrix(matrix),
-        b=flip * target[general],
-        n_zero=int(np.count_nonzero(kind == 0)),
-        n_nonneg=int(np.count_nonzero(kind == 2)),
-        soc=(),
-        lb=lb if has_bounds else None,
-        ub=ub if has_bounds else None,
-        recovery=sp.csr_matrix(recovery, (k, n_x + r + n_x)),
-        shift=np.zeros(k),
-        slack_map=None if offset else jac,
-        slack_rhs=None if offset else target,
-        variable_unit=unit,
-    )
-
-
-def _round_unit(x: float) -> float:
-    """Round a positive number to a power of PROGRAM_UNIT; return 1 for 0."""
-    return float(PROGRAM_UNIT ** np.round(np.log(x) / np.log(PROGRAM_UNIT))) if x > 0.0 else 1.0
-
-
 def _list_cone_sizes(components: list[FrictionComponent]) -> tuple[int, ...]:
     """Return the size of the second-order cone of each component of several rows."""
     return tuple(1 + len(tangents) for _, tangents, _ in components if len(tangents) > 1)
 
 
-def _mirror_lower_triangle(matrix: sp.csr_array, root: FloatArray) -> sp.csc_matrix:
-    """Return diag(root) A diag(root) from the lower triangle of A, with both triangles equal in every bit."""
+def _mirror_lower_triangle(matrix: sp.csr_array) -> sp.csr_matrix:
+    """Return A from its lower triangle, with both triangles equal in every bit."""
     entries = matrix.tocoo()
     is_lower = entries.row >= entries.col
-    i, j = entries.row[is_lower], entries.col[is_lower]
-    value, off = entries.data[is_lower] * (root[i] * root[j]), i > j
+    i, j, value = entries.row[is_lower], entries.col[is_lower], entries.data[is_lower]
+    off = i > j
     data = np.concatenate([value, value[off]])
-    return sp.csc_matrix((data, (np.concatenate([i, j[off]]), np.concatenate([j, i[off]]))), matrix.shape)
+    return sp.csr_matrix((data, (np.concatenate([i, j[off]]), np.concatenate([j, i[off]]))), matrix.shape)
 
 
 def _build_matrix(rows: list[Entries], columns: int) -> sp.csr_matrix:

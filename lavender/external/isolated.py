@@ -18,20 +18,20 @@ from lavender.base import subprocesses
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.base.subprocesses import InvalidAnswer, ProcessBackend, ProcessEnded, RemoteError
-from lavender.external.as_qp import QP
 from lavender.external.backend import Backend
-from lavender.external.forms import build_program
-from lavender.external.running import Answer, BackendFailed, Limits, capture_backend_output
+from lavender.external.convex import ScaledProgram
+from lavender.external.running import Answer, BackendFailed, Limits
 from lavender.judge.solution import Status
-from lavender.problem import Problem
 
 #: Fields of `running.Answer`, in the order in which they are sent.
-ANSWER_ARRAYS = ("x", "zeta", "xi", "direction", "contradiction")
+ANSWER_ARRAYS = ("x", "lam")
 MAX_BACKEND_MESSAGE_LENGTH = 500  # [characters] Longer messages of backends are cut.
 STOPPABLE_LIMIT_RATIO = 2.0  # A backend that accepts a time limit is killed after this multiple of its limit.
 ENTRY_SIZE = 12.0  # [bytes] Size of one matrix entry of a program in a request.
 # [bytes/s] If sending a program at this rate exceeds the time limit, the call times out at once.
 TRANSFER_RATE = 3e8
+
+Start = tuple[FloatArray, FloatArray] | None  # x and multipliers, in scaled units.
 
 #: Running processes without a current call. A thread removes a process from the list before it uses it.
 idle_processes: list[ProcessBackend] = []
@@ -55,16 +55,18 @@ class IsolatedBackend:
         self.backend = backend
         self.manner = "to its end"
 
-    def __call__(self, qp: QP, impulse: FloatArray, limit: Limits, settings: dict[str, Any]) -> Answer:
-        answer = call_backend(self.backend, qp, impulse, limit, settings)
+    def __call__(
+        self, program: ScaledProgram, start: Start, limit: Limits, settings: dict[str, Any]
+    ) -> Answer:
+        answer = call_backend(self.backend, program, start, limit, settings)
         if answer is None:
-            return self.backend.run(qp, impulse, limit, settings)
+            return self.backend.run(program, start, limit, settings)
         self.manner = "in a separate process"
         return answer
 
 
 def call_backend(
-    backend: Backend, qp: QP, impulse: FloatArray, limit: Limits, settings: dict[str, Any]
+    backend: Backend, program: ScaledProgram, start: Start, limit: Limits, settings: dict[str, Any]
 ) -> Answer | None:
     """Run the backend in another process, which is killed at the time limit; None if no process is ready.
 
@@ -76,7 +78,7 @@ def call_backend(
         The backend raised an exception, or its process died.
     """
     assert limit.time_limit is not None
-    if qp.nbytes > TRANSFER_RATE * limit.time_limit:
+    if program.nbytes > TRANSFER_RATE * limit.time_limit:
         return Answer(
             Status.TIME_LIMIT, "ended at the time limit: sending the program to the process would take longer"
         )
@@ -86,12 +88,12 @@ def call_backend(
     try:
         fields, arrays = process.call_function(
             backend,
-            qp,
-            impulse,
+            program,
+            start,
             limit,
             settings,
             timeout=limit.time_limit * (STOPPABLE_LIMIT_RATIO if backend.stoppable else 1.0),
-            max_bytes=8 * (4 * qp.n + 2 * len(qp.b)),
+            max_bytes=8 * (program.n + len(program.t)),
         )
     except TimeoutError:
         return Answer(Status.TIME_LIMIT, "ended at the time limit")
@@ -149,22 +151,27 @@ _warmed_up: set[str] = set()  # Names of the backends that were warmed up.
 
 def run_backend(
     backend: Backend,
-    qp: QP | None = None,
-    impulse: FloatArray | None = None,
+    program: ScaledProgram | None = None,
+    start: Start = None,
     limit: Limits | None = None,
     settings: dict[str, Any] | None = None,
 ) -> subprocesses.Answer:
-    """Run a backend on `qp`. If `qp` is None, solve a tiny program, so that the backend imports all of its code."""
-    if qp is None or impulse is None or limit is None or settings is None:
+    """Run a backend. Without a program, solve a tiny one, so that the backend imports all of its code."""
+    if program is None or limit is None or settings is None:
         if backend.name not in _warmed_up:
             _warmed_up.add(backend.name)
-            with suppress(Exception), capture_backend_output(backend.noisy):
-                tiny = build_program(Problem.lcp(np.eye(1), np.ones(1)), "impulse")
-                backend.run(tiny, np.zeros(1), Limits(1e-3, 1e-3, 1e-3, 100, None), {})
+            with suppress(Exception):
+                one = np.array([0, 1], np.int32), np.zeros(1, np.int32), np.ones(1)
+                tiny = ScaledProgram(
+                    P=one, q=-np.ones(1), J=one, t=np.zeros(1), free=0, variable=np.zeros(1, np.int32)
+                )
+                backend.run(tiny, None, Limits(1e-3, 1e-3, 100, None), {})
         return {}, ()
-    with capture_backend_output(backend.noisy) as printed:
-        answer = backend.run(qp, impulse, limit, settings)
+    answer = backend.run(program, start, limit, settings)
     work = {str(kind): int(count) for kind, count in answer.work.items()}
-    message = str(answer.message or "; ".join(printed))[:MAX_BACKEND_MESSAGE_LENGTH]
-    fields = {"status": answer.status.name, "message": message, "work": work}
+    fields = {
+        "status": answer.status.name,
+        "message": answer.message[:MAX_BACKEND_MESSAGE_LENGTH],
+        "work": work,
+    }
     return fields, [getattr(answer, name) for name in ANSWER_ARRAYS]

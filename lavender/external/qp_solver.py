@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from functools import partial
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -13,24 +12,121 @@ from lavender.base.arrays import FloatArray, check_bool
 from lavender.base.deadline import Deadline
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.lazy_import import import_numerical_modules
-from lavender.external.as_qp import QP, shift_to_definite
 from lavender.external.backend import Backend
-from lavender.external.forms import build_program, choose_program_form
+from lavender.external.convex import ConvexProgram
+from lavender.external.forms import Form, build_form, choose_program_form, get_program
 from lavender.external.isolated import ENTRY_SIZE, TRANSFER_RATE, IsolatedBackend, start_process
-from lavender.external.running import call_backend_until_accepted
+from lavender.external.running import BackendResult, call_backend_until_accepted
+from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import compute_stopping_residual
-from lavender.judge.solution import Claim, Status, sum_work_counts
+from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
+from lavender.problem.program import QuadraticProgram
 from lavender.solvers.costs import RATES
 from lavender.solvers.registry import Cost, Solver
 
 MAX_DENSE_SIZE = 2**30  # [bytes] A backend for dense matrices rejects a problem with a larger matrix.
+# [-] A claim "solved" is false if the error exceeds this multiple of tol, and at least MIN_FALSE_CLAIM: the tests of
+# backends use other norms.
+FALSE_CLAIM_RATIO, MIN_FALSE_CLAIM = 1e3, 1e-6
+MAX_STEPS = 3  # Newton steps with updated active rows; further steps follow only while the error exceeds tol.
+STEP_ERROR = 1e-12  # A point of a program with a larger error is improved by a Newton step.
+# With more variables and rows, the Newton step is done only if the error exceeds tol.
+MAX_FREE_STEP_SIZE = 500
 OPTION_HELP = {
     "isolate": "with a time_limit, run the backend in another process, which is killed at the limit; default True",
     "form": "'program' (P, q and rows of from_qp), 'impulse', 'velocity' (bodies, J and M) or 'auto' (default)",
-    "unit_diagonal": "in the impulse form, scale A to a unit diagonal; default True",
     "settings": "mapping of options of the backend, which override the options that are set from tol",
 }
+
+
+def get_false_claim_error(tol: float) -> float:
+    """Return the error above which a claim "solved" at tol is false."""
+    return max(FALSE_CLAIM_RATIO * tol, MIN_FALSE_CLAIM)
+
+
+class ProgramJudge:
+    """Judges points of a quadratic program, improves them by a Newton step, and keeps the best.
+
+    Attributes
+    ----------
+    x, lam : (n,), (m,)
+        The best point, with complementary multipliers; None without a point.
+    error, raw : float
+        Its error, and the error without the allowance for rounding.
+    """
+
+    def __init__(self, program: ConvexProgram, tol: float) -> None:
+        self.program, self.tol = program, tol
+        self.error = self.raw = np.inf
+        self.x: FloatArray | None = None
+        self.lam: FloatArray | None = None
+        self.has_step = False
+
+    def accepts(self, x: FloatArray, lam: FloatArray) -> bool:
+        """Judge a point and its Newton step; return whether the best point meets tol."""
+        error, active, lam = self.keep(x, lam)
+        size = len(x) + len(lam)
+        if error > (STEP_ERROR if size <= MAX_FREE_STEP_SIZE else max(self.tol, STEP_ERROR)):
+            for _ in range(MAX_STEPS):
+                point = self.program.polish(x, lam, active)
+                if point is None:
+                    break
+                _, _, lam = self.keep(*point, True)
+                if self.error <= self.tol:
+                    break
+                x, active = point[0], self.program.update_active_rows(*point, active, self.tol)
+        return self.error <= self.tol
+
+    def keep(self, x: FloatArray, lam: FloatArray, has_step: bool = False) -> tuple[float, Any, FloatArray]:
+        """Judge a point and store it if it is the best."""
+        error, raw, _, _, active, complementary, *_ = self.program.judge(x, lam)
+        if error < self.error or self.x is None:
+            self.x, self.lam, self.error, self.raw, self.has_step = x, complementary, error, raw, has_step
+        return error, active, complementary
+
+
+class ContactJudge:
+    """Judges points of a form of a constraint problem by the residual of its impulses, and keeps the best impulses.
+
+    Parameters
+    ----------
+    form : Form
+    impulse : (m,), N s
+        Receives the best impulses.
+    tol : float, -
+
+    Attributes
+    ----------
+    relative, above : float, -
+        Relative residual of the best impulses, and its part above rounding; inf without a point.
+    """
+
+    def __init__(self, form: Form, impulse: FloatArray, tol: float) -> None:
+        self.form, self.impulse, self.tol = form, impulse, tol
+        self.relative = self.above = np.inf
+        self.dual: FloatArray | None = None
+
+    def accepts(self, x: FloatArray, lam: FloatArray) -> bool:
+        """Judge a point, and its Newton step if the point does not meet tol; return whether the best point does."""
+        self._keep(x, lam)
+        program = self.form.program
+        if self.above > self.tol and not program.cones:
+            _, _, _, _, active, complementary, *_ = program.judge(x, lam)
+            point = program.polish(x, complementary, active)
+            if point is not None:
+                self._keep(*point)
+        return self.above <= self.tol
+
+    def _keep(self, x: FloatArray, lam: FloatArray) -> None:
+        impulse = self.form.recover_impulse(x, lam)
+        if not np.isfinite(impulse).all():
+            return
+        w, e = np.empty(len(impulse)), np.empty(len(impulse))
+        relative, above = compute_stopping_residual(self.form.problem, impulse, w, e, floor=True)
+        if relative < self.relative or self.dual is None:
+            self.relative, self.above, self.impulse[:] = relative, above, impulse
+            self.dual = self.form.recover_bound_multiplier(x, lam, impulse)
 
 
 @dataclass(frozen=True)
@@ -39,7 +135,6 @@ class QPSolver(Solver):
 
     backend: Backend
     form: str = "auto"
-    unit_diagonal: bool = True
     settings: Mapping[str, Any] = field(default_factory=dict)
     isolate: bool = True
 
@@ -56,78 +151,103 @@ class QPSolver(Solver):
         return Cost(lambda: RATES["program"] + entry * problem.max_entries)
 
     @np.errstate(all="ignore")  # The judge finds overflows.
-    def prepare(self, problem: Problem) -> QP:
-        return self._build_program(problem, True)
-
-    def _build_program(self, problem: Problem, fix_far_rows: bool) -> QP:
+    def prepare(self, problem: Problem) -> Form:
         """Write the problem as a program for the backend; raise CapabilityError if the backend cannot solve it."""
-        b, qp = self.backend, None
-        form = choose_program_form(problem, self.form, b.needs_definite)
-        if form != "impulse":
-            qp = build_program(problem, form, fix_far_rows=fix_far_rows)
-        if qp is None or (b.needs_definite and self.form == "auto" and not qp.is_definite):
-            qp = build_program(
-                problem, "impulse", fix_far_rows=fix_far_rows, unit_diagonal=self.unit_diagonal
-            )
-        if b.dense and 8 * qp.n * max(qp.n, len(qp.b)) > MAX_DENSE_SIZE:
+        b = self.backend
+        name = choose_program_form(problem, self.form, b.needs_definite)
+        form = build_form(problem, name)
+        if b.needs_definite and self.form == "auto" and name == "velocity" and not form.is_definite:
+            form = build_form(problem, "impulse")
+        self._check_size(form.program)
+        return form
+
+    def _check_size(self, program: ConvexProgram) -> None:
+        """Raise CapabilityError if the dense matrices of the backend would be too large."""
+        n, m = len(program.q), len(program.t)
+        if self.backend.dense and 8 * n * max(n, m) > MAX_DENSE_SIZE:
             raise CapabilityError(
-                f"solver {b.name!r} accepts dense matrices only: {max(qp.n, len(qp.b))} x {qp.n} would need more "
+                f"solver {self.backend.name!r} accepts dense matrices only: {max(n, m)} x {n} would need more "
                 f"than {MAX_DENSE_SIZE >> 20} MiB; use a sparse backend (osqp, piqp, clarabel)"
             )
-        return shift_to_definite(qp) if b.needs_definite else qp
+
+    def solve_program(
+        self,
+        qp: QuadraticProgram,
+        tol: float,
+        max_iter: int,
+        deadline: Deadline,
+        start: tuple[FloatArray, FloatArray] | None,
+    ) -> tuple[ProgramJudge, BackendResult]:
+        """Solve a quadratic program; return its best point with the judge's error, and the backend's claim."""
+        program = get_program(qp)
+        self._check_size(program)
+        judge = ProgramJudge(program, tol)
+        return judge, self._call(program, judge, max_iter, tol, deadline, start)
+
+    def _call(
+        self, program: ConvexProgram, judge: Any, max_iter: int, tol: float, deadline: Deadline, start: Any
+    ) -> BackendResult:
+        """Call the backend, in another process under a time limit, until the judge accepts its point."""
+        b = self.backend
+        isolated = IsolatedBackend(b) if self.isolate and deadline.is_set else None
+        result = call_backend_until_accepted(
+            program, judge, isolated or b.run, max_iter=max_iter, tol=tol, deadline=deadline, settings=self.settings,
+            start=start, needs_definite=b.needs_definite,
+        )  # fmt: skip
+        if deadline.is_set and not b.stoppable:
+            manner = "to its end" if isolated is None else isolated.manner
+            result.message = f"{result.message}; the backend accepts no time limit and ran {manner}"
+        return result
 
     @np.errstate(all="ignore")  # The judge finds overflows.
     def run(
-        self, state: QP, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None = None
+        self, state: Form, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None = None
     ) -> Claim:
-        qp, b, no_work = state, self.backend, {"backend_calls": 0}
-        if not len(qp.unknown_rows):
-            impulse[:] = qp.fixed
-            return Claim(Status.CONVERGED, 0, no_work, "every impulse is determined by its bounds", qp.form)
+        form, no_work = state, {"backend_calls": 0}
+        if not len(form.unknown_rows):
+            impulse[:] = form.fixed
+            return Claim(Status.CONVERGED, 0, no_work, "every impulse is determined by its bounds", form.name)
         if max_iter == 0:
-            return Claim(Status.MAX_ITERATIONS, 0, no_work, "", qp.form)
-        if not qp.is_representable:
-            message = (
-                "as a quadratic program the problem has numbers that overflow; the backend was not called"
-            )
-            return Claim(Status.NUMERICAL_ERROR, 0, no_work, message, qp.form)
-        isolated = IsolatedBackend(b) if self.isolate and time_limit is not None else None
-        deadline, start = Deadline(time_limit), impulse.copy()
-        call = partial(
-            call_backend_until_accepted,
-            call=isolated or b.run,
-            tol=tol,
-            settings=self.settings,
-            noisy=b.noisy,
-        )
-        claim = call(qp, impulse, max_iter=max_iter, time_limit=time_limit)
-        has_assumed = len(qp.assumed) and not deadline.has_passed()
-        if has_assumed and _violates_inactive_row_assumption(qp, impulse, claim):
-            first_claim, impulse[:] = claim, start
-            qp, remaining = self._build_program(qp.problem, False), max(1, max_iter - claim.iterations)
-            claim = call(qp, impulse, max_iter=remaining, time_limit=deadline.get_remaining_seconds())
-            work = sum_work_counts((first_claim.work, claim.work))
-            claim = replace(claim, work=work, iterations=first_claim.iterations + claim.iterations)
-        if time_limit is None or b.stoppable:
-            return claim
-        manner = "to its end" if isolated is None else isolated.manner
-        return replace(claim, message=f"{claim.message}; the backend accepts no time limit and ran {manner}")
+            return Claim(Status.MAX_ITERATIONS, 0, no_work, "", form.name)
+        w, e = np.empty(len(impulse)), np.empty(len(impulse))
+        if tol > 0.0 and compute_stopping_residual(form.problem, impulse, w, e)[0] == 0.0:
+            return Claim(Status.CONVERGED, 0, no_work, "the start is a solution", form.name)
+        start = form.make_start(impulse) if self.backend.starts and impulse.any() else None
+        deadline = Deadline(time_limit)
+        if form.name == "program":
+            judge, result = self.solve_program(form.problem.qp, tol, max_iter, deadline, start)
+            if judge.x is not None and judge.lam is not None:
+                impulse[:] = form.recover_impulse(judge.x, judge.lam)
+            relative, above = compute_stopping_residual(form.problem, impulse, w, e, floor=True)
+            error = judge.error
+            dual: FloatArray | None = form.recover_bound_multiplier(impulse, impulse, impulse)
+        else:
+            contact = ContactJudge(form, impulse, tol)
+            result = self._call(form.program, contact, max_iter, tol, deadline, start)
+            relative, above, dual = contact.relative, contact.above, contact.dual
+            error = relative
+        status, certificate = result.status, None
+        is_false = status is Status.CONVERGED and error > get_false_claim_error(tol)
+        if (status is Status.INFEASIBLE or is_false) and result.point is not None:
+            # A point of a program without a solution may be a certificate, because it grows without limit.
+            candidates = form.list_certificates(*result.point)
+            certificate = next((y for y in candidates if check_certificate(form.problem, y) is None), None)
+            status = status if certificate is None else Status.INFEASIBLE
+        if status is not Status.INFEASIBLE and above <= tol and tol > 0.0:
+            status = Status.CONVERGED
+        elif status in (Status.CONVERGED, Status.NUMERICAL_ERROR) and not (is_false and not result.shift):
+            # The backend's tests use other norms than the judge, or another P, so its claim is not false.
+            status = Status.STALLED if np.isfinite(error) else Status.NUMERICAL_ERROR
+        return Claim(
+            status, result.iterations, result.work, result.message, form.name, dual=dual, certificate=certificate
+        )  # fmt: skip
 
-    def start_workers(self, qp: QP, time_limit: float) -> None:
+    def start_workers(self, state: Form, time_limit: float) -> None:
         """Import the backend's code, in the process that runs it, before the clock of a time limit starts."""
         if self.isolate:
             start_process(self.backend)
         else:
             import_numerical_modules(*self.backend.modules)
-
-
-def _violates_inactive_row_assumption(qp: QP, impulse: FloatArray, claim: Claim) -> bool:
-    """Return whether a row that was assumed to stay at its bound leaves it, or may have caused a claim INFEASIBLE."""
-    if claim.status is Status.INFEASIBLE:
-        return True
-    w, error = np.empty(len(impulse)), np.empty(len(impulse))
-    compute_stopping_residual(qp.problem, impulse, w, error)
-    return bool(np.any(error[qp.assumed] != 0.0))
 
 
 def explain_refusal(problem: Problem) -> str | None:

@@ -46,6 +46,7 @@ class Status(str, Enum):
         "INFEASIBLE",
         "no solution exists; `certificate` proves it, unless `claim_check` says otherwise",
     )
+    UNBOUNDED = "UNBOUNDED", "the objective of a quadratic program decreases without limit along `ray`"
     NUMERICAL_ERROR = "NUMERICAL_ERROR", "a factorisation or the backend failed"
     INTERRUPTED = "INTERRUPTED", "stopped by Ctrl-C or by the callback"
     INVALID_PROBLEM = "INVALID_PROBLEM", "the data of one world of a batch are not a valid problem"
@@ -263,6 +264,8 @@ class Solution:
         Stages of `auto` in the order in which they ran; empty for other solvers.
     velocity_tol : float or None, m/s
         Requested velocity error; None if the solve was to reach a relative residual.
+    program_error : float or None, -
+        Error of a quadratic program that `solve_qp` solved, to which `tol` and `success` then refer.
 
     Examples
     --------
@@ -294,6 +297,7 @@ class Solution:
     sweeps_per_decade: float
     stages: tuple[SolverStage, ...]
     velocity_tol: float | None = None
+    program_error: float | None = None
 
     @classmethod
     def from_fields(cls, values: dict[str, Any]) -> Solution:
@@ -367,7 +371,12 @@ class Solution:
 
     @property
     def success(self) -> bool:
-        """Whether the judge's relative residual is at most `tol`, or its velocity error at most `velocity_tol`."""
+        """Whether the judge's relative residual is at most `tol`, or its velocity error at most `velocity_tol`.
+
+        Of a quadratic program: whether its status is CONVERGED, which is so if `program_error` is at most `tol`.
+        """
+        if self.program_error is not None:
+            return self.status is CONVERGED
         if self.velocity_tol is not None:
             return self.residual.velocity <= self.velocity_tol
         return self.residual.relative <= self.tol
@@ -399,7 +408,7 @@ class Solution:
         SolveFailed
             The judge does not accept the result; the message is the one-line summary.
         """
-        if self.success or self.residual.at_floor:
+        if self.success or (self.program_error is None and self.residual.at_floor):
             return self
         raise SolveFailed(str(self))
 
@@ -453,8 +462,9 @@ class Solution:
     def __str__(self) -> str:
         note = f"; {self.message}" if self.message else ""
         wrong = f"; CONTRADICTED: {self.status_conflict}" if self.claim_check == CONTRADICTED else ""
+        judged = self.residual if self.program_error is None else f"program error {self.program_error:.1e}"
         return (
-            f"{self.solver.name}: {self.status.name}, {self.residual}, {self._work_text}, "
+            f"{self.solver.name}: {self.status.name}, {judged}, {self._work_text}, "
             f"{self._time_text}{note}{wrong}"
         )
 
@@ -494,7 +504,7 @@ def raise_if_interrupted(solution: Solution) -> Solution:
 
 
 for _field in fields(Solution):
-    if _field.name != "velocity_tol":
+    if _field.name not in ("velocity_tol", "program_error"):
         setattr(Solution, _field.name, late_field(_field.name))
 
 

@@ -54,10 +54,11 @@ from lavender.problem.generalized import (
     convert_to_compressed_rows,
     extract_lower_triangle,
 )
-from lavender_ext.core.assemble import dense_to_csr, stack_csr_matrices
-from lavender_ext.core.checks import max_abs_of_array
-from lavender_ext.judge.measure import all_finite, compute_program_residuals
+from lavender_ext.core.assemble import dense_to_csr, mirror_lower_triangle, stack_csr_matrices
+from lavender_ext.judge.measure import all_finite
+from lavender_ext.judge.program import judge_program
 
+IntArray = npt.NDArray[np.int32]
 IntpArray = npt.NDArray[np.intp]
 
 # P counts as singular if a pivot of its Cholesky factor is at most this fraction of the diagonal entry.
@@ -65,9 +66,6 @@ MAX_SINGULAR_PIVOT = 1e-13
 # P counts as semidefinite if P + SEMIDEFINITE_SHIFT diag(P) has a Cholesky factor. The shift covers negative
 # eigenvalues that rounding causes.
 SEMIDEFINITE_SHIFT = 1e-12
-# If q is 0, q, P x and J^T lambda may all vanish at the solution. The dual error is then relative to at least this
-# fraction of the largest row of |P| |x|.
-CURVATURE_SHARE = 1e-3
 INFINITE = 1e20  # A right-hand side or bound of this size or larger counts as infinite, as in other packages.
 # Up to this many variables, the message about an indefinite P has its smallest eigenvalue.
 MAX_EIGENVALUE_SIZE = 1000
@@ -114,10 +112,8 @@ class QPSolution:
             return (
                 f"unbounded: the objective decreases without end along ray; at x it is {self.objective:.6g}"
             )
-        # Show the status, which belongs to the constraint problem, only if the program is not solved.
+        # Show the status only if the program is not solved.
         status = "" if self.solution is None or self.found else f"{self.solution.status.name}, "
-        if self.solution is not None and self.solution.claim_check == "not proven":
-            status = f"{self.solution.status.name} (not proven), "
         if status == "CONVERGED, ":
             status = "the constraint problem CONVERGED, "
         verdict = "solved" if self.found else f"not solved to {self.tol:g}"
@@ -126,76 +122,56 @@ class QPSolution:
         return f"{verdict}: {status}error {self.error:.1e}, objective {self.objective:.6g}{conflict}"
 
     @cached_property
-    def _curvature(self) -> FloatArray:
-        """P x (n,)."""
-        return self.qp.generalized.momentum_of(self.x)
-
-    @cached_property
-    def _residuals(self) -> tuple[float, ...]:
-        """Primal, dual and gap residual; the three residuals relative to their terms; the largest relative residual."""
-        qp, multipliers, min_force = self.qp, self.qp.select_row_multipliers(self.impulse), 0.0
-        if max_abs_of_array(qp.q) == 0.0:
-            min_force = CURVATURE_SHARE * float((abs(qp.generalized.mass) @ np.abs(self.x)).max(initial=0.0))
-        general = qp.generalized
-        result: tuple[float, ...] = compute_program_residuals(
-            self.x, qp.q, self._curvature, general.force(multipliers), general.velocity_of(self.x), qp.target,
-            multipliers, qp.free, general.operator.jac, self.x if general.order is None else self.x[general.order],
-            qp.estimate_variable_sizes, min_force,
-        )  # fmt: skip
-        return result
+    def _judged(self) -> tuple[Any, ...]:
+        """Result of `judge_program` for x and the multipliers."""
+        return self.qp.judge(self.x, self.qp.select_row_multipliers(self.impulse))
 
     @property
     def objective(self) -> float:
         """Objective 1/2 x.P x + q.x."""
-        return float(0.5 * self.x @ self._curvature + self.qp.q @ self.x)
+        curvature = self.qp.generalized.momentum_of(self.x)
+        return float(0.5 * self.x @ curvature + self.qp.q @ self.x)
 
     @property
     def primal_residual(self) -> float:
         """Largest violation of a row: |A x - b|, G x - h, lb - x, x - ub."""
-        return self._residuals[0]
+        return float(self._judged[6])
 
     @property
     def dual_residual(self) -> float:
         """Maximum of |P x + q + A^T y + G^T z + z_box| and of -z."""
-        return self._residuals[1]
+        return float(self._judged[7])
 
     @property
     def duality_gap(self) -> float:
         """Duality gap |x.P x + q.x + b.y + h.z + bounds.z_box|."""
-        return self._residuals[2]
+        return float(self._judged[8])
 
     @property
     def error(self) -> float:
-        """Largest of the three residuals, each relative to its own terms; 0 for an exact solution.
+        """Largest error of a row or a column, each relative to its own terms; 0 for an exact solution.
 
-        - Primal: the violation of each row, divided by the maximum of |J_ij x_j| and |target_i| of this row. The
-          divisor is at most the maximum of |J x|, |target| and |x| over all active rows, as in OSQP and Clarabel. If
-          the row's terms vanish, as in x >= 0, the divisor is the size of its variables in the active rows.
-        - Dual: divided by the maximum of |q|, |P x| and |J^T lambda|; if q is 0, by at least 1e-3 of the largest row
-          of |P| |x|.
-        - Gap: the sum of the absolute gaps of all rows, divided by |objective|, or by 1e-3 of the sum of the absolute
-          values of the objective's terms if that is larger.
+        - Row i, with right-hand side t_i: its violation divided by |t_i|. The rows of A and all active inequalities
+          count like equations.
+        - Column j: |P x + q + A^T y + G^T z + z_box|_j divided by |q_j|.
+        - An inequality is active if its multiplier, relative to its columns, exceeds its slack, relative to the row's
+          terms. Otherwise its multiplier counts as 0.
 
-        Inactive rows do not contribute to these scales: rows that are satisfied and have no multiplier, and rows that
-        are far from their bound.
+        If t_i or q_j is 0, the divisor is the largest term of the row or column, but at least 1e-3 of the size of its
+        variables or multipliers. Rounding errors of the sums count as 0. `lavender_ext/judge/program.pyx` has all
+        formulas.
         """
-        return self._residuals[6]
+        return float(self._judged[0])
 
     @property
     def found(self) -> bool:
-        """Whether the program is solved.
-
-        The error does not exceed `tol`, no ray or certificate proves that no solution exists, and the solver's claim
-        is not contradicted.
-        """
+        """Whether the error is at most `tol`, and no proof or ray shows that the program has no solution."""
         if self.ray is not None or not self.error <= self.tol:
             return False
         solution = self.solution
-        if solution is None:
-            return True
-        if solution.status.name == "INFEASIBLE":
-            return bool(solution.claim_check == "not proven")
-        return not solution.is_contradicted
+        return solution is None or not (
+            solution.status.name == "INFEASIBLE" and solution.claim_check == "confirmed"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,20 +227,56 @@ class QuadraticProgram:
         n = len(self.q)
         return replace(self, q=mark_read_only(-b[:n]), target=mark_read_only(b[n:].copy()))
 
-    def convert_to_saddle_form(self) -> QuadraticProgram:
-        """Return this program in the form (5), which is used for a singular P, also if P is definite."""
-        return replace(self, is_singular=True)
+    @cached_property
+    def hessian(self) -> Compressed:
+        """P, both triangles, in compressed rows."""
+        if self.generalized.order is None:
+            return mirror_lower_triangle(*self.generalized.operator.mass)
+        mass = self.generalized.mass
+        return mass.indptr, mass.indices, mass.data
 
-    def estimate_variable_sizes(self) -> FloatArray:
-        """Compute the size of each variable (n,) without constraints, |q_i| / P_ii or |v*_i|, in the order of J."""
+    @cached_property
+    def jacobian(self) -> Compressed:
+        """J of (2) in compressed rows."""
+        if self.generalized.order is None:
+            return self.generalized.operator.jac
+        jac = self.generalized.jac
+        return jac.indptr, jac.indices, jac.data
+
+    @cached_property
+    def variable_of_row(self) -> IntArray:
+        """Variable of each row of J that is a bound, -1 for rows of A and G (m,)."""
+        variable = np.full(len(self.target), -1, np.int32)
+        if self.fixed is not None and self.lower is not None and self.upper is not None:
+            variable[self.n_equalities or 0 : self.free] = self.fixed
+            end = len(variable) - len(self.upper)
+            variable[end:] = self.upper
+            variable[end - len(self.lower) : end] = self.lower
+        return variable
+
+    def judge(self, x: FloatArray, multipliers: FloatArray) -> tuple[Any, ...]:
+        """Judge x (n,) and the multipliers (m,) of the rows: `judge_program`."""
+        return judge_program(self.hessian, self.q, self.jacobian, self.target, multipliers, x, self.free)
+
+    def with_vectors(self, q: Any = None, h: Any = None, b: Any = None) -> QuadraticProgram:
+        """Return the program with another q (n,), h (mi,) or b (me,); its matrices are shared, and h stays infinite."""
+        changes: dict[str, Any] = {}
+        if q is not None:
+            changes["q"] = mark_read_only(as_array("q", q, (len(self.q),)).copy())
+        target = self.target.copy()
+        if b is not None:
+            target[: self.n_equalities or 0] = as_array("b", b, (self.n_equalities or 0,))
+        if h is not None:
+            h = as_array("h", h, (self.n_inequalities or 0,), finite=False)
+            h = h if self.kept is None else h[self.kept]
+            target[self.free : self.free + len(h)] = -as_array("h", h, (len(h),))
         general = self.generalized
-        ptr, _, value = general.operator.mass  # The lower triangle, with the diagonal last in each row.
-        order = slice(None) if general.order is None else general.order
-        diagonal = value[ptr[1:] - 1]
-        size: FloatArray = np.divide(
-            np.abs(self.q)[order], diagonal, out=np.zeros(len(self.q)), where=diagonal > 0.0
-        )
-        return size if self.is_singular else np.where(size > 0.0, size, np.abs(general.v_free)[order])
+        if q is not None and not self.is_singular:
+            general = general.with_jacobian(None, general.solve(-changes["q"]))
+        new = replace(self, target=mark_read_only(target), generalized=general, **changes)
+        for name in ("hessian", "jacobian", "variable_of_row"):
+            new.__dict__[name] = getattr(self, name)
+        return new
 
     def recover_variables(self, impulse: FloatArray) -> FloatArray:
         """Compute x (n,) from the impulses (m,) of the constraint problem, or (n + m,) if P is singular."""

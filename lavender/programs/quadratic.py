@@ -1,272 +1,384 @@
-"""`solve_qp`: quadratic programs through `solve`, to an error of the program itself.
+"""`solve_qp`: quadratic programs by backends, `auto` or another solver, judged in the program's own terms.
 
-`solve` stops at a residual relative to the zero impulse's, while `QPSolution.error` is relative to the terms of
-the program. While the error is above tol, the solve is continued from its result with a smaller tol. If `auto` does
-not reach tol in this way for a positive definite P, the backend for a singular P solves the program in the form (5) of
-`problem/program.py`.
+A named backend receives the program in scaled variables, and its x is kept (`lavender/external`). `auto` solves a
+program with a positive definite P as a constraint problem in J and M first, and then calls backends until the error
+meets tol. Other solvers solve the constraint problem. A point that does not meet tol is followed by a search for a
+proof that there is no solution (`proofs.py`).
 """
 
 from __future__ import annotations
 
 import math
-from copy import copy
-from dataclasses import replace
+from collections.abc import Iterator
+from functools import partial
 from time import perf_counter
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from lavender.base.arrays import check_float, mark_read_only
+from lavender.base.arrays import FloatArray, check_float, mark_read_only
+from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError
-from lavender.base.lazy_import import sparse as sp
-from lavender.judge.solution import CONFIRMED, CONVERGED, Claim, Solution, Status, sum_work_counts
+from lavender.external.forms import get_program
+from lavender.external.proofs import find_infeasibility_proof, find_ray
+from lavender.external.qp_solver import ProgramJudge, QPSolver, get_false_claim_error
+from lavender.judge.certificates import Proof
+from lavender.judge.residuals import residual
+from lavender.judge.solution import (
+    CONFIRMED,
+    CONTRADICTED,
+    CONVERGED,
+    INFEASIBLE,
+    STALLED,
+    Solution,
+    SolverRun,
+    SolverStage,
+    Status,
+    sum_work_counts,
+)
 from lavender.problem import Problem, QPSolution
-from lavender.problem.generalized import Generalized
-from lavender.problem.program import QuadraticProgram
-from lavender.solvers.registry import get
-from lavender.solvers.small import describe_stages
-from lavender.solving.finish import FinishedRun, finish
+from lavender.solvers.registry import SolverSpec, get
 from lavender.solving.limits import check_time_limit
+from lavender.solving.singular_programs import program_backends
 from lavender.solving.solve import solve
 
+MIN_TOL = 1e-13  # Smallest error that further solves are to reach; smaller ones are rounding.
 MAX_SOLVES = 5  # Maximum number of solves of one constraint problem, each with a smaller tol.
-MIN_TOL = 1e-15  # Smallest tol of a solve of the constraint problem.
 # The next tol is this fraction of the tol that would suffice if the program's error were proportional to tol.
 TOL_RATIO = 0.1
-# The backend is called first if n 2^-53 cond(M) is above this fraction of tol: solving with M then loses digits that
-# tol needs.
-MAX_LOSS = 0.1
-# A solve that ended with one of these statuses is continued. After any other status the budget is used up, or a
-# smaller tol does not change the result.
-CONTINUED = (Status.CONVERGED, Status.STALLED)
-# Statuses of the constraint problem that are returned unchanged, whatever the program's error is.
-FINAL_STATUSES = (Status.ROUNDOFF_LIMIT, Status.INTERRUPTED)
-FEASIBLE_TOL = 1e-7  # An unbounded program counts as feasible at a point of at most this relative residual.
+NAMES = "P", "q", "G", "h", "A", "b", "lb", "ub"
+
+
+class Run(NamedTuple):
+    """One solver that ran on a program, and its claim."""
+
+    name: str
+    status: Status
+    message: str
+    work: dict[str, int]
+    error: float  # Smallest error of the program after the run.
+    form: str = "program"
 
 
 def solve_qp(
-    problem: Problem,
+    problem: Any,
+    q: Any = None,
+    G: Any = None,
+    h: Any = None,
+    A: Any = None,
+    b: Any = None,
+    lb: Any = None,
+    ub: Any = None,
     solver: str = "auto",
     *,
     tol: float = 1e-9,
     time_limit: float | None = None,
+    max_iter: int | None = None,
+    impulse: Any = None,
     **options: Any,
 ) -> QPSolution:
-    """Solve a quadratic program made by `Problem.from_qp`.
+    """Solve a convex quadratic program: min 1/2 x.P x + q.x subject to G x <= h, A x = b, lb <= x <= ub.
+
+    Two forms of the call: `solve_qp(P, q, G, h, A, b, lb, ub, solver=...)` with arrays as in `Problem.from_qp`, and
+    `solve_qp(problem, solver)` with a problem of `Problem.from_qp`, for which the program is built only once.
 
     Parameters
     ----------
-    problem : Problem
+    problem : Problem, or P (n, n) array or sparse, or None
+        None as P is a linear program.
+    q : (n,), or str
+        With a problem: the name of the solver, or another q of the same program; its matrices are kept.
+    G, h, A, b, lb, ub : arrays, optional
+        With a problem: only h and b, as other right-hand sides of the same program.
     solver : str
-        As in `lavender.solve`.
+        "auto", a QP backend, or a solver of bounded rows if P is positive definite.
     tol : float
         `QPSolution.error` to reach.
     time_limit : float, optional, s
+    max_iter : int, optional
+        Largest number of iterations of the solver.
+    impulse : (m,) or (n + m,), optional
+        Start from the impulses of an earlier program (`answer.impulse`).
     **options
-        Options of the solver. `impulse` starts from the impulses of an earlier program (`answer.solution.impulse`).
+        Options of the solver.
 
     Returns
     -------
     QPSolution
-        x, y, z, z_box with their `error`; `solution.status` is CONVERGED if the error does not exceed `tol`.
-        `solution.setup_time` and `solution.solve_time` add up to the time of this call. INFEASIBLE: no x satisfies the
-        constraints, and `problem.qp.multipliers(answer.solution.certificate)` proves it, if `solution.claim_check` is
-        "confirmed". An unbounded program has a `ray`.
+        x, y, z, z_box with their `error`. `found` is True exactly if `solution.status` is CONVERGED, exactly if the
+        error is at most `tol`. INFEASIBLE: no x satisfies the constraints, and
+        `answer.qp.multipliers(answer.solution.certificate)` proves it. UNBOUNDED: the objective decreases without
+        limit along `ray`, and x satisfies the constraints.
 
     Raises
     ------
     InputError
-        `problem` was not made by `Problem.from_qp`.
+        A problem was not made by `Problem.from_qp`; arrays are invalid.
     CapabilityError
         P is singular, and the solver needs a positive definite P.
 
     Examples
     --------
-    A linear program, P = 0:
+    A linear program:
 
-    >>> import numpy as np
     >>> import lavender as lv
-    >>> problem = lv.Problem.from_qp(np.zeros((2, 2)), [-1.0, -2.0], G=[[1.0, 1.0]], h=[1.0], lb=[0.0, 0.0])
-    >>> (lv.solve_qp(problem).x.round(9) + 0.0).tolist()
-    [0.0, 1.0]
+    >>> answer = lv.solve_qp(None, [-1.0, -2.0], G=[[1.0, 1.0]], h=[1.0], lb=[0.0, 0.0], solver="highs")
+    >>> (answer.x.round(9) + 0.0).tolist(), answer.found
+    ([0.0, 1.0], True)
     """
-    qp = getattr(problem, "qp", None)
+    begun = perf_counter()
+    if isinstance(problem, Problem):
+        if isinstance(q, str):
+            solver, q = q, None
+        problem = _update_program(problem, q, h, b, (G, A, lb, ub))
+    else:
+        if problem is None:
+            problem = np.zeros((np.size(q), np.size(q)))
+        problem = Problem.from_qp(problem, q, G, h, A, b, lb, ub)
+    tol = check_float("tol", tol, low=0.0)
+    limit = check_time_limit(time_limit)
+    deadline = Deadline(None if limit == math.inf else limit)
+    spec = get(solver)
+    solve_task = _Task(problem, spec, tol, deadline, max_iter, impulse, options)
+    return solve_task.solve(begun)
+
+
+def _update_program(problem: Problem, q: Any, h: Any, b: Any, others: tuple[Any, ...]) -> Problem:
+    """Return the problem with another q, h and b; the same object without them."""
+    qp = problem.qp
     if qp is None:
         raise InputError(
             "the problem does not contain a quadratic program; a problem of Problem.from_qp is needed "
             "(results of updated() and problems read from files contain only the constraint problem)"
         )
-    begun = perf_counter()
-    tol, end = check_float("tol", tol, low=0.0), begun + check_time_limit(time_limit)
-    start = options.pop("impulse", None)
-    is_auto = isinstance(solver, str) and solver == "auto"
-    if is_auto and tol > 0.0 and not options and not qp.is_singular:
-        answer = _solve_definite(problem, tol, end, start)
-    elif _needs_saddle_form(qp, solver, tol, options):
-        answer = _solve_by_backend(problem, tol, end, start, solver, options)
-    else:
-        answer = _solve_to_error(problem, solver, tol, end, start, options)
-    if qp.is_singular:
-        answer = _add_ray_if_unbounded(problem, answer, end)
-    return _accept_program(answer, perf_counter() - begun)
-
-
-def _accept_program(answer: QPSolution, seconds: float) -> QPSolution:
-    """Return the answer with the time of the whole call, as CONVERGED if the program's error is within `tol`.
-
-    The status is CONVERGED if the program's error is within `tol`, whatever the residual of the constraint problem is.
-    """
-    solution: Solution = answer.solution
-    values: dict[str, Any] = {"solve_time": seconds - solution.setup_time}
-    is_final = solution.status in FINAL_STATUSES or (
-        solution.status is CONVERGED and not solution.is_contradicted
-    )
-    if not is_final and answer.ray is None and answer.error <= answer.tol:
-        relative = solution.residual.relative
-        if solution.certificate is None and relative < math.inf:
-            values |= {"status": CONVERGED, "tol": max(solution.tol, relative)}
-            values |= {"claim_check": CONFIRMED, "status_conflict": ""}
-    accepted = copy(answer)  # It keeps the errors that have been computed.
-    object.__setattr__(accepted, "solution", solution.with_fields(**values))
-    return accepted
-
-
-def _solve_to_error(
-    problem: Problem, solver: str, tol: float, end: float, impulse: Any, options: dict[str, Any]
-) -> QPSolution:
-    """Solve the constraint problem, with smaller tol until the error of the program does not exceed `tol`."""
-    best: QPSolution | None = None
-    inner = tol
-    for _ in range(MAX_SOLVES):
-        left = None if end == math.inf else max(end - perf_counter(), 1e-6)
-        solution = solve(problem, solver, impulse=impulse, tol=inner, time_limit=left, **options)
-        answer = problem.qp.solution(solution, tol)
-        if best is None or answer.error < best.error or _is_proved_infeasible(answer):
-            best = answer
-        if answer.error <= tol or not _should_continue(answer, end):
-            break
-        smaller = max(TOL_RATIO * inner * tol / answer.error, MIN_TOL)
-        if not smaller < inner:
-            break
-        inner, impulse = smaller, solution.impulse
-    assert best is not None
-    return best
-
-
-def _is_proved_infeasible(answer: QPSolution) -> bool:
-    """Whether a certificate that the judge has checked shows that no solution exists."""
-    solution = answer.solution
-    return bool(solution.status is Status.INFEASIBLE and solution.claim_check == CONFIRMED)
-
-
-def _should_continue(answer: QPSolution, end: float) -> bool:
-    """Return whether another solve may lower the error, and time remains for it."""
-    return answer.solution.status in CONTINUED and perf_counter() < end
-
-
-def _solve_definite(problem: Problem, tol: float, end: float, impulse: Any) -> QPSolution:
-    """Solve a program with a positive definite P over J and M and, if that fails, in the form (5) by a backend.
-
-    The backend comes first if M is so ill-conditioned that a solve by its factor loses the digits that tol needs.
-    """
-    first, second = _solve_over_velocities, _solve_by_backend
-    if _loses_digits(problem.qp, tol):
-        first, second = second, first
-    answer = first(problem, tol, end, impulse)
-    if answer.error <= tol or _is_proved_infeasible(answer) or answer.solution.status is Status.INTERRUPTED:
-        return answer
-    if not perf_counter() < end:
-        return answer
-    other = second(problem, tol, end, answer.impulse)
-    ran = [answer.solution, other.solution]
-    if other.error < answer.error or _is_proved_infeasible(other):
-        answer = other
-    stages = tuple(stage for solution in ran for stage in solution.stages)
-    work = MappingProxyType(sum_work_counts(solution.work for solution in ran))
-    message = f"{describe_stages(stages)}; {answer.solution.message}".rstrip("; ")
-    solution = replace(answer.solution, stages=stages, work=work, message=message)
-    return replace(answer, solution=solution)
-
-
-def _loses_digits(qp: QuadraticProgram, tol: float) -> bool:
-    """Return whether P is definite, and a solve by its factor loses the digits that `tol` needs."""
-    if qp.is_singular:
-        return False
-    operator = qp.generalized.operator
-    return bool(operator.n * 2.0**-53 * operator.condition > MAX_LOSS * tol)
-
-
-def _needs_saddle_form(qp: QuadraticProgram, solver: str, tol: float, options: dict[str, Any]) -> bool:
-    """Return whether to solve the form (5) of a program with a definite P, because the inverse of P loses digits."""
-    is_default = options.get("form", "auto") in ("auto", "program")
-    return tol > 0.0 and is_default and _loses_digits(qp, tol) and get(solver).singular_programs
-
-
-def _solve_over_velocities(problem: Problem, tol: float, end: float, impulse: Any) -> QPSolution:
-    return _solve_to_error(problem, "auto", tol, end, impulse, {})
-
-
-def _solve_by_backend(
-    problem: Problem,
-    tol: float,
-    end: float,
-    impulse: Any,
-    solver: str = "auto",
-    options: dict[str, Any] | None = None,
-) -> QPSolution:
-    """Solve the program in the form (5) by a backend, which works on P instead of its inverse."""
-    qp: QuadraticProgram = problem.qp.convert_to_saddle_form()
-    program = Problem(**qp.problem_fields(), qp=qp, copy=False)
-    start = None
-    if impulse is not None:
-        given = problem.impulse_array(impulse)
-        start = np.concatenate([problem.qp.recover_variables(given), given])
-        start = start if np.isfinite(start).all() else None
-    answer = _solve_to_error(program, solver, tol, end, start, options or {})
-    solution: Solution = answer.solution
-    certificate = solution.certificate if _is_proved_infeasible(answer) else None
-    claim = Claim(
-        solution.status if certificate is not None else Status.STALLED,
-        solution.iterations,
-        solution.work,
-        describe_stages(solution.stages) or solution.message,
-        certificate=None if certificate is None else qp.select_row_multipliers(certificate),
-        form=solution.solver.form,
-        stages=solution.stages,
-    )
-    impulse = qp.select_row_multipliers(answer.impulse).copy()
-    judged = finish(
-        FinishedRun(
-            problem, get(solver), options or {}, impulse, claim, tol=tol, setup_time=solution.setup_time
+    if any(x is not None for x in others):
+        raise InputError(
+            "G, A, lb or ub is given with a problem; only q, h and b of a problem can be replaced: "
+            "give P and all arrays, or make a new problem with Problem.from_qp"
         )
-    )
-    return replace(answer, solution=judged, impulse=judged.impulse, qp=problem.qp)
+    if q is None and h is None and b is None:
+        return problem
+    qp = qp.with_vectors(q, h, b)
+    fields = qp.problem_fields() | {"qp": qp, "name": problem.name, "copy": False}
+    return Problem(**fields)
 
 
-def _add_ray_if_unbounded(problem: Problem, answer: QPSolution, end: float) -> QPSolution:
-    """Return the answer with its ray, if a certificate shows that the objective decreases without end.
+class _Task:
+    """One call of `solve_qp`: its arguments, the best point, and the solvers that ran."""
 
-    A certificate of (5) consists of a direction of x and of multipliers. If the multipliers do not prove by themselves
-    that the rows contradict each other, the direction is a ray, and the program is unbounded if it has a feasible
-    point.
-    """
-    solution, qp = answer.solution, problem.qp
-    if not _is_proved_infeasible(answer) or solution.certificate is None:
-        return answer
-    direction, rows = solution.certificate[: len(qp.q)], qp.select_row_multipliers(solution.certificate)
-    if qp.target @ rows > 0.0 or not qp.q @ direction < 0.0:
-        return answer
-    # Search a feasible point: minimise the sum of unit_i x_i^2 under the program's constraints.
-    unit = problem.d[: len(qp.q)]
-    general = Generalized(qp.generalized.jac, sp.diags_array(unit), np.zeros(len(unit)))
-    cones = problem.cones.select(np.arange(len(qp.q), problem.n_blocks))
-    nearest = Problem(qp.target, cones, generalized=general, copy=False)
-    left = None if end == math.inf else max(end - perf_counter(), 1e-6)
-    point = solve(nearest, tol=FEASIBLE_TOL, time_limit=left)
-    if point.certificate is not None and point.status is Status.INFEASIBLE and point.claim_check == CONFIRMED:
-        certificate = np.concatenate([np.zeros(len(unit)), point.certificate])
-        return replace(answer, solution=replace(solution, certificate=certificate, message=point.message))
-    if not (point.success or point.residual.at_floor):
-        return answer
-    return replace(answer, ray=mark_read_only(direction / np.abs(direction).max()))
+    def __init__(
+        self,
+        problem: Problem,
+        spec: SolverSpec,
+        tol: float,
+        deadline: Deadline,
+        max_iter: int | None,
+        start: Any,
+        options: dict[str, Any],
+    ) -> None:
+        self.problem, self.spec, self.tol, self.deadline = problem, spec, tol, deadline
+        self.max_iter, self.options = max_iter, options
+        self.qp = problem.qp
+        self.start = None if start is None else problem.impulse_array(start)
+        self.program = get_program(self.qp)
+        self.judge = ProgramJudge(self.program, max(tol, MIN_TOL))
+        self.runs: list[Run] = []
+        self.rays: list[FloatArray] = []  # Multipliers of claims of infeasibility.
+        self.proof: Proof | None = None
+        self.ray: FloatArray | None = None
+        self.solution: Solution | None = None  # Last solution of the constraint problem.
+
+    def solve(self, begun: float) -> QPSolution:
+        """Run the solvers, search for proofs, and build the answer."""
+        for step in self._list_steps():
+            step()
+            if self.judge.error <= self.judge.tol or self.proof is not None:
+                break
+            if self.runs[-1].status is Status.INTERRUPTED or self.deadline.has_passed():
+                break
+        is_stopped = self.runs[-1].status is Status.INTERRUPTED
+        # A point that only the allowance for rounding accepts is no solution if no solution exists.
+        if not self.judge.raw <= self.judge.tol and not is_stopped and self._may_search():
+            self._search_proofs()
+        return self._make_answer(begun)
+
+    def _may_search(self) -> bool:
+        """Return whether to search for proofs: not if the user's budget has ended the run."""
+        return self.max_iter is None and not self.deadline.has_passed()
+
+    def _list_steps(self) -> Iterator[Any]:
+        """Yield the runs to do, one after the other, until a point meets tol."""
+        spec = self.spec
+        if self.start is not None and self.tol > 0.0 and (spec.delegates or spec.external):
+            yield self._judge_start
+        if spec.delegates and spec.builtin:
+            if not self.qp.is_singular:
+                yield self._solve_over_rows
+            if not self.options:
+                for backend in program_backends():
+                    yield partial(self._call_backend, backend, {})
+        elif _is_program_backend(spec, self.options):
+            yield partial(self._call_backend, spec, self.options)
+        else:
+            yield self._solve_constraint_problem
+
+    def _judge_start(self) -> None:
+        """Judge the start: if it meets tol, nothing runs."""
+        assert self.start is not None
+        self.judge.keep(self.qp.recover_variables(self.start), self.qp.select_row_multipliers(self.start))
+        status = CONVERGED if self.judge.error <= self.tol else STALLED
+        self.runs.append(Run("start", status, "the start is a solution", {}, self.judge.error))
+
+    def _call_backend(self, spec: SolverSpec, options: dict[str, Any]) -> None:
+        """Solve the program by a backend."""
+        solver = spec.load()(**options)
+        assert isinstance(solver, QPSolver)
+        start = None
+        if self.start is not None and solver.backend.starts:
+            start = self.qp.recover_variables(self.start), self.qp.select_row_multipliers(self.start)
+            start = start if np.isfinite(start[0]).all() else None
+        budget = spec.max_iter if self.max_iter is None else self.max_iter
+        judge, result = solver.solve_program(self.qp, self.judge.tol, budget, self.deadline, start)
+        if judge.error < self.judge.error or self.judge.x is None:
+            self.judge = judge
+        if result.status is INFEASIBLE and result.point is not None:
+            self.rays.append(result.point[1])
+        self.runs.append(Run(spec.name, result.status, result.message, result.work, judge.error))
+
+    def _solve_over_rows(self) -> None:
+        """Solve the constraint problem in J and M by `auto`, and improve its point by a Newton step."""
+        self._run_solve(max(self.tol, MIN_TOL), self.start)
+
+    def _solve_constraint_problem(self) -> None:
+        """Solve the constraint problem by the named solver, with smaller tol until the program's error meets tol."""
+        inner, start = self.tol, self.start
+        for _ in range(MAX_SOLVES):
+            solution = self._run_solve(inner, start)
+            goal, error = self.tol, self.judge.error
+            if error <= goal or solution.status is not CONVERGED or self.deadline.has_passed():
+                break
+            smaller = max(TOL_RATIO * inner * goal / error, 1e-15)
+            if not smaller < inner:
+                break
+            inner, start = smaller, solution.impulse
+
+    def _run_solve(self, tol: float, start: Any) -> Solution:
+        """Solve the constraint problem once, and keep its point if it is the best."""
+        options = self.options | ({} if self.max_iter is None else {"max_iter": self.max_iter})
+        left = self.deadline.get_remaining_seconds() if self.deadline.is_set else None
+        if left is not None:
+            options["time_limit"] = max(left, 1e-6)
+        solution = solve(self.problem, self.spec.name, impulse=start, tol=tol, **options)
+        impulse = solution.impulse
+        if np.isfinite(impulse).all():
+            point = self.qp.recover_variables(impulse), self.qp.select_row_multipliers(impulse)
+            if self.spec.delegates:
+                self.judge.accepts(*point)
+            else:
+                self.judge.keep(*point)
+        if solution.certificate is not None and solution.status is INFEASIBLE:
+            self.proof = Proof(solution.certificate, solution.impulse_bound or math.inf)
+        self.solution = solution
+        run = Run(self.spec.name, solution.status, solution.message, dict(solution.work), self.judge.error)
+        self.runs.append(run._replace(form=solution.solver.form))
+        return solution
+
+    def _search_proofs(self) -> None:
+        """Search for a proof that no x satisfies the rows and, if no point is found, for a ray."""
+        judge, rays = self.judge, self.rays
+        self.proof = self.proof or find_infeasibility_proof(
+            self.problem, self.program, rays[-1] if rays else None, self.deadline
+        )
+        if self.proof is None and self.qp.is_singular and not judge.error <= self.tol:
+            found = find_ray(self.program, judge.x, self.deadline)
+            if found is not None:
+                self.ray, point = mark_read_only(found[0]), found[1]
+                judge.x, judge.lam = point, np.zeros(len(self.qp.target))
+
+    def _make_answer(self, begun: float) -> QPSolution:
+        """Build the answer, with the status that the judge confirms."""
+        qp, judge = self.qp, self.judge
+        x = np.zeros(len(qp.q)) if judge.x is None else judge.x
+        lam = np.zeros(len(qp.target)) if judge.lam is None else judge.lam
+        impulse = mark_read_only(np.concatenate([x, lam]) if qp.is_singular else np.array(lam))
+        y, z, box = qp.multipliers(impulse)
+        last = min(self.runs, key=lambda run: run.error) if len(self.runs) > 1 else self.runs[-1]
+        status, conflict = last.status, ""
+        is_found = judge.error <= self.tol and self.proof is None and self.ray is None
+        if is_found:
+            status = CONVERGED
+            if last.status is INFEASIBLE:
+                conflict = f"says INFEASIBLE, but its x has an error of {judge.error:.1e}"
+        elif self.proof is not None:
+            status = INFEASIBLE
+        elif self.ray is not None:
+            status = Status.UNBOUNDED
+        elif status in (CONVERGED, INFEASIBLE, Status.ROUNDOFF_LIMIT):
+            is_false = status is CONVERGED and judge.error > get_false_claim_error(self.tol)
+            if self.solution is not None and self.solution.is_contradicted:
+                conflict = self.solution.status_conflict
+            elif is_false and self.spec.external:
+                conflict = (
+                    f"says CONVERGED, the program's error {judge.error:.1e} is above tol {self.tol:.1e}"
+                )
+            status = STALLED
+        solution = Solution.with_late_fields(
+            impulse, status, self.tol, perf_counter() - begun,
+            (self._compute_late_fields, (impulse, last, conflict, is_found)),
+        )  # fmt: skip
+        solution = solution.with_fields(program_error=judge.error)
+        if conflict:
+            solution = solution.with_fields(claim_check=CONTRADICTED)
+        return QPSolution(
+            x=mark_read_only(x), y=y, z=z, z_box=box, solution=solution, ray=self.ray, impulse=impulse, qp=qp,
+            tol=self.tol,
+        )  # fmt: skip
+
+    def _compute_late_fields(
+        self, impulse: FloatArray, last: Run, conflict: str, is_found: bool
+    ) -> dict[str, Any]:
+        """Return the fields of the solution that are computed when one is first read."""
+        judged = residual(self.problem, impulse, "float64")
+        work = sum_work_counts(run.work for run in self.runs)
+        message = last.message
+        if self.proof is not None:
+            message = self.proof.message
+        elif self.ray is not None:
+            message = "the objective decreases without limit along the ray"
+        elif last.status is INFEASIBLE and not is_found:
+            message = f"{message}; not proven: no certificate was found"
+        if self.judge.has_step:
+            message = f"{message}; with one Newton step on the active rows".removeprefix("; ")
+        stages: tuple[SolverStage, ...] = ()
+        if self.spec.delegates:
+            message = f"{', '.join(run.name for run in self.runs)}; {message}".removesuffix("; ")
+            before = [math.nan, *(run.error for run in self.runs)]
+            stages = tuple(
+                SolverStage(run.name, MappingProxyType(run.work), before[i], run.error)
+                for i, run in enumerate(self.runs)
+            )
+            if self.solution is not None:
+                stages = (*self.solution.stages, *stages[1:])
+        proof = self.proof
+        return {
+            "residual": judged,
+            "iterations": work.get("iterations", 0),
+            "work": MappingProxyType(work),
+            "solver": SolverRun(self.spec.name, self.options, last.form),
+            "message": message,
+            "history": None if self.solution is None else self.solution.history,
+            "dual": None,
+            "certificate": None if proof is None else proof.y,
+            "impulse_bound": None if proof is None else proof.impulse_bound,
+            "claim_check": CONTRADICTED if conflict else CONFIRMED,
+            "status_conflict": conflict,
+            "sweeps_per_decade": math.nan,
+            "stages": stages,
+        }
+
+
+def _is_program_backend(spec: SolverSpec, options: dict[str, Any]) -> bool:
+    """Return whether a solver is a backend that receives the program itself."""
+    is_default = options.get("form", "auto") in ("auto", "program")
+    return spec.builtin and spec.external and is_default

@@ -56,7 +56,6 @@ class SolverOptions(TypedDict, total=False):
     omega: float
     settings: Mapping[str, Any]
     isolate: bool
-    unit_diagonal: bool
 
 
 class State(Protocol):

@@ -1,12 +1,12 @@
-"""The judge: its pass over any form of A, its functions for Python, and the residuals of quadratic programs."""
-from libc.math cimport NAN, fabs, sqrt
+"""The judge: its pass over any form of A, and its functions for Python."""
+from libc.math cimport NAN, sqrt
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcmp, memcpy
 
 import numpy as np
 
 from lavender_ext.core cimport validate
-from lavender_ext.core.arrays cimport as_double_pointer, as_int_pointer
+from lavender_ext.core.arrays cimport as_double_pointer
 from lavender_ext.core.generalized cimport multiply_whitened_transpose
 from lavender_ext.core.islands cimport find_islands, has_no_moving_body, island_workspace_integers, list_one_island
 from lavender_ext.core.block_types cimport blocks_t, islands_t
@@ -429,136 +429,3 @@ def relative_size_by_island(Data p, const double[::1] square):
     if s == NULL:
         return [relative_size_of_change(&p.blocks, -1, x, p.reference_energy, p.reference_velocity)]
     return [relative_size_of_change(&p.blocks, i, x, s.reference[2 * i], s.reference[2 * i + 1]) for i in range(s.n)]
-
-
-cdef inline double max_or_nan(double s, double x) noexcept nogil:
-    """Return the larger of s and x; NaN if either is NaN."""
-    return s if x <= s or s != s else x
-
-
-cdef inline double ratio_or_inf(double x, double scale) noexcept nogil:
-    """Return x / scale; if scale is 0, inf for positive x, otherwise x."""
-    return x / scale if scale > 0.0 else 1.0 / 0.0 if x > 0.0 else x
-
-
-# Rows that are zero at the solution, such as x >= 0, have no terms of their own. Their scale is the size of their variables in
-# acting rows, at least MIN_VARIABLE_FRACTION of the largest variable. An equation with a target above TARGET_ROUNDING times
-# that scale has a size of its own, so the scale is multiplied by EQUATION_SCALE_FACTOR. Larger values accept larger residuals.
-cdef double MIN_VARIABLE_FRACTION = 1e-3
-cdef double EQUATION_SCALE_FACTOR = 1e-3
-cdef double TARGET_ROUNDING = 1e-12
-# The scale of the gap is at least this fraction of the sum of |terms|, because an objective of cancelling terms is not a
-# meaningful scale. The largest ratio of that sum to the objective in 81 public programs is 1000.
-cdef double MIN_TERMS_FRACTION = 1e-3
-
-
-def compute_program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac, ordered_, sizes_without_rows,
-                              double least_force):
-    """Compute the residuals of a quadratic program, and each relative to its own terms.
-
-    Rows: J x = target (the first `free`), J x >= target (the others). Row i acts if it is one of the first, is violated,
-    or has lambda_i > 0 and a slack of at most half its terms. Others enter no scale.
-
-    r_p    max_i of |J x - target|, of target - J x;           row i over scale_i
-    r_d    max_j |P x + q - J^T lambda|, max_i -lambda_i;      over max |P x|, |q|, |J^T lambda|; -lambda_i max_j |J_ij|
-    gap    |x.(P x + q) - target.lambda|;                      over |1/2 x.P x + q.x|, or 1e-3 of the sum of its terms,
-                                                               sum_j |x_j| forces_j + sum_i |lambda_i| scale_i
-
-    The relative gap is computed from |x.(P x + q - J^T lambda)| + sum_i |lambda_i (J x - target)_i|: these do not cancel.
-
-    scale_i = max(terms_i, c max_j |J_ij| max(size_j, 1e-3 max |x|)),  terms_i = max(|target_i|, max_j |J_ij x_j|),
-    c = 1e-3 for equations with a target above rounding, else 1
-    size_j = max terms_k / |J_kj| over the rows k that act; at least `unbounded` (n,) if all of these have target 0, else
-             scale_i is at most the largest of |J x|_k, |target_k| and |x_j| over the rows that act: terms that cancel, or
-             a small J_kj, are no reason to accept more than OSQP and Clarabel do
-
-    px (n,) = P x, force (n,) = J^T lambda, jx (m,); jac: (indptr, indices, data) of J, with `ordered` (n,) = x in the order of
-    its columns; `sizes_without_rows()` returns `unbounded` in this order. Each force counts as `least_force` at least.
-
-    Returns
-    -------
-    r_p, r_d, gap, the relative value of each, and the largest of the relative values
-    """
-    cdef Py_ssize_t i, j, k, n = len(x_), m = len(lam_)
-    cdef const double* x = as_double_pointer(x_, n)
-    cdef const double* q = as_double_pointer(q_, n)
-    cdef const double* px = as_double_pointer(px_, n)
-    cdef const double* force = as_double_pointer(force_, n)
-    cdef const double* jx = as_double_pointer(jx_, m)
-    cdef const double* target = as_double_pointer(target_, m)
-    cdef const double* lam = as_double_pointer(lam_, m)
-    cdef const double* ordered = as_double_pointer(ordered_, n)
-    cdef const double* unbounded = NULL
-    cdef const int32_t* ptr = as_int_pointer(jac[0], m + 1)
-    cdef const int32_t* column = as_int_pointer(jac[1], len(jac[1]))
-    cdef const double* value = as_double_pointer(jac[2], len(jac[2]))
-    cdef Workspace workspace = allocate_bytes((n + 2 * m) * sizeof(double))
-    cdef double* size = <double*>workspace.at
-    cdef double* terms = size + n
-    cdef double* acts = terms + m                       # (m) 1 for a row that acts, otherwise 0
-    cdef double primal = 0.0, dual = 0.0, gap = 0.0, row_error = 0.0, force_error = 0.0, negative = 0.0
-    cdef double forces = 0.0, far = 0.0, curvature = 0.0, linear = 0.0, sums = 0.0
-    cdef double uncancelled = 0.0, rows = 0.0, violation, own, scale, largest, floor
-    cdef bint homogeneous = True
-    for j in range(n):
-        force_error = max_or_nan(force_error, fabs(px[j] + q[j] - force[j]))
-        curvature += x[j] * px[j]
-        linear += q[j] * x[j]
-        uncancelled += x[j] * (px[j] + q[j] - force[j])
-        own = max_or_nan(max_or_nan(fabs(px[j]), fabs(q[j])), fabs(force[j]))
-        own = max_or_nan(own, least_force)
-        forces = max_or_nan(forces, own)
-        sums += fabs(x[j]) * own
-        size[j] = 0.0
-        far = max_or_nan(far, fabs(x[j]))
-    gap = curvature + linear
-    uncancelled, rows = fabs(uncancelled), far
-    for i in range(m):
-        own = fabs(target[i])
-        for k in range(ptr[i], ptr[i + 1]):
-            own = max_or_nan(own, fabs(value[k] * ordered[column[k]]))
-        terms[i] = own
-        violation = target[i] - jx[i]
-        acts[i] = i < free or violation > 0.0 or (lam[i] > 0.0 and -violation <= 0.5 * own)
-        gap -= target[i] * lam[i]
-        uncancelled += fabs(lam[i] * violation)
-        if acts[i] == 0.0:
-            continue
-        homogeneous = homogeneous and target[i] == 0.0
-        rows = max_or_nan(rows, max_or_nan(fabs(jx[i]), fabs(target[i])))
-        for k in range(ptr[i], ptr[i + 1]):
-            if value[k] != 0.0:
-                size[column[k]] = max_or_nan(size[column[k]], own / fabs(value[k]))
-    floor = MIN_VARIABLE_FRACTION * far
-    if homogeneous:
-        sizes_array = sizes_without_rows()
-        unbounded = as_double_pointer(sizes_array, n)
-    for j in range(n):
-        if homogeneous:
-            size[j] = max_or_nan(size[j], unbounded[j])
-        size[j] = max_or_nan(size[j], floor)
-    for i in range(m):
-        violation = target[i] - jx[i]
-        violation = fabs(violation) if i < free else violation
-        largest = scale = 0.0
-        for k in range(ptr[i], ptr[i + 1]):
-            largest = max_or_nan(largest, fabs(value[k]))
-            scale = max_or_nan(scale, fabs(value[k]) * size[column[k]])
-        if i < free and fabs(target[i]) > TARGET_ROUNDING * scale:
-            scale *= EQUATION_SCALE_FACTOR
-        scale = max_or_nan(terms[i], scale)
-        if not homogeneous:
-            scale = min(scale, rows)
-        primal = max_or_nan(primal, violation)
-        row_error = max_or_nan(row_error, ratio_or_inf(violation, scale))
-        if acts[i] != 0.0:
-            sums += fabs(lam[i]) * scale
-        if i >= free:
-            dual = max_or_nan(dual, -lam[i])
-            negative = max_or_nan(negative, -lam[i] * largest)
-    dual = max_or_nan(dual, force_error)
-    scale = max_or_nan(fabs(0.5 * curvature + linear), MIN_TERMS_FRACTION * sums)
-    gap = fabs(gap)
-    force_error = ratio_or_inf(max_or_nan(force_error, negative), forces)
-    scale = ratio_or_inf(uncancelled, scale)
-    return primal, dual, gap, row_error, force_error, scale, max_or_nan(max_or_nan(row_error, force_error), scale)

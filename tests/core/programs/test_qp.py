@@ -56,7 +56,7 @@ def test_found_means_what_it_means_to_users_of_osqp_and_clarabel(seed, tol, off)
     # Each row is compared with its own terms, which are no larger than all; acting rows may give a zero row some.
     if answer.found:
         assert primal <= 10.0 * tol and dual <= tol * (1.0 + 1e-9)
-        assert gap <= tol * (1.0 + 1e-9) or cancelled < 1e-4
+        assert gap <= 10.0 * tol or cancelled < 1e-4  # a sum over rows, of which each is within tol
     if max(primal, dual, gap) <= 1e-3 * tol:
         assert answer.found, (answer.error, primal, dual, gap)
     if answer.found and best.found and cancelled > 1e-2:
@@ -201,29 +201,29 @@ def test_placeholder_bounds_hide_no_equation(name, tol):
             assert answer.found, str(answer)
 
 
-def test_a_multiplier_of_a_row_that_is_far_is_a_gap_of_the_objective():
-    """The gap was over |lambda| times the largest bound: 1e-8 of an objective hidden by a bound of 1e6."""
+def test_multiplier_of_a_far_row_counts_as_zero_in_the_error():
+    """The gap of 1e-4 of a multiplier of 1e-10 at a bound of 1e6 is a residual, and the point is a solution."""
     problem = lv.Problem.from_qp(2.0 * np.eye(2), [-4.0, -2.0], A=[[1.0, 1.0]], b=[1.0], ub=[1e6, 1e6])
     impulse = lv.solve_qp(problem, "newton", tol=1e-12).impulse.copy()
     impulse[-1] = 1e-10
-    answer = problem.qp.solution(impulse, 1e-6)
+    answer = problem.qp.solution(impulse, 1e-9)
     assert answer.duality_gap == pytest.approx(1e-4, rel=1e-3)
-    assert answer.error == pytest.approx(1e-4 / 3.0, rel=1e-3) and not answer.found  # the objective is -3
+    assert answer.found and answer.error <= 1e-10
 
 
 def test_terms_that_cancel_excuse_no_violation():
-    """A second difference of 1e7 - 2e7 + 1e7 was violated by 0.5, 5e-8 of its terms, and the objective off by 1e-3."""
+    """A second difference of 1e7 - 2e7 + 1e7 is violated by 0.5, 5e-8 of its terms, and by 50 % of its side of -1."""
     difference = 1000.0 * np.array([[1.0, -2.0, 1.0]])
     problem = lv.Problem.from_qp(
-        np.zeros((3, 3)), [1.0, -2.0, 0.0], G=-difference, h=[0.0], A=[[0, 0, 1.0], [1.0, 0, 0]], b=[5e3, 5e3]
+        np.zeros((3, 3)), [1.0, -2.0, 0.0], G=-difference, h=[1.0], A=[[0, 0, 1.0], [1.0, 0, 0]], b=[5e3, 5e3]
     )
     answer = lv.solve_qp(problem)
-    np.testing.assert_allclose(answer.x, 5e3, rtol=1e-8)
+    np.testing.assert_allclose(answer.x, 5e3, rtol=1e-6)
     impulse = answer.impulse.copy()
     impulse[1] += 2.5e-4  # a violation of 0.5
     off = problem.qp.solution(impulse, 1e-6)
     assert off.primal_residual == pytest.approx(0.5, rel=1e-3)
-    assert answer.found and not off.found and off.error >= 0.5 / 5e3 * 0.999
+    assert answer.found and not off.found and off.error == pytest.approx(0.5, rel=1e-3)
 
 
 def test_gaps_of_rows_with_opposite_signs_do_not_cancel():

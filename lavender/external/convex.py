@@ -1,0 +1,351 @@
+"""Convex programs as backends receive them: equilibration by powers of two, and one Newton step on the active rows.
+
+    min 1/2 x.P x + q.x   subject to   (J x)_i = t_i for i < free,   (J x)_i >= t_i,   J x - t in second-order cones
+
+A backend receives the program in scaled variables x', with x = sigma D x', rows multiplied by E and the cost by c
+(`lavender_ext/judge/program.pyx`), so that the numbers of every program are near 1. Its x is kept; a row has the
+multiplier E lambda' / (c sigma). Bounds and rows beyond FAR_SIDE in scaled units, such as placeholder bounds of 1e9,
+are left out in the first call. The judge of the caller has all rows.
+
+`polish` improves an answer by one step of Newton's method for the optimality conditions, with the inequalities that the
+judge of programs calls active as equations:
+
+    [ P  -J_a^T ] [ dx   ]     [ P x + q - J_a^T lambda ]
+    [ J_a   0   ] [ dlam ] = - [ J_a x - t_a            ]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lavender.base.arrays import FloatArray
+from lavender.base.lazy_import import import_module_under_lock
+from lavender.base.lazy_import import sparse as sp
+from lavender.problem.derived import cached_property
+from lavender.problem.generalized import Compressed
+from lavender_ext.judge.program import equilibrate_program, judge_program
+
+IntArray = npt.NDArray[np.int32]
+MAX_BACKEND_NUMBER = 1e20  # Backends treat larger numbers as infinite, or fail.
+FAR_SIDE = (
+    1e6  # [-] Inequalities with a scaled right-hand side below -FAR_SIDE are left out in the first call.
+)
+# [-] A matrix counts as singular if a squared pivot of its Cholesky factor is at most this multiple of the diagonal.
+MAX_SINGULAR_PIVOT = 1e-13
+# [-] Multiples of the largest diagonal entry that are added to a singular P for backends that need a definite one, in
+# the first and in the second call. The Newton step removes their effect.
+DEFINITE_SHIFTS = 1e-7, 1e-5
+# Variables and active rows up to which the matrix of the Newton step is dense, and up to which the step is done.
+MAX_DENSE_STEP_SIZE, MAX_STEP_SIZE = 1000, 20_000
+# [-] Shift of the diagonal of a sparse matrix of the step, which may be singular; each refinement reduces its effect.
+SPARSE_STEP_SHIFT, REFINEMENTS_OF_SPARSE_STEP = 1e-9, 4
+# [-] The Newton step solves a least-squares problem if a pivot is at most this multiple of the largest one.
+MAX_SINGULAR_STEP_PIVOT = 1e-13
+
+
+@dataclass(frozen=True, eq=False)
+class ConvexProgram:
+    """A convex program; see the module.
+
+    Parameters
+    ----------
+    P : (indptr, indices, data)
+        Both triangles, in compressed rows.
+    q : (n,)
+    J : (indptr, indices, data)
+    t : (m,)
+    free : int
+        Number of equations, which are the first rows.
+    variable : (m,) int
+        Variable of a row that is a bound, x_j >= t_i or -x_j >= t_i; -1 for other rows.
+    cones : tuple of int
+        Sizes of the second-order cones, which are the last rows.
+    """
+
+    P: Compressed
+    q: FloatArray
+    J: Compressed
+    t: FloatArray
+    free: int
+    variable: IntArray
+    cones: tuple[int, ...] = ()
+
+    @cached_property
+    def scales(self) -> tuple[FloatArray, FloatArray, float, float]:
+        """D (n,), E (m,), sigma and c."""
+        d, e, sigma, c = equilibrate_program(self.P, self.q, self.J, self.t, self.variable, self.free)
+        first = len(self.t) - sum(self.cones)
+        for size in self.cones:  # The rows of a cone have one scale.
+            e[first : first + size] = e[first : first + size].min()
+            first += size
+        return d, e, sigma, c
+
+    @cached_property
+    def scaled(self) -> ScaledProgram:
+        """The program in scaled variables."""
+        d, e, sigma, c = self.scales
+        weight = c * sigma * sigma
+        # Copies of the indices, because SciPy sorts them in place.
+        ptr, idx, value = self.P
+        hessian = ptr.copy(), idx.copy(), value * np.repeat(weight * d, np.diff(ptr)) * d[idx]
+        ptr, idx, value = self.J
+        jac = ptr.copy(), idx.copy(), value * np.repeat(e, np.diff(ptr)) * d[idx]
+        return ScaledProgram(
+            P=hessian, q=c * sigma * d * self.q, J=jac, t=e * self.t / sigma, free=self.free,
+            variable=self.variable, cones=self.cones,
+        )  # fmt: skip
+
+    def scale_point(self, x: FloatArray, lam: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Convert x (n,) and multipliers (m,) to the scaled program."""
+        d, e, sigma, c = self.scales
+        return x / (sigma * d), lam * (c * sigma) / e
+
+    def restore_point(self, x: FloatArray, lam: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Convert x' (n,) and multipliers (m,) of the scaled program to the program."""
+        d, e, sigma, c = self.scales
+        return x * (sigma * d), lam * e / (c * sigma)
+
+    def without_cost(self) -> ConvexProgram:
+        """Return the program with P = 0 and q = 0."""
+        n = len(self.q)
+        empty = np.zeros(n + 1, np.int32), np.zeros(0, np.int32), np.zeros(0)
+        return replace(self, P=empty, q=np.zeros(n))
+
+    def judge(self, x: FloatArray, lam: FloatArray) -> tuple[Any, ...]:
+        """Judge x and multipliers of a program without cones: `judge_program`."""
+        return judge_program(self.P, self.q, self.J, self.t, lam, x, self.free)
+
+    @np.errstate(all="ignore")  # The caller judges a step that overflows.
+    def polish(
+        self, x: FloatArray, lam: FloatArray, active: npt.NDArray[np.bool_]
+    ) -> tuple[FloatArray, FloatArray] | None:
+        """Do one Newton step with iterative refinement; None if the program has cones or is too large.
+
+        It is computed in scaled units, in which all roundings are the same, because the scales are powers of two.
+        """
+        rows = active.nonzero()[0]
+        n, k, scaled = len(x), len(rows), self.scaled
+        if self.cones or not 0 < n + k <= MAX_STEP_SIZE:
+            return None
+        is_dense = n + k <= MAX_DENSE_STEP_SIZE
+        P, J, t = scaled.get_hessian(is_dense), scaled.select_rows(rows, 1.0, is_dense), scaled.t[rows]
+        largest = abs(P).max() if n else 0.0
+        weight = 1.0 / float(largest) if 0.0 < largest < np.inf else 1.0
+        try:
+            solve = (_factor_dense if is_dense else _factor_sparse)(weight * P, J)
+        except RuntimeError:  # The sparse matrix is singular in spite of its shift.
+            return None
+        x, lam = self.scale_point(x, lam)
+        multipliers = lam[rows]
+        for _ in range(2 if is_dense else REFINEMENTS_OF_SPARSE_STEP):
+            gradient = P @ x + scaled.q - J.T @ multipliers
+            move = solve(np.concatenate([-weight * gradient, t - J @ x]))
+            x, multipliers = x + move[:n], multipliers + move[n:] / weight
+        bounds = rows[self.variable[rows] >= 0]
+        x[self.variable[bounds]] = scaled.J[2][scaled.J[0][bounds]] * scaled.t[bounds]  # Remove rounding.
+        lam = np.zeros(len(lam))
+        lam[rows] = multipliers
+        return self.restore_point(x, lam) if np.isfinite(x).all() else None
+
+    def update_active_rows(
+        self, x: FloatArray, lam: FloatArray, active: npt.NDArray[np.bool_], tol: float
+    ) -> npt.NDArray[np.bool_]:
+        """Return the active rows after a step: without negative multipliers, with rows that are violated by tol."""
+        J = _to_csr(self.J, len(x))
+        active = (active & (lam > 0.0)) | (J @ x - self.t < -tol * (abs(J) @ np.abs(x) + np.abs(self.t)))
+        active[: self.free] = True
+        return active
+
+
+@dataclass(frozen=True, eq=False)
+class ScaledProgram(ConvexProgram):
+    """A scaled program as backends receive it: A x = b, G x <= h, lb <= x <= ub, and G' x <= h' in cones.
+
+    Parameters
+    ----------
+    is_kept : (m,) bool, optional
+        Rows that the backend receives; default: all.
+    shift : float
+        Number that was added to the diagonal of P.
+    """
+
+    is_kept: npt.NDArray[np.bool_] | None = field(default=None)
+    shift: float = 0.0
+
+    @property
+    def n(self) -> int:
+        """Number of variables."""
+        return len(self.q)
+
+    @property
+    def nbytes(self) -> int:
+        """Size [bytes] of the matrices."""
+        return sum(int(x.nbytes) for x in (*self.P, *self.J))
+
+    def without_far_rows(self) -> ScaledProgram:
+        """Return the program without inequalities that hold by far at x = 0; the same object if there are none."""
+        is_far = self.t < -FAR_SIDE
+        is_far[: self.free] = False
+        is_far[len(self.t) - sum(self.cones) :] = False
+        return replace(self, is_kept=~is_far) if is_far.any() else self
+
+    @property
+    def is_representable(self) -> bool:
+        """Whether all numbers of the rows that are kept are below MAX_BACKEND_NUMBER."""
+        side = self.t if self.is_kept is None else self.t[self.is_kept]
+        numbers = (self.P[2], self.q, self.J[2], side)
+        return all(bool(np.abs(x).max(initial=0.0) < MAX_BACKEND_NUMBER) for x in numbers)
+
+    @cached_property
+    def is_definite(self) -> bool:
+        """Whether P has a Cholesky factor without negligible pivots."""
+        P = self._dense[0]
+        try:
+            pivots = np.square(np.linalg.cholesky(P).diagonal())
+        except np.linalg.LinAlgError:
+            return False
+        return bool((pivots > MAX_SINGULAR_PIVOT * P.diagonal()).all())
+
+    def make_definite(self, attempt: int) -> ScaledProgram:
+        """Return the program with DEFINITE_SHIFTS[attempt] on the diagonal of P, at first only if P is singular."""
+        if self.is_definite and not attempt:
+            return self
+        P = to_dense(self.P, self.n)
+        shift = DEFINITE_SHIFTS[attempt] * float(P.diagonal().max(initial=0.0) or 1.0)
+        P[np.diag_indices(self.n)] += shift
+        flat = np.arange(self.n * self.n, dtype=np.int32) % max(self.n, 1)
+        ptr = np.arange(self.n + 1, dtype=np.int32) * self.n
+        return replace(self, P=(ptr.astype(np.int32), flat, P.ravel()), shift=shift)
+
+    @cached_property
+    def parts(self) -> tuple[Any, Any, Any, Any]:
+        """Rows of A, rows of G with the rows of the cones at the end, rows that are lower and that are upper bounds."""
+        rows, is_general = np.arange(len(self.t)), self.variable < 0
+        is_kept = np.ones(len(rows), bool) if self.is_kept is None else self.is_kept
+        sign = np.ones(len(rows))
+        bound = np.flatnonzero(~is_general)
+        sign[bound] = self.J[2][self.J[0][bound]]
+        return (
+            rows[is_general & (rows < self.free)],
+            rows[is_general & (rows >= self.free) & is_kept],
+            rows[~is_general & is_kept & (sign > 0.0)],
+            rows[~is_general & is_kept & ((sign < 0.0) | (rows < self.free))],
+        )
+
+    def list_bounds(self) -> tuple[FloatArray, FloatArray] | None:
+        """Return lb and ub (n,), or None if no variable is bounded."""
+        _, _, low, high = self.parts
+        if not len(low) and not len(high):
+            return None
+        lb, ub = np.full(self.n, -np.inf), np.full(self.n, np.inf)
+        lb[self.variable[low]] = self.t[low]
+        ub[self.variable[high]] = np.where(high < self.free, self.t[high], -self.t[high])
+        return lb, ub
+
+    @cached_property
+    def _dense(self) -> tuple[FloatArray, FloatArray]:
+        """P and J as dense matrices."""
+        return to_dense(self.P, self.n), to_dense(self.J, self.n)
+
+    @cached_property
+    def _sparse(self) -> dict[Any, Any]:
+        """Matrices of `select_rows` and `get_hessian` that have been built."""
+        return {}
+
+    def select_rows(self, rows: Any, sign: float, dense: bool) -> Any:
+        """Return sign J of these rows, dense or as `csc_matrix`."""
+        if dense:
+            return sign * self._dense[1][rows]
+        if not len(rows):
+            return sp.csc_matrix((0, self.n))
+        first, last, (ptr, idx, value) = rows[0], rows[-1] + 1, self.J
+        if last - first != len(rows):
+            matrix = sp.csr_matrix((value, idx, ptr), (len(self.t), self.n))
+            return sp.csc_matrix(sign * matrix[rows])
+        key = first, last, sign
+        if key not in self._sparse:
+            at = slice(ptr[first], ptr[last])
+            part = sign * value[at], idx[at], ptr[first : last + 1] - ptr[first]
+            self._sparse[key] = sp.csr_matrix(part, (len(rows), self.n)).tocsc()
+        return self._sparse[key]
+
+    def get_hessian(self, dense: bool) -> Any:
+        """Return a copy of the dense P, or P as `csc_matrix` with sorted indices."""
+        if dense:
+            return self._dense[0].copy()
+        if "P" not in self._sparse:
+            ptr, idx, value = self.P  # P is symmetric: its compressed rows are its compressed columns.
+            matrix = sp.csc_matrix((value, idx, ptr), (self.n, self.n))
+            matrix.sort_indices()
+            self._sparse["P"] = matrix
+        return self._sparse["P"]
+
+    def get_upper_hessian(self) -> Any:
+        """Return the upper triangle of P as `csc_matrix`."""
+        if "upper" not in self._sparse:
+            self._sparse["upper"] = sp.triu(self.get_hessian(False), format="csc")
+        return self._sparse["upper"]
+
+    def join_multipliers(self, y: Any, z: Any, box: Any) -> FloatArray:
+        """Return lambda (m,) of multipliers with the signs of qpsolvers; missing ones (None) count as 0."""
+        a, g, low, high = self.parts
+        lam = np.zeros(len(self.t))
+        if y is not None:
+            lam[a] = -y
+        if z is not None:
+            lam[g] = z
+        if box is not None:
+            lower, upper = box[self.variable[low]], box[self.variable[high]]
+            lam[high] = np.maximum(upper, 0.0)
+            lam[low] = np.where(low < self.free, -lower, np.maximum(-lower, 0.0))
+        return lam
+
+    def split_multipliers(self, lam: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return (y, z, box) of multipliers (m,), with the signs of qpsolvers."""
+        a, g, low, high = self.parts
+        box = np.zeros(self.n)
+        inequality = high >= self.free
+        np.add.at(box, self.variable[low], -lam[low])
+        np.add.at(box, self.variable[high[inequality]], lam[high[inequality]])
+        return -lam[a], lam[g], box
+
+
+def to_dense(rows: Compressed, n: int) -> FloatArray:
+    """Return a dense matrix of n columns from compressed rows."""
+    ptr, idx, value = rows
+    out = np.zeros((len(ptr) - 1, n))
+    out[np.repeat(np.arange(len(ptr) - 1), np.diff(ptr)), idx] = value
+    return out
+
+
+def _to_csr(rows: Compressed, n: int) -> Any:
+    ptr, idx, value = rows
+    return sp.csr_array((value, idx, ptr), shape=(len(ptr) - 1, n))
+
+
+def _factor_dense(hessian: FloatArray, jac: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """Return the solver of the step's equations; if they are singular, their least-squares solution."""
+    lapack, (k, n) = import_module_under_lock("scipy.linalg.lapack"), jac.shape
+    matrix = np.zeros((n + k, n + k))
+    matrix[:n, :n], matrix[:n, n:], matrix[n:, :n] = hessian, -jac.T, jac
+    lu, pivots, info = lapack.dgetrf(matrix, overwrite_a=False)
+    pivot = np.abs(lu.diagonal())
+    if info != 0 or not pivot.min() > MAX_SINGULAR_STEP_PIVOT * pivot.max():
+        return lambda rhs: np.asarray(np.linalg.lstsq(matrix, rhs, rcond=MAX_SINGULAR_STEP_PIVOT)[0], float)
+    return lambda rhs: lapack.dgetrs(lu, pivots, rhs)[0]
+
+
+def _factor_sparse(hessian: Any, jac: Any) -> Callable[[FloatArray], FloatArray]:
+    """Return the solver of the step's equations with a shifted diagonal."""
+    n, k = jac.shape[1], jac.shape[0]
+    shift = SPARSE_STEP_SHIFT * sp.eye_array(n + k)
+    matrix = sp.csc_array(sp.block_array([[hessian, -jac.T], [jac, None]]) + shift)
+    solve: Callable[[FloatArray], FloatArray] = (
+        import_module_under_lock("scipy.sparse.linalg").splu(matrix).solve
+    )
+    return solve

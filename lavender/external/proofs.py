@@ -1,0 +1,153 @@
+"""Proofs that a quadratic program has no solution, by linear programs on the equilibrated rows.
+
+infeasible   lambda with J^T lambda = 0, lambda >= 0 on inequalities, t.lambda > 0
+unbounded    d with P d = 0, J d = 0 on equations, J d >= 0 on inequalities, q.d < 0, and a feasible point
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from lavender.base.arrays import FloatArray
+from lavender.base.deadline import Deadline
+from lavender.base.lazy_import import sparse as sp
+from lavender.external.convex import ConvexProgram
+from lavender.judge.certificates import Proof, prove_infeasibility
+from lavender.problem import Problem
+from lavender.problem.generalized import Compressed
+
+RAY_TOLERANCE = 1e-8  # [-] P d, J d and q.d count as 0 up to this multiple of their largest terms.
+FEASIBLE_TOLERANCE = 1e-6  # [-] Largest error of a row of the feasible point of an unbounded program.
+NEGLIGIBLE_SHARE = 1e-9  # [-] Entries of a proof below this fraction of the largest one are set to 0.
+
+
+@np.errstate(all="ignore")  # Proofs that overflow are not accepted.
+def find_infeasibility_proof(
+    problem: Problem, program: ConvexProgram, multipliers: FloatArray | None, deadline: Deadline
+) -> Proof | None:
+    """Return a proof that no x satisfies the rows, from a backend's multipliers (m,) or a linear program, or None."""
+    rows = program.without_cost()
+    scaled, (_, e, _, _), is_equation = (
+        rows.scaled.without_far_rows(),
+        rows.scales,
+        np.arange(len(rows.t)) < rows.free,
+    )
+    candidates = [] if multipliers is None else [multipliers]
+    for attempt in range(2):
+        for lam in candidates:
+            y = _remove_small_entries(np.where(is_equation, lam, np.maximum(lam, 0.0)) / e) * e
+            proof = prove_infeasibility(
+                problem, np.concatenate([np.zeros(problem.m - len(y)), y]), 0.0, deadline
+            )
+            if not proof.reason:
+                return proof
+        if attempt or deadline.has_passed():
+            break
+        high = 1.0 if scaled.is_kept is None else scaled.is_kept.astype(float)
+        matrix = _to_sparse(scaled.J, scaled.n).T
+        t = scaled.t * high
+        found = _solve_linear_program(-t, matrix, None, np.where(is_equation, -1.0, 0.0), high, deadline)
+        if found is None:
+            return None
+        candidates = [_project_to_kernel(found, matrix) * e, found * e]
+    return None
+
+
+@np.errstate(all="ignore")
+def find_ray(
+    program: ConvexProgram, x: FloatArray | None, deadline: Deadline
+) -> tuple[FloatArray, FloatArray] | None:
+    """Return a ray d (n,) with a largest entry of 1 and a feasible point (n,) of an unbounded program, or None."""
+    scaled, (scale, _, sigma, _) = program.scaled, program.scales
+    n, free = scaled.n, program.free
+    hessian, jac = _to_sparse(scaled.P, n), _to_sparse(scaled.J, n)
+    level = sp.vstack([hessian, jac[:free]])
+    d = _solve_linear_program(scaled.q, level, jac[free:], -1.0, 1.0, deadline)
+    if d is None or not scaled.q @ d < 0.0:
+        return None
+    d = _remove_small_entries(d)
+    at_bound = np.abs(jac @ d) <= RAY_TOLERANCE * (abs(jac) @ np.abs(d))
+    at_bound[:free] = True
+    rays = [_project_to_kernel(d, sp.vstack([hessian, jac[at_bound]])), d]
+    ray = next((r for r in rays if _is_ray(hessian, jac, scaled.q, free, r)), None)
+    if ray is None:
+        return None
+    point = x
+    if point is None or not _is_feasible(program, point):
+        none = np.full(n, np.inf)
+        found = _solve_linear_program(
+            np.zeros(n), jac[:free], jac[free:], -none, none, deadline, scaled.t[:free], scaled.t[free:]
+        )
+        if found is None:
+            return None
+        point = found * (scale * sigma)
+        if not _is_feasible(program, point):
+            return None
+    ray = ray * scale
+    return ray / np.abs(ray).max(), point
+
+
+def _is_ray(hessian: Any, jac: Any, q: FloatArray, free: int, d: FloatArray) -> bool:
+    """Return whether the objective decreases without end along d, up to RAY_TOLERANCE of the terms of each row."""
+    size = np.abs(d)
+    slope, terms = jac @ d, abs(jac) @ size
+    return bool(
+        (np.abs(hessian @ d) <= RAY_TOLERANCE * (abs(hessian) @ size)).all()
+        and (np.abs(slope[:free]) <= RAY_TOLERANCE * terms[:free]).all()
+        and (slope[free:] >= -RAY_TOLERANCE * terms[free:]).all()
+        and q @ d < -RAY_TOLERANCE * (np.abs(q) @ size)
+    )
+
+
+def _is_feasible(program: ConvexProgram, x: FloatArray) -> bool:
+    """Return whether x satisfies the rows of the program, by the judge of programs without a cost."""
+    return bool(program.without_cost().judge(x, np.zeros(len(program.t)))[2] <= FEASIBLE_TOLERANCE)
+
+
+def _project_to_kernel(x: FloatArray, matrix: Any) -> FloatArray:
+    """Return the nearest vector with the same zeros for which `matrix` x = 0, in the least-squares sense."""
+    used = np.flatnonzero(x)
+    part = matrix.tocsc()[:, used].toarray()
+    out = np.zeros(len(x))
+    out[used] = x[used] - np.linalg.lstsq(part, part @ x[used], rcond=1e-10)[0]
+    return out
+
+
+def _remove_small_entries(x: FloatArray) -> FloatArray:
+    return np.where(np.abs(x) >= NEGLIGIBLE_SHARE * np.abs(x).max(initial=0.0), x, 0.0)
+
+
+def _to_sparse(rows: Compressed, n: int) -> Any:
+    ptr, idx, value = rows
+    return sp.csr_array((value, idx, ptr), shape=(len(ptr) - 1, n))
+
+
+def _solve_linear_program(
+    cost: FloatArray,
+    equations: Any,
+    inequalities: Any,
+    low: Any,
+    high: Any,
+    deadline: Deadline,
+    equal_to: Any = 0.0,
+    at_least: Any = 0.0,
+) -> FloatArray | None:
+    """Minimise cost.x with equations x = equal_to, inequalities x >= at_least and bounds; None without a point."""
+    from scipy.optimize import linprog  # Imported here: it takes 0.1 s, and is seldom needed.
+
+    n = len(cost)
+    options: dict[str, Any] = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
+    if deadline.is_set:
+        options["time_limit"] = deadline.get_remaining_seconds(1e-3)
+    bounds = np.stack([np.broadcast_to(low, (n,)), np.broadcast_to(high, (n,))], 1)
+    above: tuple[Any, Any] = (None, None)
+    if inequalities is not None and inequalities.shape[0]:
+        above = -inequalities, np.broadcast_to(-np.asarray(at_least), (inequalities.shape[0],))
+    level: tuple[Any, Any] = (None, None)
+    if equations.shape[0]:
+        level = equations, np.broadcast_to(equal_to, (equations.shape[0],))
+    size = float(np.abs(cost).max(initial=0.0)) or 1.0
+    result = linprog(cost / size, *above, *level, bounds=bounds, method="highs", options=options)
+    return None if result.x is None else np.asarray(result.x, float)
