@@ -19,6 +19,7 @@ NAMES = (
     "limits",
     "page",
     "peers",
+    "programs",
     "rates",
     "regret",
     "scale",

@@ -47,7 +47,6 @@ MIN_TOL = 1e-13  # Smallest error that further solves are to reach; smaller ones
 MAX_SOLVES = 5  # Maximum number of solves of one constraint problem, each with a smaller tol.
 # The next tol is this fraction of the tol that would suffice if the program's error were proportional to tol.
 TOL_RATIO = 0.1
-NAMES = "P", "q", "G", "h", "A", "b", "lb", "ub"
 
 
 class Run(NamedTuple):
@@ -62,7 +61,7 @@ class Run(NamedTuple):
 
 
 def solve_qp(
-    problem: Any,
+    P: Any,
     q: Any = None,
     G: Any = None,
     h: Any = None,
@@ -85,8 +84,7 @@ def solve_qp(
 
     Parameters
     ----------
-    problem : Problem, or P (n, n) array or sparse, or None
-        None as P is a linear program.
+    P : (n, n) array or sparse, None for a linear program, or a Problem
     q : (n,), or str
         With a problem: the name of the solver, or another q of the same program; its matrices are kept.
     G, h, A, b, lb, ub : arrays, optional
@@ -128,14 +126,13 @@ def solve_qp(
     ([0.0, 1.0], True)
     """
     begun = perf_counter()
-    if isinstance(problem, Problem):
+    if isinstance(P, Problem):
         if isinstance(q, str):
             solver, q = q, None
-        problem = _update_program(problem, q, h, b, (G, A, lb, ub))
+        problem = _update_program(P, q, h, b, (G, A, lb, ub))
     else:
-        if problem is None:
-            problem = np.zeros((np.size(q), np.size(q)))
-        problem = Problem.from_qp(problem, q, G, h, A, b, lb, ub)
+        hessian = np.zeros((np.size(q), np.size(q))) if P is None else P
+        problem = Problem.from_qp(hessian, q, G, h, A, b, lb, ub)
     tol = check_float("tol", tol, low=0.0)
     limit = check_time_limit(time_limit)
     deadline = Deadline(None if limit == math.inf else limit)

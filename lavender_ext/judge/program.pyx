@@ -305,25 +305,7 @@ def equilibrate_program(hessian, q_, jac, t_, variable_, int32_t free):
     cdef double* curvature = as_double_pointer(curvature_, n)
     cdef double v, gamma = 1.0, logarithms = 0.0, largest = 0.0, sigma = 1.0, fallback = 0.0
     cdef Py_ssize_t n_fallback = 0
-    for _sweep in range(EQUILIBRATION_SWEEPS):
-        for j in range(n):
-            v = 0.0
-            for k in range(p.ptr[j], p.ptr[j + 1]):
-                v = max(v, fabs(p.val[k]) * d[p.idx[k]])
-            column[j] = gamma * v * d[j]
-        for i in range(m):
-            if variable[i] >= 0:
-                continue
-            v = 0.0
-            for k in range(a.ptr[i], a.ptr[i + 1]):
-                j = a.idx[k]
-                column[j] = max(column[j], fabs(a.val[k]) * e[i] * d[j])
-                v = max(v, fabs(a.val[k]) * d[j])
-            if v > 0.0:
-                e[i] /= sqrt(v * e[i])
-        for j in range(n):
-            if column[j] > 0.0:
-                d[j] /= sqrt(column[j])
+    for _sweep in range(-1, EQUILIBRATION_SWEEPS):
         for j in range(n):
             v = 0.0
             for k in range(p.ptr[j], p.ptr[j + 1]):
@@ -332,6 +314,21 @@ def equilibrate_program(hessian, q_, jac, t_, variable_, int32_t free):
         positive = curvature_[curvature_ > 0.0]
         if len(positive):
             gamma = 1.0 / float(np.sort(positive)[len(positive) // 2])
+        for j in range(n):
+            column[j] = gamma * curvature[j]
+        for i in range(m):
+            if variable[i] >= 0:
+                continue
+            v = 0.0
+            for k in range(a.ptr[i], a.ptr[i + 1]):
+                j = a.idx[k]
+                column[j] = max(column[j], fabs(a.val[k]) * e[i] * d[j])
+                v = max(v, fabs(a.val[k]) * d[j])
+            if v > 0.0:                                 # first to 1, so that the units of rows have no effect
+                e[i] = 1.0 / v if _sweep < 0 else e[i] / sqrt(v * e[i])
+        for j in range(n):
+            if column[j] > 0.0 and _sweep >= 0:
+                d[j] /= sqrt(column[j])
     for j in range(n):
         d[j] = power_of_two(d[j])
     for i in range(m):
