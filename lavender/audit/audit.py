@@ -62,6 +62,9 @@ MAX_DEFAULT_WORLDS = 4096
 # World 0 is first judged in this process for these numbers of steps, so that Ctrl-C soon after the start has a result.
 FIRST_STEPS = (1, 20)
 MAX_CONTACT_STATES = 1000  # Up to about this many states before steps with contact are kept.
+# The states before a world diverges by less than this number of steps are not kept as states with contact: their speeds
+# are those of the divergence, and `slip` simulates settings for 25 steps.
+DIVERGENCE_MARGIN = 25
 AUDIT_BUSY_CONSEQUENCE = (
     "The audit took longer than on an idle machine; its errors do not depend on the load."
 )
@@ -229,7 +232,11 @@ def audit(
         )
     own = processes + (engine == "mujoco")  # This process waits for the workers.
     busy = machine.make_busy_warning(loads, os.cpu_count() or 1, AUDIT_BUSY_CONSEQUENCE, own=own)
-    result.contact_states.sort(key=lambda entry: entry[:2])
+    first_lost = {d.world: d.step for d in result.divergences}
+    result.contact_states[:] = sorted(
+        (s for s in result.contact_states if s.step < first_lost.get(s.world, np.inf) - DIVERGENCE_MARGIN),
+        key=lambda entry: entry[:2],
+    )
     return replace(result, stopped=result.n_processed < result.verdict.size, busy=busy, n_quiet=n_quiet)
 
 

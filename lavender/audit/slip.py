@@ -26,7 +26,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -35,9 +35,11 @@ from lavender.base.errors import InputError
 from lavender.judge.residuals import residual
 from lavender.problem import Problem
 from lavender.problem.data import check_problem
-from lavender.report.table import Table
 from lavender.report.text import NONE, format_size, format_sizes
 from lavender.solving.solve import solve
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 #: {variant: cause of its difference from the next variant}, in the order of replacement.
 CAUSES = {
@@ -52,11 +54,8 @@ CAUSES = {
 MIN_EXPLAINED_SLIP = 1e-6
 REMEDY_STEPS = 25  # Settings are compared by their mean slip in this number of further steps.
 MAX_REMAINING_SLIP = 0.9  # A setting helps if at most this fraction of the slip remains.
-#: State of a contact that slides at the friction limit: it becomes slower, or not.
-SLIDING_STATES = (
-    "Friction is above the load along the surface and brakes it.",
-    "The load along the surface is above mu times the normal force.",
-)
+# A contact slid already before the step if it then had at least this fraction of its speed after the step.
+MIN_EARLIER_FRACTION = 0.5
 UNDEFINED_LAW = "Coulomb's law is not defined for its round cones"
 
 
@@ -98,12 +97,17 @@ class Remedy:
     slip : float, m/s
         Mean speed of the contact's points in the explained step, simulated with the setting.
     later : float, m/s
-        The same, as a mean of the next `REMEDY_STEPS` steps; nan if the geoms no longer touch after one of the runs.
+        The same, as a mean of the next `REMEDY_STEPS` steps; nan if the geoms no longer touch after one of the runs, or
+        if a run diverges.
+    diverged_step : int
+        First step in which MuJoCo restarted one of the runs because it diverged; 0 is the explained step, -1 means that
+        no run diverged.
     """
 
     setting: str
     slip: float
     later: float
+    diverged_step: int = -1
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,8 +141,7 @@ class SlipExplanation:
     state: int = 0
 
     def __str__(self) -> str:
-        rows = [self.table.heads, *self.table.rows]
-        return "\n".join(["  ".join(map(str, row)) for row in rows] + self.sentences)
+        return "\n".join([self.table.to_string(index=False), *self.sentences])
 
     @property
     def parts(self) -> dict[str, FloatArray]:
@@ -167,20 +170,23 @@ class SlipExplanation:
         return tuple(slip.cause for slip in self.slips)
 
     @property
-    def table(self) -> Table:
+    def table(self) -> pd.DataFrame:
         """Sliding speed of each contact [m/s], its largest part and the cause of this part."""
-        return _tabulate_slip(self.slips).without_columns("points")
+        return tabulate_slip(self.slips).drop(columns="points")
 
     @property
-    def remedies_table(self) -> Table:
-        """Slip of the fastest contact with each setting [m/s], in the explained step and later."""
+    def remedies_table(self) -> pd.DataFrame:
+        """Slip of the fastest contact with each setting [m/s], in the explained step and later, as texts."""
+        import pandas as pd
+
+        slips, means = (format_sizes([getattr(r, name) for r in self.remedies]) for name in ("slip", "later"))
+        for i, remedy in enumerate(self.remedies):
+            if remedy.diverged_step >= 0:
+                means[i] = f"diverges in step {remedy.diverged_step}"
+        texts = [[text.replace(NONE, "no contact") for text in column] for column in (slips, means)]
+        settings = [r.setting for r in self.remedies]
         heads = ["setting", "slip [m/s]", f"mean of the next {REMEDY_STEPS} steps [m/s]"]
-        columns = [format_sizes([getattr(r, name) for r in self.remedies]) for name in ("slip", "later")]
-        rows = [
-            [r.setting, *(text.replace(NONE, "no contact") for text in texts)]
-            for r, *texts in zip(self.remedies, *columns, strict=True)
-        ]
-        return Table(heads, rows, words=frozenset({"setting"}))
+        return pd.DataFrame(dict(zip(heads, [settings, *texts], strict=True)))
 
     @property
     def sentences(self) -> list[str]:
@@ -196,15 +202,23 @@ class SlipExplanation:
             f"Fastest: {slip.contact} with {format_size(slip.speed)} m/s.",
             f"Largest part: {slip.cause}, {part} m/s.",
         ]
+        use = None if self.friction_use is None else float(self.friction_use[i])
+        has_force = use is None or not np.isnan(use)
         if self.speeds_before is not None:
-            before = float(self.speeds_before[i])
+            before, after = float(self.speeds_before[i]), float(self.variants[-1].speeds[i])
             lines.append(f"Before the step it slid with {format_size(before)} m/s.")
-            if slip.cause == CAUSES["coulomb"]:
-                is_braked = self.variants[-1].speeds[i] < before
-                lines.append(SLIDING_STATES[not is_braked])
-        if self.friction_use is not None:
-            use = f"{100.0 * self.friction_use[i]:.0f} % of mu times the normal force"
-            lines.append(f"In the engine's answer its friction force is {use}.")
+            if slip.cause == CAUSES["coulomb"] and before >= MIN_EARLIER_FRACTION * after:
+                slows = "slows it" if after < before else "does not slow it"
+                lines.append(f"The cause is that it slid already; friction {slows}.")
+            elif slip.cause == CAUSES["coulomb"] and has_force:
+                lines.append("The load along the surface is above mu times the normal force.")
+        if not has_force:
+            lines.append(
+                "The engine's answer has no normal force at this contact, and therefore no friction."
+            )
+        elif use is not None:
+            share = f"{100.0 * use:.0f} % of mu times the normal force"
+            lines.append(f"In the engine's answer its friction force is {share}.")
         return lines + [
             f"Variant {v.name!r}: {v.note}."
             for v in self.variants
@@ -216,11 +230,22 @@ class SlipExplanation:
         """Lines about the settings that helped when they were simulated, best first; or that none did."""
         if not self.remedies:
             return []
-        is_later = not np.isnan(self.remedies[0].later)
+        now = self.remedies[0]
+        if now.diverged_step >= 0:
+            step = f"step {now.diverged_step} after the state"
+            cause = f"as it is, the simulation diverges in {step}, and MuJoCo restarts it"
+            return [f"No setting is recommended: {cause}. Find the cause first (lavender audit)."]
+        is_later = not np.isnan(now.later)
         get_slip = attrgetter("later" if is_later else "slip")
-        before = get_slip(self.remedies[0])
-        helpful = [r for r in self.remedies[1:] if get_slip(r) <= MAX_REMAINING_SLIP * before]
+        before = get_slip(now)
         time = f"in the next {REMEDY_STEPS} steps" if is_later else "in the same step"
+        if not before > MIN_EXPLAINED_SLIP:
+            mean, limit = f"{format_size(before)} m/s as it is", f"{MIN_EXPLAINED_SLIP:g} m/s"
+            return [f"No setting is needed: the mean slip {time} is {mean}; up to {limit} count as no slip."]
+        helpful = [
+            r for r in self.remedies[1:]
+            if r.diverged_step < 0 and get_slip(r) <= MAX_REMAINING_SLIP * before
+        ]  # fmt: skip
         if not helpful:
             return [f"None of these settings reduces the slip {time} by more than 10 %."]
         head = f"Settings that help (mean slip {time}, {format_size(before)} m/s as it is):"
@@ -441,16 +466,10 @@ def average_slip(explanations: Iterable[SlipExplanation]) -> list[ContactSlip]:
     ]  # fmt: skip
 
 
-def summarize_slip(explanations: Iterable[SlipExplanation]) -> Table:
-    """Return the mean sliding speed of each pair of geoms [m/s] over several states, its largest part and the cause."""
-    return _tabulate_slip(average_slip(explanations))
+def tabulate_slip(slips: Iterable[ContactSlip]) -> pd.DataFrame:
+    """Return a table of contacts, with speeds in m/s; a contact without slip has no part."""
+    import pandas as pd
 
-
-def _tabulate_slip(slips: Iterable[ContactSlip]) -> Table:
-    """Return a table of contacts; a contact without slip has no part."""
-    rows = [
-        [s.contact, str(s.count), format_size(s.speed), format_size(s.parts.get(s.cause, 0.0)), s.cause]
-        for s in slips
-    ]
+    rows = [(s.contact, s.count, s.speed, s.parts.get(s.cause, 0.0), s.cause) for s in slips]
     heads = ["contact", "points", "slip [m/s]", "largest part [m/s]", "cause of this part"]
-    return Table(heads, rows, words=frozenset({"contact", "cause of this part"}))
+    return pd.DataFrame(rows, columns=heads)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lavender.audit.settings import MujocoSetting, get_option_value
+from lavender.audit.simulated_worlds import count_engine_warnings, has_diverged
 from lavender.audit.slip import (
     MIN_EXPLAINED_SLIP,
     REMEDY_STEPS,
@@ -20,6 +21,7 @@ from lavender.audit.slip import (
     explain_slip,
     find_surface_velocity,
     get_geoms,
+    tabulate_slip,
 )
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
@@ -27,14 +29,65 @@ from lavender.io import mujoco as adapter
 from lavender.io.mujoco_memory import import_mujoco
 from lavender.io.start_states import read_states, without_sleep
 from lavender.problem import Problem
+from lavender.report.runner import Event
+from lavender.report.text import format_count
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 MAX_REMEDY_STATES = 8  # Settings are simulated from up to this many states, those with the largest slip.
 FRICTION_FACTOR = 2.0  # The friction coefficient is multiplied by this in one of the settings.
 
 
+@dataclass(frozen=True, eq=False)
+class SlipOfStates:
+    """Slip of contacts at several states of a model.
+
+    Parameters
+    ----------
+    explanations : tuple of SlipExplanation
+        One for each state that has a contact with friction. The one with the fastest contact has `remedies`: settings
+        of MuJoCo, each simulated from up to 8 states, those in which this contact slides fastest.
+    n_states : int
+        Number of states.
+    diverged : tuple of int
+        Indices of the states that are left out, because MuJoCo restarts the simulation in a step up to the explained
+        one: its numbers are not finite, or above 1e10.
+    """
+
+    explanations: tuple[SlipExplanation, ...]
+    n_states: int
+    diverged: tuple[int, ...] = ()
+
+    @property
+    def worst(self) -> SlipExplanation:
+        """The explanation with the fastest contact; there must be at least one explanation."""
+        return max(self.explanations, key=lambda e: _find_fastest(e)[0])
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """Mean sliding speed of each pair of geoms [m/s], its largest part and the cause of this part."""
+        return tabulate_slip(average_slip(self.explanations))
+
+    @property
+    def notes(self) -> list[str]:
+        """A sentence about the states that are left out because they diverge; empty if there are none."""
+        if not self.diverged:
+            return []
+        n, first = len(self.diverged), self.diverged[0]
+        are = "is" if n == 1 else "are"
+        left_out = f"{format_count(n, 'state')} of {self.n_states} {are} left out, the first is state {first}"
+        return [f"{left_out}: the simulation diverges up to the explained step, and MuJoCo restarts it."]
+
+
 def explain_slip_of_states(
-    model: Any, states: Any = None, *, contacts: Sequence[str] | str | None = None, steps: int = 1
-) -> list[SlipExplanation]:
+    model: Any,
+    states: Any = None,
+    *,
+    contacts: Sequence[str] | str | None = None,
+    steps: int = 1,
+    watch: Callable[[Event], None] | None = None,
+) -> SlipOfStates:
     """Explain the slip of contacts of a MuJoCo model at given states.
 
     Parameters
@@ -46,12 +99,12 @@ def explain_slip_of_states(
         Geoms of the contacts to explain; default: all. States in which these geoms touch nothing are skipped.
     steps : int, default 1
         Steps that are simulated from each state, with its controls and without sleep; the last one is explained.
+    watch : callable, optional
+        Called with the progress.
 
     Returns
     -------
-    list of SlipExplanation
-        One for each state that has a contact with friction. The one with the fastest contact has `remedies`: settings
-        of MuJoCo, each simulated from up to 8 states, those in which this contact slides fastest.
+    SlipOfStates
 
     Raises
     ------
@@ -68,49 +121,107 @@ def explain_slip_of_states(
             raise InputError(
                 f"contacts names {entry!r}, but no geom's name contains it; the geoms are {known}"
             )
-    data, before = mj.MjData(model), np.empty(mj.mj_stateSize(model, mj.mjtState.mjSTATE_INTEGRATION))
     vectors = [None] if states is None else list(read_states(mj, model, states).vectors)
     explanations: list[SlipExplanation] = []
+    diverged: list[int] = []
     starts = []  # State vector of each explanation.
-    for i, vector in enumerate(vectors):
-        mj.mj_resetData(model, data)
-        if vector is not None:
-            mj.mj_setState(model, data, vector, mj.mjtState.mjSTATE_INTEGRATION)
+    with count_engine_warnings(mj):
+        for i, vector in enumerate(vectors):
+            if watch is not None:
+                watch(Event(i, len(vectors), "explaining states", ""))
+            data = _advance(mj, model, vector, steps)
+            if data is None:
+                diverged.append(i)
+                continue
+            explanation = _explain_state(mj, model, data, entries)
+            if explanation is not None:
+                explanations.append(replace(explanation, state=i))
+                starts.append(_get_state(mj, model, data))
+        if explanations:
+            _simulate_remedies(mj, model, explanations, starts, watch)
+    return SlipOfStates(tuple(explanations), len(vectors), tuple(diverged))
+
+
+def _get_state(mj: Any, model: Any, data: Any) -> FloatArray:
+    """Return the state vector of mjSTATE_INTEGRATION."""
+    state = np.empty(mj.mj_stateSize(model, mj.mjtState.mjSTATE_INTEGRATION))
+    mj.mj_getState(model, data, state, mj.mjtState.mjSTATE_INTEGRATION)
+    return state
+
+
+def _advance(mj: Any, model: Any, vector: FloatArray | None, steps: int) -> Any:
+    """Return data after the forward pass of step number `steps` from a state; None if the simulation diverges."""
+    data = mj.MjData(model)
+    if vector is not None:
+        mj.mj_setState(model, data, vector, mj.mjtState.mjSTATE_INTEGRATION)
+    try:
         for _ in range(steps - 1):
             mj.mj_step(model, data)
+            if has_diverged(mj, data):
+                return None
         mj.mj_forward(model, data)
-        mj.mj_getState(model, data, before, mj.mjtState.mjSTATE_INTEGRATION)
-        problem, disk, surface = _read_step(mj, model, data)
-        measured = problem if disk is None else disk
-        blocks = np.flatnonzero(measured.cones.n_tangents > 0).tolist()
-        names = [measured.block_name(k) for k in blocks]
-        touching = [entry for entry in entries if any(entry in name for name in names)]
-        if touching or (names and not entries):
-            answer = adapter.impulse(model, data)
-            explanation = explain_slip(
-                problem, answer, contacts=touching or None, disk=disk, surface_velocity=surface
+    except mj.FatalError:
+        return None
+    return None if _is_diverging(mj, data) else data
+
+
+def _is_diverging(mj: Any, data: Any) -> bool:
+    """Return whether MuJoCo will restart the simulation in the step of this forward pass."""
+    return not all(np.abs(x).max(initial=0.0) <= mj.mjMAXVAL for x in (data.qpos, data.qvel, data.qacc))
+
+
+def _explain_state(mj: Any, model: Any, data: Any, entries: list[str]) -> SlipExplanation | None:
+    """Explain the step after a forward pass; None if no chosen contact has friction."""
+    problem, disk, surface = _read_step(mj, model, data)
+    measured = problem if disk is None else disk
+    blocks = np.flatnonzero(measured.cones.n_tangents > 0).tolist()
+    names = [measured.block_name(k) for k in blocks]
+    touching = [entry for entry in entries if any(entry in name for name in names)]
+    if not names or (entries and not touching):
+        return None
+    answer = adapter.impulse(model, data)
+    explanation = explain_slip(
+        problem, answer, contacts=touching or None, disk=disk, surface_velocity=surface
+    )
+    chosen = [blocks[names.index(name)] for name in explanation.contacts]
+    slips = compute_slip(measured, chosen, data.qvel, surface)
+    use = [_compute_friction_use(mj, model, data, name) for name in explanation.contacts]
+    speeds = np.array([np.linalg.norm(v) for v in slips])
+    return replace(explanation, speeds_before=speeds, friction_use=np.array(use))
+
+
+def _simulate_remedies(
+    mj: Any, model: Any, explanations: list[SlipExplanation], starts: list[FloatArray], watch: Any
+) -> None:
+    """Simulate settings from the states in which the fastest contact slides fastest, and add their results."""
+    fastest = max(range(len(explanations)), key=lambda k: _find_fastest(explanations[k])[0])
+    speed, pair = _find_fastest(explanations[fastest])
+    i = int(np.argmax(explanations[fastest].variants[0].speeds))
+    use = explanations[fastest].friction_use
+    if not speed > MIN_EXPLAINED_SLIP or (use is not None and np.isnan(use[i])):
+        return  # No setting changes the slip of a contact without normal force.
+    sliding = [
+        (a.speed, k) for k, e in enumerate(explanations) for a in average_slip([e]) if a.contact == pair
+    ]
+    chosen = [starts[k] for _, k in sorted(sliding, reverse=True)[:MAX_REMEDY_STATES]]
+    settings = list(_change_settings(mj, model, pair))
+    remedies: list[Remedy] = []
+    for k, (text, changed) in enumerate(settings):
+        if watch is not None:
+            watch(
+                Event(k, len(settings), f"simulating settings from {format_count(len(chosen), 'state')}", "")
             )
-            chosen = [blocks[names.index(name)] for name in explanation.contacts]
-            slips = compute_slip(measured, chosen, data.qvel, surface)
-            use = [_compute_friction_use(mj, model, data, name) for name in explanation.contacts]
-            speeds = np.array([np.linalg.norm(v) for v in slips])
-            explanations.append(
-                replace(explanation, speeds_before=speeds, friction_use=np.array(use), state=i)
-            )
-            starts.append(before.copy())
-    fastest = max(range(len(explanations)), key=lambda k: _find_fastest(explanations[k])[0], default=-1)
-    if fastest >= 0 and _find_fastest(explanations[fastest])[0] > MIN_EXPLAINED_SLIP:
-        pair = _find_fastest(explanations[fastest])[1]
-        sliding = [
-            (a.speed, k) for k, e in enumerate(explanations) for a in average_slip([e]) if a.contact == pair
-        ]
-        chosen_starts = [starts[k] for _, k in sorted(sliding, reverse=True)[:MAX_REMEDY_STATES]]
-        remedies = tuple(
-            Remedy(text, *np.mean([_simulate_slip(mj, changed, x, pair) for x in chosen_starts], axis=0))
-            for text, changed in _change_settings(mj, model, pair)
-        )
-        explanations[fastest] = replace(explanations[fastest], remedies=remedies, n_states=len(chosen_starts))
-    return explanations
+        results = [_simulate_slip(mj, changed, state, pair) for state in chosen]
+        steps = [step for *_, step in results]
+        if k == 0 and min(steps) < 0:
+            # Compare settings only from the states from which the present setting does not diverge.
+            chosen = [state for state, step in zip(chosen, steps, strict=True) if step < 0]
+            results = [result for result in results if result[2] < 0]
+            steps = [-1]
+        step = min((step for step in steps if step >= 0), default=-1)
+        slip, later = np.mean([result[:2] for result in results], axis=0).tolist()
+        remedies.append(Remedy(text, slip, later, step))
+    explanations[fastest] = replace(explanations[fastest], remedies=tuple(remedies), n_states=len(chosen))
 
 
 def _find_fastest(explanation: SlipExplanation) -> tuple[float, str]:
@@ -178,21 +289,28 @@ def _change_settings(mj: Any, model: Any, geoms: str) -> Iterator[tuple[str, Any
         yield f'friction="{friction:g}" of {" and ".join(geoms.split(", "))}', changed
 
 
-def _simulate_slip(mj: Any, model: Any, state: FloatArray, geoms: str) -> tuple[float, float]:
+def _simulate_slip(mj: Any, model: Any, state: FloatArray, geoms: str) -> tuple[float, float, int]:
     """Return the sliding speed [m/s] of two geoms in the step from a state, and its mean in the next `REMEDY_STEPS`.
 
     Steps in which the geoms do not touch do not count. The first speed is nan if the geoms do not touch in its step,
-    the second one if they do not touch in the last step.
+    the second one if they do not touch in the last step. The last result is the step in which the simulation diverges
+    (0 is the first), from which on no step counts, or -1.
     """
-    data, means = mj.MjData(model), []
+    data = mj.MjData(model)
+    means: list[float] = []
     mj.mj_setState(model, data, state, mj.mjtState.mjSTATE_INTEGRATION)
-    for _ in range(REMEDY_STEPS + 1):
-        mj.mj_forward(model, data)
-        problem, disk, surface = _read_step(mj, model, data)
-        measured = problem if disk is None else disk
-        sliding = np.flatnonzero(measured.cones.n_tangents > 0).tolist()
-        blocks = [k for k in sliding if get_geoms(measured.block_name(k)) == geoms]
-        mj.mj_step(model, data)
+    for step in range(REMEDY_STEPS + 1):
+        try:
+            mj.mj_forward(model, data)
+            if _is_diverging(mj, data):
+                return means[0] if means else np.nan, np.nan, step
+            problem, disk, surface = _read_step(mj, model, data)
+            measured = problem if disk is None else disk
+            sliding = np.flatnonzero(measured.cones.n_tangents > 0).tolist()
+            blocks = [k for k in sliding if get_geoms(measured.block_name(k)) == geoms]
+            mj.mj_step(model, data)
+        except mj.FatalError:
+            return means[0] if means else np.nan, np.nan, step
         speeds = [np.linalg.norm(v) for v in compute_slip(measured, blocks, data.qvel, surface)]
         means.append(float(np.mean(speeds)) if speeds else np.nan)
-    return means[0], np.nan if np.isnan(means[-1]) else float(np.nanmean(means[1:]))
+    return means[0], np.nan if np.isnan(means[-1]) else float(np.nanmean(means[1:])), -1

@@ -7,8 +7,8 @@ from pathlib import Path
 import click
 
 from lavender.base.exits import EXIT_UNMET
+from lavender.cli.measuring import show_progress
 from lavender.cli.options import FILE, limit_to_one_thread, make_console, print_escaped
-from lavender.io.stored import check_figure_path, check_writable, write_figure
 
 
 @click.command()
@@ -19,9 +19,7 @@ from lavender.io.stored import check_figure_path, check_writable, write_figure
               help="Steps simulated from each state, with its controls; the last one is explained.")  # fmt: skip
 @click.option("--contact", "contacts", multiple=True, metavar="GEOM",
               help="Contacts of geoms whose names contain this; may be repeated. Default: all.")  # fmt: skip
-@click.option("--out", type=click.Path(path_type=Path), metavar="FILE.png|svg|pdf",
-              help="Draw the parts of the slip of each contact.")  # fmt: skip
-def slip(model: Path, states: str | None, steps: int, contacts: tuple[str, ...], out: Path | None) -> None:
+def slip(model: Path, states: str | None, steps: int, contacts: tuple[str, ...]) -> None:
     """Explain why contacts of a MuJoCo model slip.
 
     MODEL.xml is an MJCF file. The first table shows the speed of each contact along its surface after the step, and
@@ -33,46 +31,39 @@ def slip(model: Path, states: str | None, steps: int, contacts: tuple[str, ...],
 
     Exit code 1: no state has a contact with friction.
     """
-    from lavender.audit.slip import summarize_slip
-    from lavender.audit.slip_figure import draw_slip
     from lavender.audit.slip_states import explain_slip_of_states
     from lavender.base.arrays import check_int
     from lavender.io.start_states import can_sleep, load_model
-    from lavender.report.table import print_table
-    from lavender.report.text import format_count
+    from lavender.report.render import format_count, print_table
 
     steps = check_int("steps", steps, 1)
-    if out is not None:
-        out = check_writable(check_figure_path(out))
     limit_to_one_thread()
     mj, loaded = load_model(model)
-    explanations = explain_slip_of_states(loaded, states, contacts=contacts or None, steps=steps)
+    with show_progress() as watch:
+        result = explain_slip_of_states(loaded, states, contacts=contacts or None, steps=steps, watch=watch)
     if can_sleep(mj, loaded):
         print_escaped('Sleep was off, although the model has <flag sleep="enable"/>.')
-    touching = [contact for explanation in explanations for contact in explanation.contacts]
+    for note in result.notes:
+        print_escaped(note)
+    touching = [contact for explanation in result.explanations for contact in explanation.contacts]
     for name in contacts:
         if not any(name in contact for contact in touching):
             print_escaped(f"{name!r} touches nothing with friction in these states.")
-    if not explanations:
+    if not result.explanations:
         print_escaped(
             f"{model}: no contact with friction in these states; give other --states, or more --steps"
         )
         raise click.exceptions.Exit(EXIT_UNMET)
-    if out is not None:
-        write_figure(draw_slip(explanations), out)
-    console = make_console()
-    print_table(console, summarize_slip(explanations), optional=("points",))
-    n = len(explanations)
+    console, worst = make_console(), result.worst
+    print_table(console, result.table, optional=("points",))
+    n = len(result.explanations)
     print_escaped(
         f"slip: mean over the points of {format_count(n, 'state')} with contact, in one step of each"
     )
-    worst = max(range(n), key=lambda k: explanations[k].variants[0].speeds.max(initial=0.0))
     if n > 1:
-        print_escaped(f"\nState {explanations[worst].state} (counted from 0) has the fastest contact:")
-    print_escaped("\n".join(explanations[worst].sentences))
-    if explanations[worst].remedies:
-        print_escaped(
-            f"\nSettings simulated from {format_count(explanations[worst].n_states, 'state')}, mean slip:"
-        )
-        print_table(console, explanations[worst].remedies_table)
-        print_escaped("\n".join(explanations[worst].advice))
+        print_escaped(f"\nState {worst.state} (counted from 0) has the fastest contact:")
+    print_escaped("\n".join(worst.sentences))
+    if worst.remedies:
+        print_escaped(f"\nSettings simulated from {format_count(worst.n_states, 'state')}, mean slip:")
+        print_table(console, worst.remedies_table)
+        print_escaped("\n".join(worst.advice))

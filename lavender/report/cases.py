@@ -22,6 +22,7 @@ from lavender import io, suite
 from lavender.base.arrays import FloatArray, check_bool, check_sequence
 from lavender.base.errors import InputError, SolverUnavailable
 from lavender.diagnostics import diagnose
+from lavender.io.contact_count import count_contacts
 from lavender.io.stored import ENGINE, STATES_FOLDER, SUFFIXES, read_whole_file
 from lavender.judge.residuals import DEFAULT_THRESHOLD, Residual, is_solved_by_zero, residual
 from lavender.problem import Problem, check_problem
@@ -418,7 +419,7 @@ def _make_names_differ(items: list[Item]) -> list[Item]:
 def describe_case(item: Item, run: str) -> CaseInfo:
     """Load the problem of an item and describe it for the report."""
     p = item.problem
-    contacts = int(np.count_nonzero(p.cones.is_contact))
+    contacts = count_contacts(p)
     answer = item.judge_stored_answer()
     structure, islands = classify_structure_and_count_islands(p)
     return CaseInfo(

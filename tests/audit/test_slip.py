@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 import lavender as lv
-from lavender.audit.slip import CAUSES, REMEDY_STEPS, SLIDING_STATES, average_slip, explain_slip, summarize_slip
-from lavender.audit.slip_figure import draw_slip
+from lavender.audit.slip import REMEDY_STEPS, Remedy, SlipExplanation, explain_slip
 from lavender.audit.slip_states import explain_slip_of_states
 
 mujoco = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[peers]'")
@@ -31,7 +30,7 @@ def dominant(explanation):
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
 def test_below_the_friction_angle_a_block_creeps_because_friction_is_soft(cone):
     angle = 0.3  # tan 0.309 < 0.5
-    explanation = explain_slip_of_states(block(angle, option=f'cone="{cone}"'), steps=600)[0]
+    explanation = explain_slip_of_states(block(angle, option=f'cone="{cone}"'), steps=600).explanations[0]
     assert set(explanation.causes) == {"softness of friction"}
     hard = explanation.variants[3]
     assert hard.name == "hard" and hard.speeds.max() < 1e-6
@@ -47,7 +46,7 @@ def test_creep_has_the_speed_of_the_softened_row():
         mujoco.mj_step(model, data)
     mujoco.mj_forward(model, data)
     tangent = int(data.contact.efc_address[0]) + 1
-    explanation = explain_slip_of_states(model, steps=1501)[0]
+    explanation = explain_slip_of_states(model, steps=1501).explanations[0]
     force = GRAVITY * np.sin(angle) / data.ncon
     damping = -data.efc_aref[tangent : tangent + 2] @ np.ones(2) / (data.efc_vel[tangent : tangent + 2] @ np.ones(2))
     speed = data.efc_R[tangent] * force / damping
@@ -57,7 +56,7 @@ def test_creep_has_the_speed_of_the_softened_row():
 def test_above_the_friction_angle_the_load_is_too_large():
     angle, friction = 0.6, 0.5  # tan 0.684 > 0.5
     steps = 150
-    explanation = explain_slip_of_states(block(angle, friction, 'cone="elliptic"'), steps=steps)[0]
+    explanation = explain_slip_of_states(block(angle, friction, 'cone="elliptic"'), steps=steps).explanations[0]
     assert set(explanation.causes) == {"sliding at the friction limit"}
     expected = GRAVITY * (np.sin(angle) - friction * np.cos(angle)) * steps * 0.002
     assert explanation.variants[-1].speeds == pytest.approx(np.full(len(explanation.contacts), expected), rel=0.05)
@@ -66,14 +65,14 @@ def test_above_the_friction_angle_the_load_is_too_large():
 def test_iterations_that_are_missing_are_the_cause():
     model = block(0.3, option='cone="elliptic" solver="PGS" iterations="1" tolerance="0" impratio="1000"')
     exact = block(0.3, option='cone="elliptic" impratio="1000"')
-    assert dominant(explain_slip_of_states(exact, steps=40)[0]) != "unfinished solving"
+    assert dominant(explain_slip_of_states(exact, steps=40).explanations[0]) != "unfinished solving"
     data = mujoco.MjData(exact)
     for _ in range(40):
         mujoco.mj_step(exact, data)
     state = np.empty(mujoco.mj_stateSize(exact, mujoco.mjtState.mjSTATE_INTEGRATION))
     data.qacc_warmstart[:] = 0.0
     mujoco.mj_getState(exact, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
-    assert dominant(explain_slip_of_states(model, state[None])[0]) == "unfinished solving"
+    assert dominant(explain_slip_of_states(model, state[None]).explanations[0]) == "unfinished solving"
 
 
 def slide(velocity, cones, friction="coulomb", compliance=None):
@@ -117,7 +116,7 @@ def test_a_gripper_holds_a_box_or_drops_it(grip, cause):
       <body pos="0 0 1"><freejoint/><geom name="box" type="box" size=".05 .05 .05" mass="1"/></body></worldbody>
       <actuator><motor joint="left" ctrllimited="false"/><motor joint="right" ctrllimited="false"/></actuator>
       <keyframe><key ctrl="{grip} {grip}"/></keyframe></mujoco>""")
-    explanation = explain_slip_of_states(model, "keyframes", contacts="box", steps=20)[0]
+    explanation = explain_slip_of_states(model, "keyframes", contacts="box", steps=20).explanations[0]
     assert dominant(explanation) == cause
 
 
@@ -134,31 +133,18 @@ def test_velocity_of_the_engines_impulses_is_the_engines_own():
 
 
 def test_chosen_contacts_and_summary():
-    explanations = explain_slip_of_states(block(0.6, option='cone="elliptic"'), steps=100, contacts="box")
-    table = summarize_slip(explanations)
-    assert [str(row[0]) for row in table.rows] == ["slope, box"]
-    assert table.rows[0][-1] == "sliding at the friction limit"
+    table = explain_slip_of_states(block(0.6, option='cone="elliptic"'), steps=100, contacts="box").table
+    assert table["contact"].tolist() == ["slope, box"]
+    assert table["cause of this part"].tolist() == ["sliding at the friction limit"]
     with pytest.raises(lv.InputError, match="but no geom's name contains it"):
         explain_slip_of_states(block(0.6, option='cone="elliptic"'), steps=100, contacts="hand")
-
-
-def test_bars_of_the_figure_are_the_parts():
-    explanations = explain_slip_of_states(block(0.3, option='cone="elliptic"'), steps=200, contacts="box")
-    (average,) = average_slip(explanations)
-    axes = draw_slip(explanations).axes[0]
-    assert [bar.get_label() for bar in axes.containers] == list(CAUSES.values())
-    widths = [float(bar.patches[0].get_width()) for bar in axes.containers]
-    assert widths == pytest.approx(list(average.parts.values()), rel=1e-6)
-    assert axes.lines[0].get_xdata() == [average.speed] and average.count == len(explanations[0].contacts)
-    with pytest.raises(lv.InputError, match="have no contact to draw"):
-        draw_slip([])
 
 
 @pytest.mark.parametrize("option", ['cone="elliptic"', 'cone="pyramidal"', 'cone="elliptic" impratio="10"'])
 def test_every_variant_is_solved_and_judged(option):
     """Each solution has a relative residual of at most 1e-9, and an engine that converged has the same velocity."""
     for angle in (0.2, 0.6):
-        explanation = explain_slip_of_states(block(angle, option=option), steps=100)[0]
+        explanation = explain_slip_of_states(block(angle, option=option), steps=100).explanations[0]
         for variant in explanation.variants[1:]:
             assert not variant.note.startswith("not solved")
             assert variant.relative <= 1e-9, variant.name
@@ -173,14 +159,14 @@ def test_problems_without_contacts_or_velocities_are_rejected():
 
 
 def test_advice_lists_only_settings_whose_simulated_slip_is_smaller():
-    soft = explain_slip_of_states(block(0.3, option='cone="elliptic"'), steps=600)[0]
+    soft = explain_slip_of_states(block(0.3, option='cone="elliptic"'), steps=600).explanations[0]
     as_it_is, *others = soft.remedies
     advised = [line.strip().rpartition(": ")[0] for line in soft.advice[1:]]
     helpful = [r.setting for r in sorted(others, key=lambda r: r.later) if r.later <= 0.9 * as_it_is.later]
     assert advised == helpful and '<option impratio="10"/>' in advised
     # A larger friction coefficient does not reduce creep, although it is the first idea.
     assert 'friction="1" of slope and box' in {r.setting for r in others} - set(advised)
-    stiff = explain_slip_of_states(block(0.3, option='cone="elliptic" impratio="10"'), steps=600)[0]
+    stiff = explain_slip_of_states(block(0.3, option='cone="elliptic" impratio="10"'), steps=600).explanations[0]
     # The creep of a softened row is proportional to its compliance, which impratio divides; 5 leaves room for the load.
     assert stiff.variants[0].speeds.max() < soft.variants[0].speeds.max() / 5.0
 
@@ -189,9 +175,9 @@ def test_sentences_of_a_sliding_box_state_that_friction_brakes_it_and_that_no_se
     # At 1 m/s on a slope of tan 0.2 with friction 0.4, friction exceeds the load.
     model = block(0.2, friction=0.4)
     states = {"qpos": model.qpos0[None], "qvel": np.eye(model.nv)[:1]}
-    (explanation,) = explain_slip_of_states(model, states, steps=10)
+    (explanation,) = explain_slip_of_states(model, states, steps=10).explanations
     assert dominant(explanation) == "sliding at the friction limit"
-    assert SLIDING_STATES[0] in explanation.sentences
+    assert "The cause is that it slid already; friction slows it." in explanation.sentences
     i = int(np.argmax(explanation.variants[0].speeds))
     assert 0.0 < explanation.friction_use[i] <= 1.0 + 1e-6  # Friction is within the cone, up to MuJoCo's tolerance.
     best = min(r.later for r in explanation.remedies[1:] if not np.isnan(r.later))
@@ -199,9 +185,88 @@ def test_sentences_of_a_sliding_box_state_that_friction_brakes_it_and_that_no_se
     assert explanation.advice == ["None of these settings reduces the slip in the next 25 steps by more than 10 %."]
 
 
-def test_sentences_of_an_accelerating_box_state_that_the_load_is_above_the_limit():
-    (explanation,) = explain_slip_of_states(block(0.6, 0.5, 'cone="elliptic"'), steps=50)
-    assert SLIDING_STATES[1] in explanation.sentences
+def test_sentences_accelerating_box_name_the_load_only_in_the_step_in_which_it_starts():
+    # The box starts at rest, 0.1 mm in the slope. tan(0.6) is above the friction coefficient of 0.5.
+    load = "The load along the surface is above mu times the normal force."
+    model = block(0.6, 0.5, 'cone="elliptic"')
+    model.qpos0[2] -= 0.0001
+    (first,) = explain_slip_of_states(model).explanations
+    assert load in first.sentences
+    (later,) = explain_slip_of_states(model, steps=50).explanations
+    assert load not in later.sentences
+    assert "The cause is that it slid already; friction does not slow it." in later.sentences
+
+
+def test_sentences_contact_without_normal_force_have_no_percentage_and_no_advice():
+    """A box above a plane within the margin has a contact but no force; it moves along the plane with 1 m/s."""
+    model = mujoco.MjModel.from_xml_string("""<mujoco><option timestep="0.002" gravity="0 0 0" cone="elliptic"/>
+      <default><geom margin="0.01"/></default><worldbody><geom name="floor" type="plane" size="9 9 1"/>
+      <body pos="0 0 .059"><freejoint/><geom name="box" type="box" size=".2 .2 .05"/></body></worldbody></mujoco>""")
+    states = {"qpos": model.qpos0[None], "qvel": np.array([[1.0, 0.0, 50.0, 0.0, 0.0, 0.0]])}
+    (explanation,) = explain_slip_of_states(model, states).explanations
+    text = " ".join([*explanation.sentences, *explanation.advice])
+    assert "nan" not in text and "load" not in text and explanation.remedies == ()
+    assert "The engine's answer has no normal force at this contact, and therefore no friction." in text
+
+
+# A box that slides with 0.44 m/s, and a weight whose motor amplifies its velocity until MuJoCo restarts the simulation.
+DIVERGING = """<mujoco><option timestep=".01"/><worldbody><geom name="floor" type="plane" size="5 5 1"/>
+  <body pos="0 0 .099"><freejoint/><geom name="box" type="box" size=".1 .1 .1" friction=".3"/></body>
+  <body pos="1 0 1" gravcomp="1"><joint name="h" type="slide" axis="0 0 1"/>
+    <geom size=".05" contype="0" conaffinity="0" mass=".01"/></body></worldbody>
+  <actuator><general joint="h" gaintype="fixed" biastype="affine" gainprm="1" biasprm="0 0 90"/></actuator></mujoco>"""
+
+
+def make_diverging_states(weight_speeds):
+    """Return the model and states in which the weight of `DIVERGING` has these speeds [m/s]."""
+    model = mujoco.MjModel.from_xml_string(DIVERGING)
+    qpos = np.repeat(np.array([[0, 0, 0.099, 1, 0, 0, 0, 0.1]]), len(weight_speeds), axis=0)
+    qvel = np.zeros((len(weight_speeds), 7))
+    qvel[:, 0], qvel[:, 6] = 1.0, weight_speeds
+    return model, {"qpos": qpos, "qvel": qvel}
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_explain_slip_of_states_restart_by_mujoco_is_named_and_no_setting_recommended():
+    model, states = make_diverging_states([1.0])
+    data, step = mujoco.MjData(model), 0
+    data.qpos[:], data.qvel[:] = states["qpos"][0], states["qvel"][0]
+    while not data.warning[int(mujoco.mjtWarning.mjWARN_BADQACC)].number:
+        mujoco.mj_step(model, data)
+        step += 1
+    (explanation,) = explain_slip_of_states(model, states).explanations
+    assert explanation.remedies[0].diverged_step == step - 1 > 0
+    assert explanation.remedies_table.iloc[0, 2] == f"diverges in step {step - 1}"
+    assert len(explanation.advice) == 1 and "No setting is recommended" in explanation.advice[0]
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_explain_slip_of_states_diverging_step_is_left_out():
+    """A weight of 1e9 m/s is accelerated above MuJoCo's limit of 1e10 in the explained step."""
+    model, states = make_diverging_states([1e9, 0.0])
+    result = explain_slip_of_states(model, states)
+    assert (result.diverged, [e.state for e in result.explanations]) == ((0,), [1])
+    assert "1 state of 2 is left out, the first is state 0" in result.notes[0]
+    assert result.table["slip [m/s]"].max() < 1.0
+    # A step before the explained one counts, too.
+    assert explain_slip_of_states(model, {k: x[:1] for k, x in states.items()}, steps=4).diverged == (0,)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_settings_are_compared_only_from_states_from_which_the_present_one_does_not_diverge():
+    model, states = make_diverging_states([1.0, 0.0])
+    states["qvel"][0, 0] = 2.0  # The diverging state slides faster.
+    result = explain_slip_of_states(model, states)
+    assert result.worst.state == 0 and result.worst.n_states == 1
+    (alone,) = explain_slip_of_states(model, {k: x[1:] for k, x in states.items()}).explanations
+    assert [r.later for r in result.worst.remedies] == pytest.approx([r.later for r in alone.remedies], nan_ok=True)
+
+
+def test_advice_is_not_given_for_a_slip_that_counts_as_no_slip():
+    remedies = (Remedy("as it is", 1e-3, 1e-9), Remedy("<option/>", 1e-3, 1e-12))
+    explanation = SlipExplanation((), (), remedies=remedies)
+    (line,) = explanation.advice
+    assert "is 1.0e-9 m/s as it is; up to 1e-06 m/s count as no slip" in line
 
 
 def test_settings_are_simulated_from_all_states_with_the_fastest_contact():
@@ -209,14 +274,15 @@ def test_settings_are_simulated_from_all_states_with_the_fastest_contact():
     speeds = np.array([0.5, 1.0, 0.2])
     model.qpos0[2] -= 0.0001  # The box touches the slope in its first step.
     states = {"qpos": np.repeat(model.qpos0[None], 3, axis=0), "qvel": speeds[:, None] * np.eye(model.nv)[:1]}
-    explanations = explain_slip_of_states(model, states, steps=1)
+    explanations = explain_slip_of_states(model, states, steps=1).explanations
     assert [e.n_states for e in explanations] == [0, 3, 0]
-    alone = [explain_slip_of_states(model, {k: x[i : i + 1] for k, x in states.items()}, steps=1)[0] for i in range(3)]
+    parts = [{k: x[i : i + 1] for k, x in states.items()} for i in range(3)]
+    alone = [explain_slip_of_states(model, part, steps=1).explanations[0] for part in parts]
     assert explanations[1].remedies[0].slip == pytest.approx(np.mean([e.remedies[0].slip for e in alone]))
 
 
 def test_a_law_that_is_not_defined_is_stated():
-    explanations = explain_slip_of_states(block(0.3, option='cone="elliptic"', condim=4), steps=100)
+    explanations = explain_slip_of_states(block(0.3, option='cone="elliptic"', condim=4), steps=100).explanations
     assert "Variant 'coulomb': Coulomb's law is not defined for its round cones." in explanations[0].sentences
     assert explanations[0].parts["convex relaxation"] == pytest.approx([0.0] * len(explanations[0].contacts))
 
@@ -267,7 +333,7 @@ def test_explain_slip_of_states_subtracts_surface_velocity_of_geoms():
           <geom name="belt" type="plane" size="9 9 1" surfacevel="1 0 0 0 0 0"/>
           <body pos="0 0 .05"><freejoint/><geom name="box" type="box" size=".2 .2 .05" mass="1"/></body></worldbody>
           </mujoco>""")
-        explanation = explain_slip_of_states(model, steps=1000)[0]
+        explanation = explain_slip_of_states(model, steps=1000).explanations[0]
         assert explanation.causes == ("no slip",) * len(explanation.contacts)
 
 
@@ -282,7 +348,7 @@ def test_explain_slip_of_states_remedy_has_the_slip_that_the_typed_setting_gives
     mujoco.mj_forward(model, data)
     state = np.empty(mujoco.mj_stateSize(model, state_kind))
     mujoco.mj_getState(model, data, state, state_kind)
-    (explanation,) = explain_slip_of_states(model, steps=steps)
+    (explanation,) = explain_slip_of_states(model, steps=steps).explanations
     settings = {remedy.setting: remedy for remedy in explanation.remedies}
     assert next(iter(settings)) == "as it is" and 'solref="0.004 1" of all geoms' in settings
     assert ('<option cone="elliptic" noslip_iterations="20"/>' in settings) == (cone == "pyramidal")
@@ -313,5 +379,6 @@ def test_explain_slip_of_states_skips_states_in_which_the_geom_touches_nothing()
     touching, flying = model.qpos0.copy(), model.qpos0.copy()
     flying[2] = 5.0
     states = {"qpos": np.array([flying, touching]), "qvel": np.zeros((2, model.nv))}
-    assert len(explain_slip_of_states(model, states, contacts="box", steps=20)) == 1
-    assert explain_slip_of_states(model, {k: x[:1] for k, x in states.items()}, contacts="box", steps=2) == []
+    assert len(explain_slip_of_states(model, states, contacts="box", steps=20).explanations) == 1
+    first = {k: x[:1] for k, x in states.items()}
+    assert explain_slip_of_states(model, first, contacts="box", steps=2).explanations == ()

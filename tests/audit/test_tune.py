@@ -105,6 +105,28 @@ def test_what_is_chosen():
     assert '<option iterations="9"/>' in found.lines[0]
 
 
+def test_errors_on_the_worlds_held_back_do_not_change_the_choice():
+    """The second of two equally fast siblings was not judged on the worlds held back."""
+    now, first = measured(10.0, 24.0), measured(9.0, 10.8, solver="CG", iterations=3)
+    second = measured(8.99, 10.80000001, solver="CG", iterations=3, ls_tolerance=1e-3)
+    before = chosen(now, first, second)
+    for error in (1e-9, 16.0, 1e9):
+        held = [measured(10.0, 31.0), replace(first, error=np.full(100, error))]
+        after = replace(before, held=held, held_errors={m.setting: float(m.error.max()) for m in held})
+        assert (after.faster, after.closer) == (before.faster, before.closer) == (first, first)
+        assert not any("not measured" in line for line in after.lines)
+
+
+def test_headline_gain_is_the_one_on_the_worlds_held_back():
+    now, exact = measured(10.0, 61e-3), measured(10.0, 1e-3, tolerance=1e-9)
+    assert "less" not in chosen(now, exact).summary_page.head
+    held = [measured(10.0, 9e-3), replace(exact, error=np.full(100, 1e-3))]
+    head = chosen(now, exact, held=held).summary_page.head
+    assert "In the same time the error can be 9.0 times less on worlds that were held back" in head
+    worse = [measured(10.0, 1e-3), replace(exact, error=np.full(100, 2e-3))]
+    assert "No setting is as fast and more accurate" in chosen(now, exact, held=worse).summary_page.head
+
+
 def test_of_equally_fast_settings_the_largest_iteration_limit_is_recommended():
     now, few, many, slow = (
         measured(10.0, 1e-3, iterations=15), measured(7.0, 3e-16, iterations=3),

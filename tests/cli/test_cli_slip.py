@@ -20,15 +20,6 @@ def test_the_table_names_the_cause(lavender, tmp_path):
     assert code == 2 and "hand" in error
 
 
-def test_the_figure_is_written(lavender, tmp_path):
-    (tmp_path / "slope.xml").write_text(SLOPE)
-    code, output, error = lavender("slip", tmp_path / "slope.xml", "--steps", 15, "--out", tmp_path / "slip.svg")
-    assert code == 0, error
-    assert "<svg" in (tmp_path / "slip.svg").read_text() and "sliding at the friction limit" in output
-    code, _, error = lavender("slip", tmp_path / "slope.xml", "--out", tmp_path / "slip.xyz")
-    assert code == 2 and "its suffix must be of" in error
-
-
 def test_no_contact_is_stated(lavender, tmp_path):
     (tmp_path / "air.xml").write_text(
         "<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>"

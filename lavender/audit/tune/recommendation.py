@@ -114,7 +114,7 @@ class Tuning:
         return min(
             self._list_ties(good),
             key=lambda m: (
-                max(self._compute_largest_error(m), threshold),
+                max(float(m.error.max()), threshold),
                 -m.setting.iterations,
                 m.mean_step_time,
             ),
@@ -285,6 +285,17 @@ class Tuning:
             sentences.append(self.present_result.setting.merge_note)
         return " ".join(filter(None, sentences))
 
+    def _describe_gain(self) -> str:
+        """Return a sentence on the gain of the more accurate setting on the worlds held back; empty without one."""
+        tested = None if self.closer is None else self._find_held_back(self.closer)
+        if tested is None:
+            return ""
+        error, before = tested.worst_error, self.held[0].worst_error
+        if error >= before:
+            return " No setting is as fast and more accurate on the worlds held back."
+        gain = f"{format_ratio(before / error)} less" if error else "exactly 0"
+        return f" In the same time the error can be {gain} on worlds that were held back from the choice."
+
     def _build_table_of_settings(self, settings: Iterable[Measured]) -> Table:
         """Build the table of some settings."""
         rows: list[list[str | Cell]] = [
@@ -358,10 +369,7 @@ class Tuning:
             f"{Path(self.model).name}: a step takes {format_seconds(now.mean_step_time)}, and 1 % of the steps "
             f"have errors above {format_size(now.worst_error)} m/s."
         )
-        if self.closer is not None:
-            error = self.closer.worst_error
-            gain = f"{format_ratio(now.worst_error / error)} less" if error else "exactly 0"
-            head += f" In the same time the error can be {gain} on these states."
+        head += self._describe_gain()
         if self.reason_without_line:
             head += f" {self.reason_without_line}"
         other = [m for m in self.measured if m.setting.changes_problem]
