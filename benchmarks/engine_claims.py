@@ -24,8 +24,9 @@ import click
 import numpy as np
 
 from benchmarks.output import markdown, out_option, write_json
-from lavender.audit.claims import ClaimComparison, compare_claims
+from lavender.audit.audit import audit_steps
 from lavender.audit.engine_scenes import NewtonScene, start_scene
+from lavender.audit.result import Audit
 from lavender.io.engine_step import EngineStep
 from lavender.report.text import format_size
 
@@ -202,12 +203,12 @@ def check_steps(running: NewtonScene, steps: int, checks: Checks) -> Iterator[En
 
 def run_scene(
     build: Callable[[], Any], worlds: int, steps: int, spread: float, threshold: float
-) -> tuple[ClaimComparison, Checks]:
+) -> tuple[Audit, Checks]:
     """Step one scene; return claims against verdicts, and the second computation."""
     running = start_scene(build, "kamino", worlds=worlds, spread=spread)
     assert isinstance(running, NewtonScene)
     checks = Checks(threshold)
-    return compare_claims(check_steps(running, steps, checks), engine="kamino", threshold=threshold), checks
+    return audit_steps(check_steps(running, steps, checks), engine="kamino", threshold=threshold), checks
 
 
 @click.command()
@@ -236,14 +237,14 @@ def command(
     disagreements = 0
     for name in names or SCENES:
         result, checks = run_scene(SCENES[name], worlds, steps, spread, threshold)
-        counts, disagreements = list(result.counts.values()), disagreements + len(checks.disagreements)
-        worst = float(np.nanmax(result.velocity, initial=0.0))
+        counts, disagreements = list(result.claim_counts.values()), disagreements + len(checks.disagreements)
+        worst = float(np.nanmax(result.numbers[0], initial=0.0))
         numbers = [checks.largest.get(key, 0.0) for key in ("A", "complementarity", "cone", "momentum")]
         rows.append([
-            name, str(result.outcome.size), *map(str, counts[:4]), str(sum(counts[4:])), format_size(worst),
+            name, str(result.verdict.size), *map(str, counts[:4]), str(sum(counts[4:])), format_size(worst),
             f"{checks.agree} of {checks.total}", *map(format_size, numbers),
         ])  # fmt: skip
-        lines.append({"scene": name, "counts": result.counts, "worst": worst, "agree": checks.agree,
+        lines.append({"scene": name, "counts": result.claim_counts, "worst": worst, "agree": checks.agree,
                       "judged": checks.total, "disagreements": checks.disagreements, **checks.largest})  # fmt: skip
         click.echo(" | ".join(rows[-1]), err=True)
     heads = [

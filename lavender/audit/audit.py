@@ -1,8 +1,10 @@
 """Judge every step of many worlds: which solves stopped before convergence, their errors, and the worst states.
 
     result = audit("ant.xml")          # as many worlds as take about a minute; or worlds=64
-    result.table_of_errors; result.worst[0].problem
-    result.write("lavender-audit"); result.summary_page.write("lavender-audit")
+    result = audit(model)              # a mujoco.MjModel as it is, also one that was changed after loading
+    result = audit(env, policy=policy)  # a gymnasium environment: every step of MuJoCo in env.step
+    result.errors; result.worst[0].problem
+    result.write("lavender-audit"); result.page.write("lavender-audit")
 
 An answer with an error that rounding explains, in the precision of the engine, is at its floor and did not stop before
 convergence (`Residual.verdict`). MuJoCo's problems are built by `lavender.io.from_mujoco_many` again from the
@@ -18,20 +20,25 @@ it diverged is judged only if the engine's answer is finite.
 from __future__ import annotations
 
 import copy
+import hashlib
 import os
-import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
-from time import perf_counter
-from typing import Any, NamedTuple
+from time import monotonic, perf_counter
+from typing import Any
 
 import numpy as np
 
-from lavender.audit.result import N_WORST_WORLDS, NOT_JUDGED, WORST_ROW_ERRORS, Audit, Piece, StepState, Worst
+from lavender._version import __version__
+from lavender.audit.engine_scenes import CLAIM_ENGINES, step_scene
+from lavender.audit.environment import get_environment_data, is_environment, iterate_environment
+from lavender.audit.pieces import NOT_JUDGED, Judging, Piece, judge_steps
+from lavender.audit.result import Audit
 from lavender.audit.simulated_worlds import (
     ENGINES,
-    N_TRIAL_WORLDS,
+    SPREADS,
     Divergence,
+    Frame,
     Runs,
     can_any_geoms_collide,
     count_engine_warnings,
@@ -39,13 +46,12 @@ from lavender.audit.simulated_worlds import (
     simulate_world,
     split_state_vector,
 )
-from lavender.base.arrays import FloatArray, check_float, check_int
+from lavender.base.arrays import check_float, check_int
 from lavender.base.errors import InputError, check_name
-from lavender.batch.data import Batch
-from lavender.batch.residuals import residual_many
 from lavender.io.efc import from_mujoco_many
-from lavender.io.start_states import VECTOR, Control
-from lavender.judge.residuals import DEFAULT_THRESHOLD, UNCONVERGED, VERDICTS, WRONG
+from lavender.io.engine_step import EngineStep
+from lavender.io.start_states import VECTOR, Control, hash_model
+from lavender.judge.residuals import DEFAULT_THRESHOLD
 from lavender.problem import PRECISIONS
 from lavender.report import machine
 from lavender.report.runner import Event
@@ -56,44 +62,25 @@ MAX_PROBLEMS_IN_MEMORY = 512  # Problems are built and judged in batches of this
 STEPS_PER_TASK = 4096  # A worker returns its results after this many steps or fewer.
 MIN_TASKS_PER_WORKER = 10  # With fewer tasks, the progress and the remaining time would be coarse.
 DEFAULT_DURATION = 60.0  # [s] Without a number of worlds, the audit takes about this time.
-MIN_PROGRESS_TIME = 1.0  # [s] The remaining time is estimated only after results have arrived for this long.
 # If `worlds` is None, at most this many are simulated; more would hardly change the quantiles.
 MAX_DEFAULT_WORLDS = 4096
+DEFAULT_JOINT_WORLDS = 8  # Default number of worlds of other engines, and of episodes of environments.
 # World 0 is first judged in this process for these numbers of steps, so that Ctrl-C soon after the start has a result.
 FIRST_STEPS = (1, 20)
 MAX_CONTACT_STATES = 1000  # Up to about this many states before steps with contact are kept.
+SAVE_INTERVAL = 60.0  # [s] Results of complete worlds are written to `folder` after this time.
 # The states before a world diverges by less than this number of steps are not kept as states with contact: their speeds
-# are those of the divergence, and `slip` simulates settings for 25 steps.
+# belong to the divergence, and `slip` simulates settings for 25 steps.
 DIVERGENCE_MARGIN = 25
 AUDIT_BUSY_CONSEQUENCE = (
     "The audit took longer than on an idle machine; its errors do not depend on the load."
 )
-# Matches "contact 12 " at the start of a row's name. The number differs between steps and is removed from names.
-CONTACT_NUMBER = re.compile(r"^contact \d+ ")
-
-
-class Judging(NamedTuple):
-    """How steps are judged and which are kept.
-
-    Parameters
-    ----------
-    precision : {"float64", "float32"}
-    threshold : float, m/s
-    keep : int or None
-        Number of worst steps to keep; None: the worst step of each of `N_WORST_WORLDS` worlds.
-    contact_share : float
-        Up to this fraction of the steps have contact and their state before the step kept.
-    """
-
-    precision: str
-    threshold: float
-    keep: int | None = None
-    contact_share: float = 0.0
 
 
 def audit(
-    model: str | os.PathLike[str],
+    model: Any,
     *,
+    policy: Callable[[Any], Any] | None = None,
     worlds: int | None = None,
     steps: int = 200,
     engine: str = "mujoco",
@@ -101,27 +88,40 @@ def audit(
     seed: int = 0,
     spread: float | None = None,
     states: Any = None,
+    against: Any = None,
     keep: int | None = None,
     keep_contact_states: bool = False,
     precision: str | None = None,
     threshold: float = DEFAULT_THRESHOLD,
     max_velocity_error: float | None = None,
+    njmax: int | None = None,
     workers: int = -1,
     backend: str = "loky",
+    folder: str | os.PathLike[str] | None = None,
+    reuse: bool = True,
     watch: Callable[[Event], None] | None = None,
 ) -> Audit:
     """Simulate worlds of a model and judge the engine's answer to every step.
 
     Parameters
     ----------
-    model : path (MJCF)
+    model : path of a model (MJCF, .mjb), mujoco.MjModel, gymnasium environment, or scene
+        An environment is stepped as it is: each step of MuJoCo in `env.step` is judged with the model at that time. A
+        scene of the engines "kamino", "newton-mujoco" and "genesis" is as for `step_scene`.
+    policy : callable, optional
+        Function from the environment's observation to an action. Default: random actions.
     worlds : int, optional
-        Default: as many as take about a minute (`DEFAULT_DURATION`), at most 4096.
-    steps, control, seed, spread
+        Default: as many of MuJoCo as take about a minute (`DEFAULT_DURATION`), up to 4096; 8 for other engines
+        and for environments, whose worlds are episodes.
+    steps : int, default 200
+        Steps of the engine in each world.
+    engine : {"mujoco", "mjx", "mujoco_warp", "kamino", "newton-mujoco", "genesis"}
+    control, seed, spread
         See `Runs`. Default spread: the largest of 0.1, 0.01, 0.001 and 0 m/s with which trial worlds do not diverge.
-    engine : {"mujoco", "mjx", "mujoco_warp"}
     states : path of an .npz, "keyframes", or arrays, optional
         States in which the worlds start: see `lavender.io.start_states`. Default: the model's own.
+    against : path of a model or mujoco.MjModel, optional
+        Another model, such as one with other options, that solves the same steps from the same states.
     keep : int, optional
         Number of worst steps that are kept as problems and states. Default: the worst step of each of three worlds.
     keep_contact_states : bool
@@ -131,96 +131,188 @@ def audit(
     threshold : float, m/s
         A smaller velocity error is close enough.
     max_velocity_error : float, m/s, optional
-        The summary counts the steps with a larger velocity error.
+        The headline counts the steps with a larger velocity error.
+    njmax : int, optional
+        Rows of each world for which MuJoCo Warp allocates memory, as in the user's own simulation: rows that it drops
+        are counted. Default: as many as needed.
     workers : int
         Processes for MuJoCo; -1: one for each core.
     backend : str
         Name of a joblib backend, as for a campaign.
+    folder : path, optional
+        Complete worlds of MuJoCo are written there every minute, and worlds of an earlier audit of the same model with
+        the same parameters are reused from there, unless `reuse` is false.
     watch : callable, optional
         Called with the progress.
 
     Returns
     -------
     Audit
-        After Ctrl-C, the result of the steps so far, with `stopped`: before the first results of the workers, some
+        After Ctrl-C, the result of the steps so far, with `is_stopped`: before the first results of the workers, some
         steps of world 0.
 
     Raises
     ------
     InputError
-        The model cannot be read, the engine is not installed, or a number is out of range.
+        The model cannot be read, the engine is not installed, a number is out of range, or an argument has no effect.
     CapabilityError
         MuJoCo does not store the matrix of the integrator "discrete"; see `lavender.io.from_mujoco`.
     UnknownName
         The engine is unknown.
     """
-    check_name("engine", engine, ENGINES)
+    check_name("engine", engine, (*ENGINES, *CLAIM_ENGINES))
     if precision not in (None, *PRECISIONS) or (precision and engine != "mujoco"):
         raise InputError(
             f"precision is {precision!r} and engine is {engine!r}; None is needed, or with engine 'mujoco' "
             f"{' or '.join(PRECISIONS)}"
         )
     check_workers(workers)
-    if max_velocity_error is not None:
-        max_velocity_error = check_float("max_velocity_error", max_velocity_error, low=0.0)
-    judging = Judging(
-        precision or "float64",
-        check_float("threshold", threshold, low=0.0),
-        None if keep is None else check_int("keep", keep, 1),
-    )
-    expected_time = DEFAULT_DURATION if worlds is None else None
-    one = Runs(
-        os.fspath(model), 1 if worlds is None else worlds, steps, control=control, seed=seed
-    ).with_start_states(states)
-    early = result = _make_empty_audit(one, engine, max_velocity_error)
+    limit = max_velocity_error
+    if limit is not None:
+        limit = check_float("max_velocity_error", limit, low=0.0)
+    threshold = check_float("threshold", threshold, low=0.0)
+    keep = None if keep is None else check_int("keep", keep, 1)
+    judging = Judging(precision or "float64", threshold, keep)
+    common: dict[str, Any] = {"threshold": threshold, "error_limit": limit}
+    if is_environment(model):
+        own = {"engine": engine == "mujoco", "control": isinstance(control, str) and control == "random",
+               "spread": spread is None, "states": states is None, "against": against is None}  # fmt: skip
+        for name in (name for name, is_default in own.items() if not is_default):
+            raise InputError(f"{name} has no effect with an environment, which steps itself: leave it out")
+        episodes = DEFAULT_JOINT_WORLDS if worlds is None else worlds
+        env_model, _ = get_environment_data(model)
+        runs = Runs.of_environment(model, env_model, episodes, steps, seed)
+        pieces = _audit_environment(model, policy, runs, judging)
+        return _collect(_make_empty_audit(runs, engine, common), pieces, judging, watch)
+    if policy is not None:
+        raise InputError("policy needs a gymnasium environment as model; for a model of MuJoCo give control=")
+    if against is not None and engine != "mujoco":
+        raise InputError(f"against is given and engine is {engine!r}; 'mujoco' is needed for it")
+    if njmax is not None and engine != "mujoco_warp":
+        raise InputError(f"njmax is {njmax} and engine is {engine!r}; 'mujoco_warp' is needed for it")
+    if engine in CLAIM_ENGINES:
+        if control != "random":
+            raise InputError(
+                f"control needs a model of MuJoCo; a scene of {engine} sets its own controls: leave it out"
+            )
+        start = {"states": states, "spread": SPREADS[0] if spread is None else spread, "seed": seed}
+        n = DEFAULT_JOINT_WORLDS if worlds is None else worlds
+        stepped = step_scene(model, engine, worlds=n, steps=steps, **start)
+        return audit_steps(
+            stepped, engine=engine, name=str(model), threshold=threshold, max_velocity_error=limit, keep=keep,
+            total=steps, seed=seed, watch=watch,
+        )  # fmt: skip
+    default_worlds = 1 if engine == "mujoco" else DEFAULT_JOINT_WORLDS
+    n = default_worlds if worlds is None else worlds
+    runs = Runs.of_model(model, n, steps, control=control, seed=seed).with_start_states(states)
+    runs = runs.with_other_model(against)
+    if engine == "mujoco":
+        more = (keep_contact_states, workers, backend, folder, reuse, watch, common)
+        return _audit_model(runs, judging, worlds, spread, *more)
+    runs, note = _choose_spread(runs, spread, watch)
+    if watch is not None:
+        watch(Event(0, 0, f"compiling {engine}", ""))
+    pieces = _audit_frames(iterate_frames(engine, runs, njmax), judging)
+    return _collect(_make_empty_audit(runs, engine, common, note), pieces, judging, watch)
+
+
+def audit_steps(
+    steps: Iterable[EngineStep],
+    *,
+    engine: str = "engine",
+    name: str = "steps",
+    threshold: float = DEFAULT_THRESHOLD,
+    max_velocity_error: float | None = None,
+    keep: int | None = None,
+    total: int = 0,
+    seed: int = 0,
+    watch: Callable[[Event], None] | None = None,
+) -> Audit:
+    """Judge the steps of an engine and compare its claims with the verdicts.
+
+    Parameters
+    ----------
+    steps : iterable of EngineStep
+        Results of `lavender.io.from_kamino` or `from_genesis`, one for each step, with equal numbers of worlds.
+    engine, name : str
+        Names of the engine and of the model in tables.
+    threshold, max_velocity_error, keep, watch
+        See `audit`.
+    total : int, optional
+        Number of steps, for the progress.
+    seed : int
+        Seed of the steps, for the records.
+
+    Returns
+    -------
+    Audit
+        Its `converged` holds the claims. After Ctrl-C it covers the steps judged so far, and `is_stopped` is true.
+
+    Raises
+    ------
+    InputError
+        There are no steps, or steps have different numbers of worlds.
+    """
+    if watch is not None:
+        watch(Event(0, 0, f"compiling {engine}", ""))
+    judging = Judging("float64", check_float("threshold", threshold, low=0.0), keep)
+    frames = (Frame.of_step(step) for step in steps)
+    runs = Runs(name, None, 1, max(total, 1), seed=seed)
+    common: dict[str, Any] = {"threshold": judging.threshold, "error_limit": max_velocity_error}
+    result = Audit.with_size(runs, engine, has_claims=True, **common)
+    _collect(result, _audit_frames(frames, judging), judging, watch)
+    if not result.n_processed:
+        raise InputError("steps is empty; at least one step is needed")
+    return result
+
+
+def _audit_model(
+    one: Runs,
+    judging: Judging,
+    worlds: int | None,
+    spread: float | None,
+    keep_contact_states: bool,
+    workers: int,
+    backend: str,
+    folder: Any,
+    reuse: bool,
+    watch: Callable[[Event], None] | None,
+    common: dict[str, Any],
+) -> Audit:
+    """Audit a model of MuJoCo: time its first world, choose the spread, and judge all worlds in worker processes."""
+    processes = count_processes(workers)
     loads: list[float | None] = []
-    processes = count_processes(workers) if engine == "mujoco" else 1
-    n_quiet = (0, 0)
+    early = result = _make_empty_audit(one, "mujoco", common)
+    can_reuse = folder is not None and reuse and not keep_contact_states and one.against is None
+    key = hash_parameters(one, judging, spread)
     try:
-        if worlds is None or engine == "mujoco":
-            _reject_unsupported_model(one)
-            for n_steps in (*FIRST_STEPS, steps) if worlds is None else FIRST_STEPS:
+        stored = Audit.read_size(folder, key) if can_reuse and folder is not None else None
+        if worlds is None and stored is not None:
+            worlds = stored[0]
+        elif stored is None:
+            # Raise the error of an unsupported model once and before any worker starts.
+            from_mujoco_many(one.model, np.concatenate([one.model.qpos0, np.zeros(one.model.nv)])[None])
+            for n_steps in (*FIRST_STEPS, one.steps) if worlds is None else FIRST_STEPS:
                 begin = perf_counter()
-                judged = _judge_first_steps(result, judging, n_steps, watch)
+                early = _judge_first_steps(result, judging, n_steps, watch)
                 duration = perf_counter() - begin
-                early = judged if engine == "mujoco" else early
         if worlds is None:
             worlds = choose_world_count(duration, processes)
-        runs = Runs(os.fspath(model), worlds, steps, control=control, seed=seed).with_start_states(states)
-        if watch is not None and spread is None:
-            watch(Event(0, 0, "simulating trial worlds to choose the spread", ""))
-        runs, spread_note = runs.choose_spread() if spread is None else (replace(runs, spread=spread), "")
+        runs, note = _choose_spread(replace(one, worlds=worlds), spread, watch)
         if keep_contact_states:
-            judging = judging._replace(contact_share=min(1.0, MAX_CONTACT_STATES / (worlds * steps)))
-        result = _make_empty_audit(runs, engine, max_velocity_error, spread_note)
-        if engine == "mujoco":
-            pieces = _audit_mujoco(runs, judging, workers, backend)
-        else:
-            pieces = _audit_jointly_stepped_worlds(engine, runs, judging)
-        if watch is not None:
-            text = f"{format_count(worlds, 'world')} of {format_count(steps, 'step')}"
-            if engine == "mujoco":
-                watch(Event(0, worlds * steps, text, "", remaining=expected_time))
-            else:
-                watch(Event(0, worlds * steps, f"compiling {engine}, then {text}", ""))
-        begin = perf_counter()
-        first: tuple[int, float] | None = None  # Number of steps and time [s] of the first results.
-        for piece in pieces:
-            result.add_piece(piece, judging.keep)
-            loads.append(machine.count_runnable_processes())
-            if watch is not None:
-                # The time before the first results contains the start of the workers.
-                first = first or (result.n_processed, perf_counter())
-                elapsed, since = perf_counter() - first[1], result.n_processed - first[0]
-                remaining = (
-                    None if expected_time is None else max(0.0, expected_time + begin - perf_counter())
-                )
-                if since and elapsed >= MIN_PROGRESS_TIME:
-                    remaining = elapsed * (worlds * steps - result.n_processed) / since
-                text = f"steps, {int(result.is_unconverged.sum())} unconverged"
-                watch(Event(result.n_processed, worlds * steps, text, "", remaining=remaining))
-        if engine == "mujoco":
-            n_quiet = _repeat_without_noise(runs, result.divergences)
+            share = min(1.0, MAX_CONTACT_STATES / (worlds * runs.steps))
+            judging = judging._replace(contact_share=share)
+        result = _make_empty_audit(runs, "mujoco", common, note)
+        result.key = key
+        if stored == (worlds, runs.steps) and folder is not None:
+            result.restore(folder)
+        todo = np.flatnonzero((result.verdict < 0).any(axis=1)).tolist()
+        if len(todo) < worlds:
+            n = worlds - len(todo)
+            result.notes.append(f"{format_count(n, 'world')} of an earlier audit reused (--no-reuse).")
+        pieces = _audit_mujoco(runs, judging, todo, workers, backend)
+        saved = folder if can_reuse else None
+        result = _collect(result, pieces, judging, watch, loads=loads, folder=saved)
     except KeyboardInterrupt:
         if not result.n_processed:
             if not early.n_processed:
@@ -230,26 +322,82 @@ def audit(
         raise InputError(
             "no step was judged, because workers were lost; give fewer workers (--workers), which need less memory"
         )
-    own = processes + (engine == "mujoco")  # This process waits for the workers.
-    busy = machine.make_busy_warning(loads, os.cpu_count() or 1, AUDIT_BUSY_CONSEQUENCE, own=own)
+    busy = machine.make_busy_warning(loads, os.cpu_count() or 1, AUDIT_BUSY_CONSEQUENCE, own=processes + 1)
+    result.notes += [busy] if busy else []
     first_lost = {d.world: d.step for d in result.divergences}
     result.contact_states[:] = sorted(
         (s for s in result.contact_states if s.step < first_lost.get(s.world, np.inf) - DIVERGENCE_MARGIN),
         key=lambda entry: entry[:2],
     )
-    return replace(result, stopped=result.n_processed < result.verdict.size, busy=busy, n_quiet=n_quiet)
+    return result
 
 
-def _make_empty_audit(runs: Runs, engine: str, error_limit: float | None, note: str = "") -> Audit:
-    """Make the result of an audit before its first step; `note` is a sentence about the spread."""
-    shape = runs.worlds, runs.steps
-    rows, contacts = np.zeros((2, *shape), int)
-    return Audit(
-        runs, engine, np.full((len(WORST_ROW_ERRORS), *shape), np.nan), np.full(shape, -1, np.int8),
-        rows=rows, contacts=contacts, can_touch=can_any_geoms_collide(*runs.load_model()), where={},
-        worst=[], divergences=[], error_limit=error_limit,
-        notes=" ".join(filter(None, (runs.sleep_note, note))),
-    )  # fmt: skip
+def _collect(
+    result: Audit,
+    pieces: Iterable[Piece],
+    judging: Judging,
+    watch: Callable[[Event], None] | None,
+    *,
+    loads: list[float | None] | None = None,
+    folder: Any = None,
+) -> Audit:
+    """Add pieces to a result until their end or Ctrl-C, show the progress, and write complete worlds to `folder`."""
+    saved = monotonic()
+    if watch is not None:
+        text = f"{format_count(result.runs.worlds, 'world')} of {format_count(result.runs.steps, 'step')}"
+        watch(Event(result.n_processed, result.verdict.size, text, ""))
+    try:
+        for piece in pieces:
+            result.add_piece(piece, judging.keep)
+            if loads is not None:
+                loads.append(machine.count_runnable_processes())
+            if watch is not None:
+                text = f"steps, {int(result.is_unconverged.sum())} unconverged"
+                watch(Event(result.n_processed, result.verdict.size, text, ""))
+            if folder is not None and monotonic() > saved + SAVE_INTERVAL:
+                result.write(folder)
+                saved = monotonic()
+    except KeyboardInterrupt:
+        if not result.n_processed:
+            raise
+    result.is_stopped = result.n_processed < result.verdict.size
+    return result
+
+
+def hash_parameters(runs: Runs, judging: Judging, spread: float | None) -> str:
+    """Return a hash of the model and of all parameters on which the numbers of an audit depend, except `worlds`."""
+    control = runs.control
+    if not isinstance(control, str):
+        # The results of a function may change from call to call.
+        control = os.urandom(8).hex() if callable(control) else np.asarray(control, float).tobytes()
+    states = None if runs.starts is None else runs.starts.vectors.tobytes()
+    model = hash_model(runs.model, options=True)
+    values = model, runs.steps, runs.seed, spread, control, states, judging, __version__, runs.mj.__version__
+    return hashlib.sha256(repr(values).encode()).hexdigest()
+
+
+def _make_empty_audit(runs: Runs, engine: str, common: dict[str, Any], *notes: str) -> Audit:
+    """Make the result of an audit of a model of MuJoCo before its first step."""
+    notes = (*runs.notes, *notes)
+    can_touch = can_any_geoms_collide(runs.mj, runs.model)
+    result = Audit.with_size(runs, engine, can_touch=can_touch, notes=list(filter(None, notes)), **common)
+    if runs.against is not None:
+        name, model = runs.against
+        result.against = Audit.with_size(
+            replace(runs, name=name, model=model, against=None), engine, **common
+        )
+    return result
+
+
+def _choose_spread(
+    runs: Runs, spread: float | None, watch: Callable[[Event], None] | None
+) -> tuple[Runs, str]:
+    """Return the runs with the given spread, or with the largest with which trial worlds do not diverge."""
+    if spread is not None:
+        return replace(runs, spread=spread), ""
+    if watch is not None:
+        watch(Event(0, 0, "simulating trial worlds to choose the spread", ""))
+    return runs.choose_spread()
 
 
 def _judge_first_steps(
@@ -262,22 +410,11 @@ def _judge_first_steps(
     runs = replace(empty.runs, steps=min(n_steps, empty.runs.steps))
     if watch is not None:
         watch(Event(0, 0, f"judging one world: {format_count(runs.steps, 'step')}", ""))
-    judged = _make_empty_audit(empty.runs, empty.engine, empty.error_limit)
-    for piece in audit_worlds(runs, judging, range(1)):
+    judged = copy.deepcopy(empty)
+    judged.is_stopped = True
+    for piece in audit_worlds(runs, judging, [0]):
         judged.add_piece(piece, judging.keep)
-    return replace(judged, stopped=True)
-
-
-def _repeat_without_noise(runs: Runs, divergences: list[Divergence]) -> tuple[int, int]:
-    """Simulate the first worlds that diverged again, without their random velocities and with the same controls.
-
-    Returns the number of worlds and how many of them did not diverge.
-    """
-    worlds = [d.world for d in divergences if d.world >= runs.n_exact_worlds][:N_TRIAL_WORLDS]
-    mj, model = runs.load_model()
-    with count_engine_warnings(mj):
-        repeated = [simulate_world(mj, model, replace(runs, spread=0.0), world)[1] for world in worlds]
-    return len(worlds), repeated.count(None)
+    return judged
 
 
 def count_processes(workers: int) -> int:
@@ -293,124 +430,91 @@ def choose_world_count(duration: float, processes: int) -> int:
     return max(1, min(MAX_DEFAULT_WORLDS, int(DEFAULT_DURATION * processes / max(duration, 1e-6))))
 
 
-def _audit_mujoco(runs: Runs, judging: Judging, workers: int, backend: str) -> Iterator[Piece]:
-    """Simulate and judge MuJoCo's steps in worker processes."""
-    share = -(-runs.worlds // (MIN_TASKS_PER_WORKER * count_processes(workers)))
-    worlds_per_task = max(1, min(STEPS_PER_TASK // runs.steps, share))
-    parts = (
-        (runs, judging, range(first, min(first + worlds_per_task, runs.worlds)))
-        for first in range(0, runs.worlds, worlds_per_task)
-    )
+def _audit_mujoco(
+    runs: Runs, judging: Judging, worlds: Sequence[int], workers: int, backend: str
+) -> Iterator[Piece]:
+    """Simulate and judge MuJoCo's steps of some worlds in worker processes."""
+    share = -(-len(worlds) // (MIN_TASKS_PER_WORKER * count_processes(workers)))
+    n = max(1, min(STEPS_PER_TASK // runs.steps, share))
+    parts = ((runs, judging, worlds[first : first + n]) for first in range(0, len(worlds), n))
     name, cluster = connect_backend(backend)
     with cluster:
         for pieces in map_unordered(audit_worlds, parts, workers, name):
             yield from pieces
 
 
-def _reject_unsupported_model(runs: Runs) -> None:
-    """Raise an error if the model's constraint problems cannot be built, once and before any worker starts."""
-    _, model = runs.load_model()
-    from_mujoco_many(model, np.concatenate([model.qpos0, np.zeros(model.nv)])[None])
-
-
-def audit_worlds(runs: Runs, judging: Judging, worlds: range) -> list[Piece]:
+def audit_worlds(runs: Runs, judging: Judging, worlds: Sequence[int]) -> list[Piece]:
     """Simulate and judge MuJoCo's steps of some worlds, in a worker."""
-    mj, model = runs.load_model()
-    with count_engine_warnings(mj) as engine_warnings:
-        pieces = _audit_worlds(mj, model, runs, judging, worlds)
-    return [*pieces[:-1], pieces[-1]._replace(engine_warnings=engine_warnings)]
+    with count_engine_warnings(runs.mj) as engine_warnings:
+        simulations = [simulate_world(runs, world) for world in worlds]
+        states = np.concatenate([states for states, _ in simulations])
+        divergences = [divergence for _, divergence in simulations if divergence is not None]
+        world, step = np.repeat(worlds, runs.steps), np.tile(np.arange(runs.steps), len(worlds))
+        pieces = list(judge_states(runs.model, judging, states, world, step))
+        if runs.against is not None:
+            others = judge_states(runs.against[1], judging, states, world, step)
+            pieces = [own._replace(against=other) for own, other in zip(pieces, others, strict=True)]
+    pieces[-1] = pieces[-1]._replace(divergences=divergences, engine_warnings=engine_warnings)
+    return pieces
 
 
-def _audit_worlds(mj: Any, model: Any, runs: Runs, judging: Judging, worlds: range) -> list[Piece]:
-    """Simulate and judge MuJoCo's steps of some worlds."""
-    simulations = [simulate_world(mj, model, runs, world) for world in worlds]
-    states = np.concatenate([states for states, _ in simulations])
-    divergences = [divergence for _, divergence in simulations if divergence is not None]
+def judge_states(model: Any, judging: Judging, states: Any, world: Any, step: Any) -> Iterator[Piece]:
+    """Judge MuJoCo's answers to the steps from states (n, size) of mjSTATE_INTEGRATION."""
     judge = copy.copy(model)
     judge.opt.noslip_iterations = 0
-    world, step = np.repeat(worlds, runs.steps), np.tile(np.arange(runs.steps), len(worlds))
-    out = []
     for i in range(0, len(states), MAX_PROBLEMS_IN_MEMORY):
-        selection = slice(i, i + MAX_PROBLEMS_IN_MEMORY)
-        batch, impulse = from_mujoco_many(judge, states[selection], errors="status")
-        assert impulse is not None
+        part = slice(i, i + MAX_PROBLEMS_IN_MEMORY)
+        batch, impulse = from_mujoco_many(judge, states[part], errors="status")
 
-        def state_of(k: int, selection: FloatArray = states[selection]) -> dict[str, FloatArray]:
-            return split_state_vector(mj, model, selection[k]) | {VECTOR: selection[k].copy()}
+        def state_of(k: int, vectors: Any = states[part]) -> dict[str, Any]:
+            own = {VECTOR: vectors[k].copy(), "model": np.array(hash_model(judge))}
+            return split_state_vector(judge, vectors[k]) | own
 
-        sizes = batch.row_counts, batch.contact_counts
-        out.append(_judge_steps(batch, impulse, judging, world[selection], step[selection], state_of, sizes))
-    return [*out[:-1], out[-1]._replace(divergences=divergences)]
+        assert impulse is not None and batch.contact_counts is not None
+        frame = Frame(batch, impulse, {}, batch.row_counts, batch.contact_counts)
+        yield judge_steps(frame, judging, world[part], step[part], state_of)
 
 
-def _audit_jointly_stepped_worlds(engine: str, runs: Runs, judging: Judging) -> Iterator[Piece]:
+def _audit_environment(env: Any, policy: Any, runs: Runs, judging: Judging) -> Iterator[Piece]:
+    """Judge the steps of MuJoCo in episodes of an environment, each with the model at its time."""
+    with count_engine_warnings(runs.mj) as engine_warnings:
+        for world in range(runs.worlds):
+            lost: Divergence | None = None
+            for model, states, first, diverged in iterate_environment(env, policy, runs, world):
+                step = first + np.arange(len(states))
+                for piece in judge_states(model, judging, states, np.full(len(states), world), step):
+                    yield piece._replace(engine_warnings=dict(engine_warnings))
+                    engine_warnings.clear()
+                if diverged:
+                    lost = Divergence(world, int(step[-1]), "acceleration", False)
+            if lost is not None:
+                rest = np.arange(lost.step + 1, runs.steps)
+                yield Piece.of_lost_steps(world, rest, lost)
+
+
+def _audit_frames(frames: Iterable[Frame], judging: Judging) -> Iterator[Piece]:
     """Judge the steps of an engine that steps all worlds at once."""
-    world, diverged = np.arange(runs.worlds), np.zeros(runs.worlds, bool)
-    for step, frame in enumerate(iterate_frames(engine, runs)):
+    diverged: Any = None
+    for k, frame in enumerate(frames):
+        n = len(frame.batch)
+        diverged = np.zeros(n, bool) if diverged is None else diverged
+        if n != len(diverged):
+            raise InputError(
+                f"step {k} has {n} worlds, and the first step {len(diverged)}; all steps need the same number of worlds"
+            )
 
-        def state_of(k: int, frame: Any = frame) -> dict[str, FloatArray]:
-            return {name: x[k] for name, x in frame.state.items()}
+        def state_of(i: int, state: Any = frame.state) -> dict[str, Any]:
+            return {name: x[i] for name, x in state.items()}
 
         judging = judging._replace(precision=frame.batch.precision)
-        sizes, at = (frame.rows, frame.contacts), np.full(runs.worlds, step)
-        piece = _judge_steps(frame.batch, frame.impulse, judging, world, at, state_of, sizes)
+        piece = judge_steps(frame, judging, np.arange(n), np.full(n, k), state_of)
         lost = (piece.verdict == NOT_JUDGED) & ~diverged
-        finite = [all(np.isfinite(x[k]).all() for x in frame.state.values()) for k in world]
+        finite = [all(np.isfinite(x[i]).all() for x in frame.state.values()) for i in range(n)]
         divergences = [
             Divergence(
-                k, step, "forces or acceleration" if finite[k] else "state before the step", not finite[k]
+                i, k, "forces or acceleration" if finite[i] else "state before the step", not finite[i]
             )
-            for k in np.flatnonzero(lost).tolist()
+            for i in np.flatnonzero(lost).tolist()
         ]
         diverged |= lost
         yield piece._replace(divergences=divergences)
-
-
-def _judge_steps(
-    batch: Batch,
-    impulse: FloatArray,
-    judging: Judging,
-    world: Any,
-    step: Any,
-    state_of: Callable[[int], Any],
-    sizes: tuple[Any, Any],
-) -> Piece:
-    """Judge the answers `impulse` [N s] to the problems of `batch`, one for each step.
-
-    `world` and `step` are the numbers of the steps, `state_of(i)` returns the state before step i, and `sizes` holds
-    the numbers of rows and of contacts.
-    """
-    residuals = residual_many(
-        batch, impulse, precision=judging.precision, threshold=judging.threshold, errors="status"
-    )
-    numbers = np.array(
-        [residuals.velocity_error, residuals.impulse_error, residuals.relative, residuals.roundoff_floor]
-    )
-    verdicts = residuals.verdict
-    verdict = np.full(len(verdicts), NOT_JUDGED, np.int8)
-    measured = np.isfinite(numbers[0])
-    for i, word in enumerate(VERDICTS):
-        verdict[measured & (verdicts == word)] = i
-    numbers[:, verdict == NOT_JUDGED] = np.nan
-    rows, contacts = (np.where(verdict == NOT_JUDGED, 0, x) for x in sizes)
-    unconverged = np.flatnonzero(
-        (verdict == VERDICTS.index(UNCONVERGED)) | (verdict == VERDICTS.index(WRONG))
-    )
-    names = {int(i): residuals[int(i)].worst_name for i in unconverged}
-    order = unconverged[np.argsort(-numbers[0, unconverged], kind="stable")]
-    if judging.keep is None:
-        order = order[np.sort(np.unique(world[order], return_index=True)[1])]
-    flat, worst = impulse.reshape(-1), []
-    for i in order[: N_WORST_WORLDS if judging.keep is None else judging.keep].tolist():
-        impulse_of_step = flat[batch.rows_of(i)].copy()
-        world_and_step = int(world[i]), int(step[i])
-        fields = {"where": names[i], "problem": batch[i], "impulse": impulse_of_step, "state": state_of(i)}
-        worst.append(Worst(float(numbers[0, i]), *world_and_step, **fields))
-    where = [(i, CONTACT_NUMBER.sub("contact ", name)) for i, name in names.items()]
-    with_contact = np.flatnonzero(contacts > 0)
-    n = min(len(with_contact), int(np.ceil(judging.contact_share * len(world))))
-    chosen = with_contact[np.arange(n) * len(with_contact) // max(n, 1)]
-    return Piece(
-        world, step, numbers, verdict=verdict, rows=rows, contacts=contacts, where=where, worst=worst,
-        contact_states=[StepState(int(world[i]), int(step[i]), state_of(i)) for i in chosen.tolist()],
-    )  # fmt: skip

@@ -48,58 +48,22 @@ GENESIS_STATE = ("qpos", "qvel")
 EngineState = dict[str, FloatArray]
 
 
-def step_scene(
-    scene: str | os.PathLike[str] | Callable[..., Any],
-    engine: str,
-    *,
-    worlds: int = 8,
-    steps: int = 50,
-    dt: float = DEFAULT_TIME_STEP,
-    states: Any = None,
-    spread: float = 0.0,
-    seed: int = 0,
-) -> Iterator[EngineStep]:
+def step_scene(scene: Any, engine: str, *, steps: int = 50, **start: Any) -> Iterator[EngineStep]:
     """Start a scene and return its converted steps, each with the state before it.
 
-    Parameters
-    ----------
-    scene : path of a Python file, str, or callable
-        The file's function `build`, or the callable, makes the scene; a name is a builder of
-        `newton.tests.utils.basics`.
-    engine : {"kamino", "newton-mujoco", "genesis"}
-    worlds, steps : int
-    dt : float, default 0.01 s
-        Time step of newton's solvers. A scene of Genesis has its own.
-    states : path of an .npz, or dict of arrays, optional
-        World i starts from state i modulo their number.
-    spread : float, default 0 m/s, rad/s
-    seed : int, default 0
-
-    Returns
-    -------
-    iterator of EngineStep
-
-    Raises
-    ------
-    InputError
-        The engine is not installed, the file has no function `build`, `build` returns another object, or states do not
-        fit the scene.
-    UnknownName
-        The engine or the builder is unknown.
-    CapabilityError
-        The importer of the engine does not support the scene.
+    `start` holds the further parameters of `start_scene`, which raises the errors.
     """
     steps = check_int("steps", steps, 1)
-    running = start_scene(scene, engine, worlds=worlds, dt=dt, states=states, spread=spread, seed=seed)
-    return _iterate_steps(running, steps)
+    running = start_scene(scene, engine, **start)
 
+    def iterate_steps() -> Iterator[EngineStep]:
+        """Step the scene and yield the converted steps."""
+        for _ in range(steps):
+            state = running.get_state()
+            running.step()
+            yield running.convert()._replace(state=state or None)
 
-def _iterate_steps(running: NewtonScene | GenesisScene, steps: int) -> Iterator[EngineStep]:
-    """Step a scene and yield the converted steps."""
-    for _ in range(steps):
-        state = running.get_state()
-        running.step()
-        yield running.convert()._replace(state=state or None)
+    return iterate_steps()
 
 
 def start_scene(
@@ -112,7 +76,32 @@ def start_scene(
     spread: float = 0.0,
     seed: int = 0,
 ) -> NewtonScene | GenesisScene:
-    """Build a scene of `worlds` worlds and set their start states; see `step_scene` for the parameters."""
+    """Build a scene and set the start states of its worlds.
+
+    Parameters
+    ----------
+    scene : path of a Python file, str, or callable
+        The file's function `build`, or the callable, makes the scene; a name is a builder of
+        `newton.tests.utils.basics`.
+    engine : {"kamino", "newton-mujoco", "genesis"}
+    worlds : int
+    dt : float, default 0.01 s
+        Time step of newton's solvers. A scene of Genesis has its own.
+    states : path of an .npz, or dict of arrays, optional
+        World i starts from state i modulo their number.
+    spread : float, default 0 m/s, rad/s
+    seed : int, default 0
+
+    Raises
+    ------
+    InputError
+        The engine is not installed, the file has no function `build`, `build` returns another object, or states do not
+        fit the scene.
+    UnknownName
+        The engine or the builder is unknown.
+    CapabilityError
+        The importer of the engine does not support the scene.
+    """
     check_name("engine", engine, CLAIM_ENGINES)
     worlds, dt = check_int("worlds", worlds, 1), check_float("dt", dt, above=0.0)
     spread, seed = check_float("spread", spread, low=0.0), check_int("seed", seed, high=None)
@@ -122,7 +111,7 @@ def start_scene(
     running = GenesisScene(build, worlds) if engine == "genesis" else NewtonScene(build, engine, worlds, dt)
     first_noisy = 1
     if starts is not None:
-        running.set_state(_repeat_states(starts, running.n))
+        running.set_state({name: x[np.arange(running.n) % len(x)] for name, x in starts.items()})
         first_noisy = len(next(iter(starts.values())))
     if spread and running.n > first_noisy:
         running.add_noise(first_noisy, spread, seed)
@@ -158,11 +147,6 @@ def read_engine_states(source: Any, names: tuple[str, ...]) -> EngineState:
         sizes = ", ".join(f"{count} of {name}" for name, count in counts.items()) or "no arrays"
         raise InputError(f"{label}: {sizes}; {', '.join(names)} must have equally many entries, at least one")
     return arrays
-
-
-def _repeat_states(states: EngineState, n: int) -> EngineState:
-    """Return states of n worlds: state i modulo the number of states."""
-    return {name: x[np.arange(n) % len(x)] for name, x in states.items()}
 
 
 def load_build_function(scene: str | os.PathLike[str], engine: str) -> Any:
@@ -235,12 +219,6 @@ class NewtonScene:
         self.pipeline.collide(self.before, self.contacts)
         self.solver.step(self.before, self.after, self.control, self.contacts, self.dt)
         self.before, self.after = self.after, self.before
-
-    def synchronize(self) -> None:
-        """Wait until the last step is complete."""
-        import warp
-
-        warp.synchronize_device(self.model.device)
 
     def convert(self) -> EngineStep:
         """Return the problems of the last step, the engine's impulses and claims."""

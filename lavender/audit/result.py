@@ -2,48 +2,75 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lavender.audit.page import ResultPage
+from lavender.audit.pieces import (
+    AUDIT_VERDICTS,
+    N_WORST_WORLDS,
+    NOT_JUDGED,
+    WORST_ROW_ERRORS,
+    Piece,
+    StepState,
+    Worst,
+)
 from lavender.audit.simulated_worlds import Divergence, Runs
 from lavender.audit.step_sizes import StepSizes, describe_exceedance
 from lavender.base.arrays import FloatArray, check_choice
+from lavender.base.errors import InputError
+from lavender.io import read
 from lavender.io.npz import write_npz
 from lavender.io.stored import lock_step_folder, write_arrays
-from lavender.judge.residuals import AT_FLOOR, CLOSE, DEFAULT_THRESHOLD, UNCONVERGED, VERDICTS, WRONG
-from lavender.problem import Problem
+from lavender.judge.residuals import AT_FLOOR, CLOSE, DEFAULT_THRESHOLD, UNCONVERGED, WRONG
 from lavender.report.figures import Curve, Figure
-from lavender.report.summary_page import PageSection, SummaryPage
-from lavender.report.table import Cell, Table
+from lavender.report.render import Section
 from lavender.report.text import format_count, format_percent, format_size
 
-UNCONVERGED_OR_WRONG = f"{UNCONVERGED} or wrong"
-AUDIT_VERDICTS = (*VERDICTS, "not judged")
-NOT_JUDGED = len(VERDICTS)
-VELOCITY_UNIT = "m/s, rad/s"  # Linear rows have the first unit, angular rows the second.
-WORST_ROW_ERRORS = ("velocity", "impulse", "relative", "floor")  # Errors of the worst row [m/s, N s, -, -].
+if TYPE_CHECKING:
+    import pandas as pd
+
 QUANTILES = (0.5, 0.9, 0.99, 0.999, 1.0)
-N_SHOWN_WORLDS = 5  # Up to this many numbers of worlds are written in a sentence.
 SAVED_KINDS = ("worst", "contact")
-N_WORST_WORLDS = 3  # Number of worlds for which the worst step is written to a file.
 MAX_CURVE_POINTS = 60  # Largest number of points of a curve over time.
+N_SHOWN_WORLDS = 5  # Up to this many numbers of worlds are written in a sentence.
+#: Outcomes of a step of an engine that claims that its solve converged, or that it did not.
+OUTCOMES = (
+    "claimed and right",
+    "claimed and wrong",
+    "not claimed but right",
+    "not claimed and wrong",
+    "claimed with numbers that are not finite",
+    "not claimed, not finite",
+)
 ERRORS_NOTE = (
-    "Errors of the worst row of each judged step. At its floor: rounding explains the error, in the engine's "
-    "precision. Close enough: no row has a larger error than the threshold. Stopped before convergence, or wrong: all "
-    "others. Not judged: the engine's answer is not finite, or the world diverged before. The errors are of the "
-    "engine's forces: the accelerations by which MuJoCo's Newton and CG move bodies are usually more accurate."
+    "Errors of the worst row of each judged step; in rad/s if the row is angular. At its floor: rounding explains the "
+    "error, in the engine's precision. Close enough: no row has a larger error than the threshold. Stopped before "
+    "convergence, or wrong: all others. Not judged: the engine's answer is not finite, or the world diverged before. "
+    "Shares are fractions of the steps judged. The errors are of the engine's forces: the accelerations by which "
+    "MuJoCo's Newton and CG move bodies are usually more accurate."
 )
 SIZES_NOTE = "Rows and contacts of the steps judged."
 FILES_NOTE = (
-    "Problems with the engine's impulses, in the folder worst; states.npz holds the states before these steps "
-    "(--states starts from them again)."
+    "Problems with the engine's impulses, in the folder worst: lavender check reads it. states.npz holds the states "
+    "before these steps (--states starts from them again)."
+)
+ROWS_NOTE = "Rows that were the worst of a step that stopped before convergence or is wrong."
+CLAIMS_NOTE = (
+    "Right: no row has a velocity error above the threshold, or rounding explains it in the engine's precision. A "
+    "wrong claim hides an error; a missing claim for a right answer costs iterations, or a needless warning."
+)
+AGAINST_NOTE = (
+    "Both models solve the same steps: the states, controls and warm starts before each step of the first model's "
+    "worlds. Errors of the worst row of each step."
 )
 DIVERGED_NOTE = (
     "The step in which each world diverged, the quantity that was not finite or above 1e10, and whether every solve of "
@@ -57,83 +84,7 @@ DIVERGENCE_ADVICE = (
 )
 
 
-@dataclass(frozen=True)
-class Worst:
-    """The worst step of a world.
-
-    Parameters
-    ----------
-    velocity : float, m/s
-        Largest velocity error of a row.
-    world, step : int
-    where : str
-        Name of the row with this error.
-    problem : Problem
-    impulse : (m,) N s
-        The engine's answer.
-    state : dict
-        State before the step, by the names of MjData.
-    """
-
-    velocity: float
-    world: int
-    step: int
-    where: str
-    problem: Problem = field(repr=False)
-    impulse: FloatArray = field(repr=False)
-    state: dict[str, FloatArray] = field(repr=False)
-
-
-class StepState(NamedTuple):
-    """The state before a step.
-
-    Parameters
-    ----------
-    world, step : int
-    state : dict
-        By the names of MjData.
-    """
-
-    world: int
-    step: int
-    state: dict[str, FloatArray]
-
-
-class Piece(NamedTuple):
-    """Results of k judged steps.
-
-    Parameters
-    ----------
-    world, step : (k,) int
-        World and number of each step.
-    numbers : (len(WORST_ROW_ERRORS), k)
-        Errors of the worst row of each step, one row for each name in `WORST_ROW_ERRORS`.
-    verdict : (k,) int
-        Indices in AUDIT_VERDICTS.
-    rows, contacts : (k,) int
-    where : list of (int, str)
-        Index of a step that stopped before convergence, and the name of its worst row.
-    worst : list of Worst
-    divergences : sequence of Divergence
-    engine_warnings : dict
-        MuJoCo's own warnings, and how often each occurred.
-    contact_states : sequence of StepState
-    """
-
-    world: Any
-    step: Any
-    numbers: FloatArray
-    verdict: Any
-    rows: Any
-    contacts: Any
-    where: list[tuple[int, str]]
-    worst: list[Worst]
-    divergences: Sequence[Divergence] = ()
-    engine_warnings: Mapping[str, int] = MappingProxyType({})
-    contact_states: Sequence[StepState] = ()
-
-
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Audit:
     """Result of `audit`.
 
@@ -149,25 +100,31 @@ class Audit:
         Rows, and contacts that have rows; 0 if the step was not judged.
     can_touch : bool
         Whether the model has geoms that can collide.
+    threshold : float, m/s
+        Velocity error up to which an answer is close enough.
+    error_limit : float, m/s, optional
+        The headline counts the steps with a larger velocity error that rounding does not explain.
+    notes : list of str
+        Sentences about the differences from a simulation of the model as it is, and warnings.
+    converged : (worlds, steps) int, optional
+        The engine's claims: 1 if it calls the solve converged, 0 if not, -1 without a claim. None if it makes none.
     where : dict
-        Row name (without the contact's number) -> number of steps that stopped before convergence with this worst row,
+        Row name (without numbers of contacts) -> number of steps that stopped before convergence with this worst row,
         and its largest error [m/s].
     worst : list of Worst
     divergences : list of Divergence
-    stopped : bool
+    is_stopped : bool
         The audit was stopped by Ctrl-C, or workers were lost.
-    busy : str
-        A warning if other processes used the processors; else empty.
-    error_limit : float, m/s, optional
-        The summary counts the steps with a larger velocity error that rounding does not explain.
     engine_warnings : Counter
         MuJoCo's own warnings, and how often each occurred.
-    notes : str
-        Sentences about the differences from a simulation of the model as it is: no sleep, a smaller spread.
-    n_quiet : (int, int)
-        Number of worlds that diverged and were simulated again without noise, and how many of these then survived.
     contact_states : list of StepState
         States before steps with contact, if the audit keeps them; in the order of worlds and steps.
+    n_dropped : int
+        Number of constraint rows for which the engine had no memory.
+    against : Audit, optional
+        Result of another model on the same states.
+    key : str
+        Hash of the model and all parameters on which the numbers depend.
     """
 
     runs: Runs
@@ -176,24 +133,40 @@ class Audit:
     verdict: Any
     rows: Any
     contacts: Any
-    can_touch: bool
-    where: dict[str, tuple[int, float]]
-    worst: list[Worst]
-    divergences: list[Divergence]
-    stopped: bool = False
-    busy: str = ""
+    can_touch: bool = True
+    threshold: float = DEFAULT_THRESHOLD
     error_limit: float | None = None
+    notes: list[str] = field(default_factory=list)
+    converged: Any = None
+    where: dict[str, tuple[int, float]] = field(default_factory=dict)
+    worst: list[Worst] = field(default_factory=list)
+    divergences: list[Divergence] = field(default_factory=list)
+    is_stopped: bool = False
     engine_warnings: Counter[str] = field(default_factory=Counter)
-    notes: str = ""
-    n_quiet: tuple[int, int] = (0, 0)
     contact_states: list[StepState] = field(default_factory=list)
+    n_dropped: int = 0
+    against: Audit | None = None
+    key: str = ""
+
+    @classmethod
+    def with_size(cls, runs: Runs, engine: str, *, has_claims: bool = False, **more: Any) -> Audit:
+        """Create the result of an audit before its first step."""
+        shape = runs.worlds, runs.steps
+        rows, contacts = np.zeros((2, *shape), int)
+        numbers = np.full((len(WORST_ROW_ERRORS), *shape), np.nan)
+        claims = np.full(shape, -1, np.int8) if has_claims else None
+        return cls(
+            runs, engine, numbers, np.full(shape, -1, np.int8), rows, contacts, converged=claims, **more
+        )
 
     def add_piece(self, piece: Piece, keep: int | None) -> None:
         """Add the results of judged steps, and keep the worst (`Judging.keep`)."""
+        self._make_space(piece)
+        at = piece.world, piece.step
         self.numbers[:, piece.world, piece.step] = piece.numbers
-        self.verdict[piece.world, piece.step] = piece.verdict
-        self.rows[piece.world, piece.step] = piece.rows
-        self.contacts[piece.world, piece.step] = piece.contacts
+        self.verdict[at], self.rows[at], self.contacts[at] = piece.verdict, piece.rows, piece.contacts
+        if self.converged is not None and piece.converged is not None:
+            self.converged[at] = piece.converged
         for i, name in piece.where:
             count, largest = self.where.get(name, (0, 0.0))
             self.where[name] = count + 1, max(largest, float(piece.numbers[0, i]))
@@ -201,6 +174,25 @@ class Audit:
         self.contact_states.extend(piece.contact_states)
         self.engine_warnings.update(piece.engine_warnings)
         self.divergences[:] = sorted([*self.divergences, *piece.divergences])
+        self.n_dropped += piece.n_dropped
+        if self.against is not None and piece.against is not None:
+            self.against.add_piece(piece.against, keep)
+
+    def _make_space(self, piece: Piece) -> None:
+        """Enlarge the arrays for steps of a loop whose length and number of worlds were not known."""
+        size = self.verdict.shape
+        worlds, steps = (max(n, int(np.max(x, initial=-1)) + 1) for n, x in zip(size, piece[:2], strict=True))
+        if (worlds, steps) == size:
+            return
+        more = ((0, worlds - size[0]), (0, steps - size[1]))
+        self.numbers = np.pad(self.numbers, ((0, 0), *more), constant_values=np.nan)
+        self.verdict = np.pad(self.verdict, more, constant_values=-1)
+        self.rows, self.contacts = np.pad(self.rows, more), np.pad(self.contacts, more)
+        if self.converged is not None:
+            self.converged = np.pad(self.converged, more, constant_values=-1)
+        self.runs = replace(self.runs, worlds=worlds, steps=steps)
+
+    # -- counts --------------------------------------------------------------------------------------------
 
     @property
     def is_judged(self) -> Any:
@@ -210,9 +202,7 @@ class Audit:
     @property
     def is_unconverged(self) -> Any:
         """(worlds, steps) bool: whether the solve stopped before convergence, or the answer is wrong."""
-        return (self.verdict == AUDIT_VERDICTS.index(UNCONVERGED)) | (
-            self.verdict == AUDIT_VERDICTS.index(WRONG)
-        )
+        return np.isin(self.verdict, [AUDIT_VERDICTS.index(word) for word in (UNCONVERGED, WRONG)])
 
     @property
     def n_judged(self) -> int:
@@ -235,15 +225,14 @@ class Audit:
         return len(self.divergences)
 
     @property
+    def _errors_above_floor(self) -> FloatArray:
+        """Velocity errors of the steps judged that are not at their floor [m/s]."""
+        return self.numbers[0][self.is_judged & (self.verdict > AUDIT_VERDICTS.index(AT_FLOOR))]
+
+    @property
     def max_velocity_error(self) -> float:
         """Largest velocity error that rounding does not explain, of the steps judged [m/s]."""
         return float(np.max(self._errors_above_floor, initial=0.0))
-
-    @property
-    def _errors_above_floor(self) -> FloatArray:
-        """Velocity errors of the steps judged that are not at their floor [m/s]."""
-        measured = self.is_judged & (self.verdict > AUDIT_VERDICTS.index(AT_FLOOR))
-        return self.numbers[0][measured]
 
     @property
     def n_above_limit(self) -> int:
@@ -256,6 +245,28 @@ class Audit:
         """Rows and contacts of the steps judged."""
         return StepSizes(self.rows[self.is_judged], self.contacts[self.is_judged], self.can_touch)
 
+    @property
+    def is_unmet(self) -> bool:
+        """Whether a world diverged, steps were not judged or exceed the limit, rows were lost, or contact is rare."""
+        lost = self.n_diverged or self.n_unjudged or self.n_above_limit or self.n_dropped
+        return bool(lost) or not self.judged_sizes.has_enough_contact
+
+    @property
+    def outcome(self) -> Any:
+        """(worlds, steps) int: indices in `OUTCOMES`; -1 without a claim."""
+        if self.converged is None:
+            return np.full(self.verdict.shape, -1)
+        claimed = self.converged == 1
+        judged = np.where(self.is_unconverged, 1, 0) + np.where(claimed, 0, 2)
+        outcome = np.where(self.verdict == NOT_JUDGED, np.where(claimed, 4, 5), judged)
+        return np.where(self.converged < 0, -1, outcome)
+
+    @property
+    def claim_counts(self) -> dict[str, int]:
+        """Number of steps with each outcome."""
+        outcome = self.outcome
+        return {name: int(np.count_nonzero(outcome == i)) for i, name in enumerate(OUTCOMES)}
+
     def has_exact_solves(self, divergence: Divergence) -> bool:
         """Return whether every step of a world that diverged was solved, so that its solver is not the cause.
 
@@ -267,174 +278,195 @@ class Audit:
         close = (verdict == AUDIT_VERDICTS.index(CLOSE)) & (self.numbers[0][selection] <= DEFAULT_THRESHOLD)
         return bool(np.all(close | (verdict == AUDIT_VERDICTS.index(AT_FLOOR))))
 
-    @property
-    def start_warning(self) -> str:
-        """Warning if the start states lack a warm start or controls; else empty."""
-        missing = self.runs.starts.missing if self.runs.starts is not None else ()
-        if not missing:
-            return ""
-        consequences = {
-            "warm start": "the first solve of each world starts cold",
-            "controls": "the first step uses the controls of --controls",
-        }
-        return (
-            f"The start states have no {' and no '.join(missing)}: "
-            f"{' and '.join(consequences[name] for name in missing)}. The first step therefore has "
-            "other errors than in the original simulation. Only the array `state` (mjSTATE_INTEGRATION) contains both."
-        )
+    # -- sentences -----------------------------------------------------------------------------------------
 
     @property
-    def summary_text(self) -> str:
-        """Summary in a few sentences."""
-        unconverged, judged = self.is_unconverged, self.n_judged
+    def headline(self) -> list[str]:
+        """Result in up to three sentences: the counts, the largest error, and divergence, claims or the limit."""
+        return [self._describe_counts(), *filter(None, (self._describe_worst(), self._describe_third()))]
+
+    def _describe_counts(self) -> str:
+        """Return the sentence with the numbers of steps that stopped before convergence or are wrong."""
+        judged, wrong = self.n_judged, int((self.verdict == AUDIT_VERDICTS.index(WRONG)).sum())
+        n = int(self.is_unconverged.sum()) - wrong
+        share = f" ({format_percent(n, judged, 1)})" if n else ""
         worlds = format_count(int(np.count_nonzero(self.is_judged.any(axis=1))), "world")
-        wrong = int((self.verdict == AUDIT_VERDICTS.index(WRONG)).sum())
-        n = int(unconverged.sum()) - wrong
-        text = (
-            f"{Path(self.runs.model).name}, {self.engine}: {n or 'none'} of {format_count(judged, 'step')} judged in "
-            f"{worlds} stopped before convergence"
-        )
-        if n:
-            text += f" ({format_percent(n, judged, 1)})"
-        if wrong:
-            answers = f"{wrong} {'is' if wrong == 1 else 'are'} wrong"
-            text += f", and {answers} ({format_percent(wrong, judged, 1)}): no better than zero forces"
-        if n or wrong:
-            text += (
-                f", in {format_count(int(unconverged.any(axis=1).sum()), 'world')}; "
-                f"the worst error is {format_size(self.max_velocity_error)} m/s (rad/s if its row is angular)"
-            )
-            if self.worst and self.worst[0].velocity == self.max_velocity_error:
-                text += f", in {self.worst[0].where}"
-        warning = "" if self.judged_sizes.has_enough_contact else (
-            f"Only {self.judged_sizes.contact_phrase}: this is too little to rate the solver. "
-            "Start from other states with --states."
-        )  # fmt: skip
-        engine_warnings = "; ".join(
-            f"{text} ({format_count(n, 'time')})" for text, n in self.engine_warnings.most_common()
-        )
-        if engine_warnings:
-            engine_warnings = f"MuJoCo's own warnings: {engine_warnings}."
-        more = [self._describe_limit(), self._describe_divergences(), engine_warnings, warning]
-        return " ".join([f"{text}.", *filter(None, more)])
+        text = f"{self.runs.name}, {self.engine}: {n or 'none'} of {format_count(judged, 'step')} judged in {worlds}"
+        text += f" stopped before convergence{share}"
+        return f"{text}, {wrong} wrong ({format_percent(wrong, judged, 1)})." if wrong else f"{text}."
 
-    def _describe_limit(self) -> str:
-        """Return a sentence with the number of steps above `error_limit`; empty without a limit."""
-        if self.error_limit is None:
+    def _describe_worst(self) -> str:
+        """Return the sentence with the largest error of steps that stopped before convergence or are wrong."""
+        if not self.is_unconverged.any():
             return ""
-        count, judged = self.n_above_limit, self.n_judged
-        share = f" ({format_percent(count, judged, 1)})" if count else ""
-        has = "has" if count == 1 else "have"
-        return (
-            f"{count or 'None'} of {format_count(judged, 'step')} judged{share} {has} an error above "
-            f"{self.error_limit:g} m/s."
-        )
+        text = f"The worst error is {format_size(self.max_velocity_error)} m/s"
+        if self.worst and self.worst[0].velocity == self.max_velocity_error:
+            w = self.worst[0]
+            text += f" (rad/s if angular): {w.where}, world {w.world}, step {w.step}"
+        return f"{text}."
+
+    def _describe_third(self) -> str:
+        """Return the sentence on divergence, else on the other model, claims, the limit, or missing contact."""
+        parts = []
+        if self.divergences:
+            first = min(d.step for d in self.divergences)
+            parts.append(
+                f"{format_count(self.n_diverged, 'world')} diverged, in step {first} at the earliest"
+            )
+        if lost := int((self.verdict == NOT_JUDGED).sum()):
+            parts.append(f"{format_count(lost, 'step')} not judged: numbers not finite or above 1e10")
+        if self.error_limit is not None:
+            n, judged = self.n_above_limit, self.n_judged
+            share = f" ({format_percent(n, judged, 1)})" if n else ""
+            parts.append(f"{format_count(n, 'step')} above {self.error_limit:g} m/s{share}")
+        if self.converged is not None:
+            counts = list(self.claim_counts.values())
+            claimed = counts[0] + counts[1] + counts[4]
+            parts.append(f"of {claimed} that the engine calls converged, {counts[1] + counts[4]} wrong")
+        if not self.judged_sizes.has_enough_contact:
+            parts.append(f"only {self.judged_sizes.contact_phrase}")
+        text = "; ".join(parts)
+        return f"{text[0].upper()}{text[1:]}." if text else ""
+
+    @property
+    def advice(self) -> list[str]:
+        """Sentences with consequences and remedies, below the tables of a terminal."""
+        lines = [self._compare_in_words(), self._describe_divergences()]
+        if not self.judged_sizes.has_enough_contact:
+            lines.append(
+                "Too few steps have contact to rate the solver: start from other states with --states."
+            )
+        if self.n_dropped:
+            lines.append(
+                f"The engine had no memory for {self.n_dropped} constraint rows and dropped them: its answers solve "
+                "problems without these rows. Allocate more with --njmax."
+            )
+        if self.engine_warnings:
+            counted = self.engine_warnings.most_common()
+            texts = "; ".join(f"{text} ({format_count(n, 'time')})" for text, n in counted)
+            lines.append(f"MuJoCo's own warnings: {texts}.")
+        return [*filter(None, lines), *filter(None, self.notes)]
 
     def _describe_divergences(self) -> str:
-        """Return a sentence about steps that were not judged and worlds that diverged; empty if there are none."""
-        lost = self.verdict == NOT_JUDGED
-        unjudged = format_count(int(lost.sum()), "step")
-        were = "was" if lost.sum() == 1 else "were"
+        """Return sentences on the cause of divergence; empty if no world diverged."""
         if not self.divergences:
-            return f"{unjudged} {were} not judged: the answer is not finite." if lost.any() else ""
-        first = min(d.step for d in self.divergences)
-        text = f"{format_count(self.n_diverged, 'world')} diverged, in step {first} at the earliest"
-        if lost.any():
-            text += f"; {unjudged} {were} not judged, because numbers are not finite or above 1e10"
+            return ""
         noisy = [d.world for d in self.divergences if d.world >= self.runs.n_exact_worlds]
         if noisy and self.runs.spread and len(noisy) == self.n_diverged:
-            return f"{text}. {self._describe_noise(noisy)}"
-        text += "."
+            return self._describe_noise(noisy)
         exact = sum(map(self.has_exact_solves, self.divergences))
         if exact == self.n_diverged:
-            return f"{text} Every solve until then was exact: the cause lies {OUTSIDE_SOLVER}."
-        if exact:
-            text += f" In {exact} of these every solve until then was exact: the cause lies {OUTSIDE_SOLVER}."
-        return f"{text} {DIVERGENCE_ADVICE if self.engine == 'mujoco' else ENGINE_ADVICE}"
+            return f"Every solve until a world diverged was exact: the cause lies {OUTSIDE_SOLVER}."
+        text = DIVERGENCE_ADVICE if self.engine == "mujoco" else ENGINE_ADVICE
+        if not exact:
+            return text
+        return f"In {exact} worlds every solve until divergence was exact: the cause lies {OUTSIDE_SOLVER}. {text}"
 
     def _describe_noise(self, worlds: list[int]) -> str:
         """Return sentences about worlds that diverged, all of which started with random velocities."""
-        exact, (checked, quiet) = self.runs.n_exact_worlds, self.n_quiet
+        exact = self.runs.n_exact_worlds
         names = "World 0, which starts" if exact == 1 else f"The first {exact} worlds, which start"
-        text = (
+        return (
             f"{names} without random velocities, did not diverge; the others start with {self.runs.spread:g} m/s or "
-            f"rad/s (--spread), and {_join_numbers(worlds)} diverged."
+            f"rad/s (--spread), and {_join_numbers(worlds)} diverged. To find out whether these velocities are the "
+            "cause, audit again with --spread 0, or from states of your own (--states)."
         )
-        remedy = "Audit again with --spread 0, or from states of your own (--states)."
-        if checked and quiet == checked:
-            again = "It was" if len(worlds) == 1 else f"{checked} of these {len(worlds)} were"
-            return (
-                f"{text} {again} simulated again with the same controls and without random velocities, and did not "
-                f"diverge: the random velocities are the cause, not the model or its solver. {remedy}"
-            )
-        if checked:
-            cause = f"{text} Without random velocities {checked - quiet} of {checked} of them diverge, too."
-            return f"{cause} {DIVERGENCE_ADVICE}"
-        return f"{text} {remedy}"
+
+    def _compare_in_words(self) -> str:
+        """Return a sentence with the counts of the other model on the same states; empty without one."""
+        if self.against is None:
+            return ""
+        other, both = self.against, self.is_judged & self.against.is_judged
+        own, its = (x.numbers[0][both] for x in (self, other))
+        better, worse, n = int((own < its).sum()), int((own > its).sum()), int(both.sum())
+        less, more = (format_percent(x, max(n, 1), 1) for x in (better, worse))
+        return (
+            f"Against {other.runs.name}, on the same {format_count(n, 'state')}: the error is smaller in {less} of the "
+            f"steps and larger in {more}; {int(self.is_unconverged.sum())} of its solves stopped before convergence or "
+            f"are wrong, and {int(other.is_unconverged.sum())} of the other model's."
+        )
+
+    # -- tables --------------------------------------------------------------------------------------------
 
     @property
-    def table_of_errors(self) -> Table:
+    def errors(self) -> pd.DataFrame:
         """Quantiles of the errors over all steps judged, and over unconverged and wrong ones."""
-        heads = ["error", *(f"{100.0 * q:g} %" for q in QUANTILES[:-1]), "worst"]
-        rows: list[list[str | Cell]] = []
-        for of, selected in (
-            ("all steps judged", self.is_judged),
-            (UNCONVERGED_OR_WRONG, self.is_unconverged),
-        ):
-            for name, unit, x in (
-                ("velocity", VELOCITY_UNIT, self.numbers[0]),
-                ("impulse", "N s", self.numbers[1]),
-            ):
+        columns: dict[str, Any] = {
+            "quantile": [*(f"{100.0 * q:g} %" for q in QUANTILES[:-1]), "largest error"]
+        }
+        for prefix, selected in (("", self.is_judged), ("unconverged: ", self.is_unconverged)):
+            for name, unit, x in (("velocity", "m/s", self.numbers[0]), ("impulse", "N s", self.numbers[1])):
                 known = x[selected & np.isfinite(x)]
                 if len(known):
-                    quantiles = np.quantile(known, QUANTILES, method="higher")
-                    rows.append([f"{name} [{unit}], {of}", *map(Cell.size, quantiles.tolist())])
-        return Table(heads, rows, words=frozenset({"error"}))
+                    columns[f"{prefix}{name} [{unit}]"] = np.quantile(known, QUANTILES, method="higher")
+        return _make_frame(columns if len(columns) > 1 else {})
 
     @property
-    def table_of_verdicts(self) -> Table:
-        """Number of steps and of worlds with each verdict."""
+    def verdicts(self) -> pd.DataFrame:
+        """Number of steps and of worlds with each verdict; shares are fractions of the steps judged."""
         rows = []
         for i, word in enumerate(AUDIT_VERDICTS):
             here = self.verdict == i
-            if here.any():
-                worlds = str(np.count_nonzero(here.any(axis=1)))
-                rows.append(
-                    [word, str(here.sum()), format_percent(int(here.sum()), self.n_processed, 2), worlds]
-                )
-        return Table(["verdict", "steps", "share", "worlds"], rows, words=frozenset({"verdict"}))
+            n = int(here.sum())
+            if n:
+                share = format_percent(n, self.n_judged, 1) if i != NOT_JUDGED else ""
+                rows.append((word, n, share, int(np.count_nonzero(here.any(axis=1)))))
+        return _make_frame(["verdict", "steps", "share", "worlds"], rows)
 
     @property
-    def table_of_rows(self) -> Table:
+    def worst_rows(self) -> pd.DataFrame:
         """The worst rows of steps that stopped before convergence or are wrong, most frequent first."""
         ranked = sorted(self.where.items(), key=lambda entry: -entry[1][0])
-        rows: list[list[str | Cell]] = [[name, str(n), Cell.size(largest)] for name, (n, largest) in ranked]
-        return Table(["worst row", UNCONVERGED_OR_WRONG, f"at most [{VELOCITY_UNIT}]"], rows)
+        rows = [(name, n, largest) for name, (n, largest) in ranked]
+        return _make_frame(["worst row", "steps", "largest error [m/s]"], rows)
 
     @property
-    def table_of_diverged(self) -> Table:
+    def diverged(self) -> pd.DataFrame:
         """The step in which each world diverged."""
-        rows: list[list[str | Cell]] = []
-        for d in self.divergences:
-            error = self.numbers[0, d.world, d.step]
-            known = Cell.size(float(error))
-            exact = "exact" if self.has_exact_solves(d) else "not exact"
-            rows.append([d.cause, str(d.world), str(d.step), known, exact])
-        heads = ["too large", "world", "step", f"error [{VELOCITY_UNIT}]", "solves until then"]
-        return Table(heads, rows, words=frozenset({"too large", "solves until then"}))
+        rows = [
+            (d.cause, d.world, d.step, float(self.numbers[0, d.world, d.step]),
+             "exact" if self.has_exact_solves(d) else "not exact")
+            for d in self.divergences
+        ]  # fmt: skip
+        return _make_frame(["too large", "world", "step", "error [m/s]", "solves until then"], rows)
 
     @property
-    def table_of_worst(self) -> Table:
+    def worst_steps(self) -> pd.DataFrame:
         """The worlds of the worst steps, which are written to files."""
-        rows: list[list[str | Cell]] = [
-            [f"worst_{i}.npz", str(w.world), str(w.step), Cell.size(w.velocity), w.where]
-            for i, w in enumerate(self.worst, 1)
-        ]
-        return Table(
-            ["file", "world", "step", VELOCITY_UNIT, "worst row"],
-            rows,
-            words=frozenset({"file", "worst row"}),
-        )
+        rows = [(f"worst_{i}.npz", w.world, w.step, w.velocity, w.where) for i, w in enumerate(self.worst, 1)]
+        return _make_frame(["file", "world", "step", "error [m/s]", "worst row"], rows)
+
+    @property
+    def claims(self) -> pd.DataFrame:
+        """Number of steps and worlds with each outcome of a claim, and errors."""
+        rows, outcome = [], self.outcome
+        for i, name in enumerate(OUTCOMES):
+            here = outcome == i
+            n = int(here.sum())
+            if n:
+                errors = self.numbers[0][here & self.is_judged]
+                sizes = np.quantile(errors, (0.5, 1.0)).tolist() if len(errors) else [np.nan, np.nan]
+                share = format_percent(n, int((outcome >= 0).sum()), 1)
+                rows.append((name, n, share, int(np.count_nonzero(here.any(axis=1))), *sizes))
+        heads = ["claim and verdict", "steps", "share", "worlds", "median [m/s]", "largest error [m/s]"]
+        return _make_frame(heads, rows)
+
+    @property
+    def comparison(self) -> pd.DataFrame:
+        """Errors and counts of this model and of the other one on the same states."""
+        if self.against is None:
+            return _make_frame({})
+        names = ["this model", "the other model"]
+        if self.runs.name != self.against.runs.name:
+            names = [self.runs.name, self.against.runs.name]
+        columns: dict[str, Any] = {
+            "quantile": [*(f"{100.0 * q:g} %" for q in QUANTILES[:-1]), "largest error"]
+        }
+        both = self.is_judged & self.against.is_judged
+        for name, one in zip(names, (self, self.against), strict=True):
+            if both.any():
+                columns[f"{name} [m/s]"] = np.quantile(one.numbers[0][both], QUANTILES, method="higher")
+        return _make_frame(columns if both.any() else {})
 
     @property
     def figure(self) -> Figure:
@@ -450,15 +482,17 @@ class Audit:
             "over-time", "Errors of all worlds", "step", "velocity error [m/s]", curves, x_log=False
         )
 
+    # -- files ---------------------------------------------------------------------------------------------
+
     def write(self, folder: str | os.PathLike[str]) -> None:
         """Write `records.npz`, the worst steps as `worst/worst_1.npz` etc., and `states.npz`.
 
-        `summary_page.write` writes the page.
+        `page.write` writes the page.
 
         `records.npz` holds `velocity` [m/s], `impulse` [N s], `relative`, `floor`, `verdict`, `rows`, `contacts` (each
-        (worlds, steps)), `verdicts` and `diverged`, rows of (world, step). `states.npz` holds qpos, qvel, act, ctrl
-        and qacc_warmstart of the worst worlds before their step, one row each, and for MuJoCo `state`, their
-        mjSTATE_INTEGRATION.
+        (worlds, steps)), `verdicts`, `diverged`, rows of (world, step), and of an engine with claims `converged`.
+        `states.npz` holds the states before the worst steps, one row each, by the engine's names; for MuJoCo
+        `state` is their mjSTATE_INTEGRATION.
         """
         folder = Path(folder)
         with lock_step_folder(folder / "worst", replace=True) as worst:
@@ -469,7 +503,61 @@ class Audit:
         records |= {"verdict": self.verdict, "verdicts": np.array(AUDIT_VERDICTS)}
         records |= {"rows": self.rows, "contacts": self.contacts}
         records["diverged"] = np.array([(d.world, d.step) for d in self.divergences], int).reshape(-1, 2)
+        if self.converged is not None:
+            records["converged"] = self.converged
+        if self.against is not None:
+            records["against"] = self.against.numbers[0]
+        facts = {
+            "key": self.key, "where": self.where, "divergences": self.divergences,
+            "engine_warnings": self.engine_warnings, "worst_rows": [w.where for w in self.worst],
+        }  # fmt: skip
+        records["facts"] = np.array(json.dumps(facts))
         write_arrays(folder / "records.npz", records)
+
+    @staticmethod
+    def read_size(folder: str | os.PathLike[str], key: str) -> tuple[int, int] | None:
+        """Return the numbers of worlds and steps of an earlier audit with this `key`; None without one."""
+        with suppress(OSError, ValueError, KeyError), np.load(Path(folder) / "records.npz") as file:
+            if json.loads(str(file["facts"]))["key"] == key:
+                worlds, steps = file["verdict"].shape
+                return int(worlds), int(steps)
+        return None
+
+    def restore(self, folder: str | os.PathLike[str]) -> bool:
+        """Read the complete worlds of an earlier audit with the same `key`; return whether there are any."""
+        folder = Path(folder)
+        with suppress(OSError, ValueError, KeyError, InputError):
+            with np.load(folder / "records.npz", allow_pickle=False) as file:
+                records = dict(file)
+            facts = json.loads(str(records["facts"]))
+            verdict = records["verdict"]
+            is_complete, is_begun = (verdict >= 0).all(axis=1), (verdict >= 0).any(axis=1)
+            # A world that was judged in part has counts that its repetition would add again.
+            if (
+                facts["key"] != self.key
+                or verdict.shape != self.verdict.shape
+                or (is_begun != is_complete).any()
+            ):
+                return False
+            worst = []
+            with np.load(folder / "states.npz", allow_pickle=False) as file:
+                states = dict(file)
+            for i, where in enumerate(facts["worst_rows"]):
+                stored = read(folder / "worst" / f"worst_{i + 1}.npz")
+                world, step = int(states["world"][i]), int(states["step"][i])
+                state = {name: x[i] for name, x in states.items() if name not in ("world", "step")}
+                velocity = float(records["velocity"][world, step])
+                assert stored.impulse is not None
+                found: dict[str, Any] = {"problem": stored.problem, "impulse": stored.impulse, "state": state}
+                worst.append(Worst(velocity, world, step, where, **found))
+            self.numbers[:] = [records[name] for name in WORST_ROW_ERRORS]
+            self.verdict[:], self.rows[:], self.contacts[:] = verdict, records["rows"], records["contacts"]
+            self.where |= {name: (n, largest) for name, (n, largest) in facts["where"].items()}
+            self.divergences[:] = [Divergence(*d) for d in facts["divergences"]]
+            self.engine_warnings.update(facts["engine_warnings"])
+            self.worst[:] = worst
+            return bool(is_complete.any())
+        return False
 
     def save_states(self, kind: str, path: str | os.PathLike[str]) -> int:
         """Write states before steps to a file that `--states` reads, and return their number.
@@ -493,38 +581,49 @@ class Audit:
         """Totals, as `numbers.json` holds them."""
         runs, unconverged = self.runs, self.is_unconverged
         divergences = [d._asdict() | {"exact": self.has_exact_solves(d)} for d in self.divergences]
-        return {
-            "head": self.summary_text, "engine": self.engine, "model": runs.model, "worlds": runs.worlds,
-            "steps": runs.steps,
-            "seed": runs.seed, "judged": self.n_judged, "unjudged": self.n_unjudged, "diverged": self.n_diverged,
-            "unconverged": int(unconverged.sum()), "wrong": int((self.verdict == AUDIT_VERDICTS.index(WRONG)).sum()),
-            "worlds_unconverged": int(unconverged.any(axis=1).sum()),
-            "largest": self.max_velocity_error, "error_limit": self.error_limit, "above_limit": self.n_above_limit,
+        totals = {
+            "head": self.headline, "notes": self.advice, "engine": self.engine, "model": runs.name,
+            "worlds": runs.worlds, "steps": runs.steps, "seed": runs.seed, "spread": runs.spread,
+            "threshold": self.threshold, "judged": self.n_judged, "unjudged": self.n_unjudged,
+            "diverged": self.n_diverged, "unconverged": int(unconverged.sum()),
+            "wrong": int((self.verdict == AUDIT_VERDICTS.index(WRONG)).sum()),
+            "worlds_unconverged": int(unconverged.any(axis=1).sum()), "largest": self.max_velocity_error,
+            "error_limit": self.error_limit, "above_limit": self.n_above_limit, "dropped_rows": self.n_dropped,
             "divergences": divergences, **self.judged_sizes.as_dict,
-            "engine_warnings": dict(self.engine_warnings), "busy": self.busy, "start_warning": self.start_warning,
-            "spread": runs.spread, "notes": self.notes,
-            "stopped": self.stopped,
+            "engine_warnings": dict(self.engine_warnings), "stopped": self.is_stopped,
         }  # fmt: skip
+        if self.converged is not None:
+            totals["claims"] = self.claim_counts
+        if self.against is not None:
+            totals["against"] = self.against.totals
+        return totals
 
     @property
-    def summary_page(self) -> SummaryPage:
-        """Page with the result in a sentence, figures and tables, as `lavender audit` writes it."""
+    def page(self) -> ResultPage:
+        """Page with the result in sentences, figures and tables, as `lavender audit` writes it."""
         n_worlds = int(np.count_nonzero(self.is_judged.any(axis=1)))
-        return SummaryPage(
-            "lavender audit", self.summary_text,
-            [
-                PageSection("Errors", [self.table_of_errors, self.table_of_verdicts], [self.figure], short=4,
-                     note=f"{ERRORS_NOTE} {describe_exceedance(n_worlds)}".strip()),
-                PageSection("Rows and contacts", [self.judged_sizes.size_table], short=2, note=SIZES_NOTE),
-                PageSection("Worlds that diverged", [self.table_of_diverged], short=2, note=DIVERGED_NOTE),
-                PageSection("Worst rows", [self.table_of_rows], short=3,
-                        note="Rows that were the worst of a step that stopped before convergence or is wrong."),
-                PageSection("The worst worlds", [self.table_of_worst], short=len(self.worst), note=FILES_NOTE),
+        note = f"{ERRORS_NOTE} {describe_exceedance(n_worlds)}".strip()
+        return ResultPage(
+            title="lavender audit", headline=self.headline, sections=[
+                Section("The same states", [self.comparison], short=5, note=AGAINST_NOTE),
+                Section("Claims and verdicts", [self.claims], short=len(OUTCOMES), note=CLAIMS_NOTE),
+                Section("Errors", [self.errors, self.verdicts], note, [self.figure], short=5),
+                Section("Rows and contacts", [self.judged_sizes.table], short=2, note=SIZES_NOTE),
+                Section("Worlds that diverged", [self.diverged], short=2, note=DIVERGED_NOTE),
+                Section("Worst rows", [self.worst_rows], short=3, note=ROWS_NOTE),
+                Section("The worst worlds", [self.worst_steps], short=len(self.worst), note=FILES_NOTE),
             ],
-            self.totals,
-            stopped=self.stopped,
-            warning=" ".join(filter(None, (self.start_warning, self.notes, self.busy))),
+            numbers=self.totals, notes=self.advice, is_stopped=self.is_stopped,
         )  # fmt: skip
+
+
+def _make_frame(columns: Any, rows: Sequence[Any] | None = None) -> pd.DataFrame:
+    """Build a DataFrame from a dict of columns, or from heads and rows; empty without rows."""
+    import pandas as pd
+
+    if rows is None:
+        return pd.DataFrame(columns)
+    return pd.DataFrame(rows, columns=columns)
 
 
 def _join_numbers(numbers: list[int]) -> str:

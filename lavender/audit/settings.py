@@ -1,10 +1,10 @@
-"""Settings of engines: options that differ from the present ones, and lines to copy in the engine's syntax."""
+"""Settings of MuJoCo: options that differ from the model's, and lines to copy."""
 
 from __future__ import annotations
 
 import copy
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any
 
 MERGE_NOTE = (
     "Add the line after the model's own <option>: MuJoCo merges both, and a later attribute replaces an earlier one. "
@@ -17,48 +17,21 @@ PROBLEM_OPTIONS = ("cone", "impratio", "noslip_iterations")  # Options that chan
 
 
 @dataclass(frozen=True)
-class Setting:
-    """Options of an engine that differ from the present ones; a derived class writes them in the engine's syntax."""
+class MujocoSetting:
+    """Attributes of MuJoCo's `<option>` that differ from the model's.
 
-    problem_options: ClassVar[tuple[str, ...]] = ()  # Options that change the constraint problem itself.
-    comment: ClassVar[str] = "# {}"  # Format of a comment in the syntax of `option_line`.
-    merge_note: ClassVar[str] = ""  # Note for the user on where to insert `option_line`.
+    Parameters
+    ----------
+    options : tuple of (str, value)
+    is_default : bool
+        Whether these are MuJoCo's default options.
+    iterations : int
+        Iteration limit, also if it is the model's own.
+    """
 
     options: tuple[tuple[str, Any], ...] = ()
-    is_default: bool = field(default=False, compare=False)  # Whether these are the engine's default options.
-    iterations: int = field(
-        default=0, compare=False
-    )  # Iteration limit, also if it is the present one; 0: unknown.
-
-    @property
-    def option_line(self) -> str:
-        """Line to copy; empty if no option differs."""
-        raise NotImplementedError
-
-    @property
-    def name(self) -> str:
-        """`option_line`, or "the model's own setting" if it is empty."""
-        return self.option_line or "the model's own setting"
-
-    @property
-    def short_name(self) -> str:
-        """Options without the engine's syntax, for narrow tables."""
-        values = ((name, f"{x:g}" if isinstance(x, float) else str(x)) for name, x in self.options)
-        return " ".join(f"{name}={x}" for name, x in values) or "model's own setting"
-
-    @property
-    def changes_problem(self) -> bool:
-        """Whether the setting changes the constraint problem, and not only how it is solved."""
-        return any(name in self.problem_options for name, _ in self.options)
-
-
-@dataclass(frozen=True)
-class MujocoSetting(Setting):
-    """Attributes of `<option>` that differ from the model's."""
-
-    problem_options: ClassVar[tuple[str, ...]] = PROBLEM_OPTIONS
-    comment: ClassVar[str] = "<!-- {} -->"
-    merge_note: ClassVar[str] = MERGE_NOTE
+    is_default: bool = field(default=False, compare=False)
+    iterations: int = field(default=0, compare=False)
 
     @classmethod
     def from_options(cls, mj: Any, model: Any, **options: Any) -> MujocoSetting:
@@ -72,12 +45,20 @@ class MujocoSetting(Setting):
     @property
     def name(self) -> str:
         """`option_line`, after "MuJoCo's defaults" if the setting is that; or "the model's own setting"."""
-        return f"MuJoCo's defaults: {super().name}" if self.is_default else super().name
+        line = self.option_line or "the model's own setting"
+        return f"MuJoCo's defaults: {line}" if self.is_default else line
 
     @property
     def short_name(self) -> str:
-        """Options without the syntax of MJCF; or "MuJoCo's defaults"."""
-        return "MuJoCo's defaults" if self.is_default else super().short_name
+        """Options without the syntax of MJCF, for tables; or "MuJoCo's defaults"."""
+        values = ((name, f"{x:g}" if isinstance(x, float) else str(x)) for name, x in self.options)
+        short = " ".join(f"{name}={x}" for name, x in values) or "model's own setting"
+        return f"MuJoCo's defaults ({short})" if self.is_default else short
+
+    @property
+    def changes_problem(self) -> bool:
+        """Whether the setting changes the constraint problem, and not only how it is solved."""
+        return any(name in PROBLEM_OPTIONS for name, _ in self.options)
 
     def apply_to(self, mj: Any, model: Any) -> Any:
         """Return a copy of the model with these options."""

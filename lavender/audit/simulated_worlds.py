@@ -25,9 +25,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray, check_float, check_int
-from lavender.base.errors import CapabilityError, InputError
+from lavender.base.errors import InputError
 from lavender.batch.data import Batch
+from lavender.io.contact_count import count_contacts
 from lavender.io.efc import from_efc
+from lavender.io.engine_step import EngineStep
+from lavender.io.mujoco_memory import import_mujoco
 from lavender.io.start_states import (
     Control,
     StartStates,
@@ -35,6 +38,7 @@ from lavender.io.start_states import (
     load_controls,
     load_model,
     make_controller,
+    name_model,
     read_states,
     without_sleep,
 )
@@ -66,29 +70,40 @@ SPREADS = (0.1, 0.01, 0.001, 0.0)  # [m/s, rad/s] Default: the largest one with 
 N_TRIAL_WORLDS = 3
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Runs:
     """Parameters of a simulation of several worlds.
 
     Parameters
     ----------
-    model : path of a model (MJCF)
+    name : str
+        Name of the model in sentences and tables.
+    model : mujoco.MjModel or None
+        Without sleep; None for scenes of other engines.
     worlds, steps : int
-    control : "random", "zero", or an array (any, nu) of controls that every world applies step by step
+    control : "random", "zero", "hold", array (any, nu) or callable
+        See `lavender.io.record`; every world applies an array step by step.
     seed : int
     spread : float, m/s, rad/s
         Standard deviation of the noise that is added to the velocities at the start.
     starts : StartStates, optional
         States in which the worlds start; default: the model's own.
+    against : (str, mujoco.MjModel), optional
+        Name and model of the other model that solves the same steps.
+    notes : tuple of str
+        Sentences about the differences from a simulation of the model as it is.
     """
 
-    model: str
+    name: str
+    model: Any
     worlds: int
     steps: int
     control: Control = "random"
     seed: int = 0
     spread: float = SPREADS[0]
     starts: StartStates | None = None
+    against: tuple[str, Any] | None = None
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("worlds", "steps"):
@@ -97,28 +112,64 @@ class Runs:
         check_int("seed", self.seed, high=None)
         check_float("spread", self.spread, low=0.0)
 
-    def load_model(self) -> tuple[Any, Any]:
-        """Load MuJoCo and the model, without sleep.
+    @classmethod
+    def of_model(cls, source: Any, worlds: int, steps: int, **more: Any) -> Runs:
+        """Make the runs of a model, without sleep.
+
+        Parameters
+        ----------
+        source : path of a model (MJCF, .mjb) or mujoco.MjModel
+        worlds, steps, more
+            See `Runs`.
 
         Raises
         ------
         InputError
             The model cannot be read, or the controls do not fit it.
         """
-        mj, model = load_model(self.model)
-        make_controller(model, self.control, self.seed)
-        return mj, without_sleep(mj, model)
+        mj, model = load_model(source)
+        notes = (SLEEP_NOTE,) if can_sleep(mj, model) else ()
+        runs = cls(name_model(source), without_sleep(mj, model), worlds, steps, notes=notes, **more)
+        make_controller(model, runs.control, runs.seed)
+        return runs
+
+    @classmethod
+    def of_environment(cls, env: Any, model: Any, episodes: int, steps: int, seed: int) -> Runs:
+        """Make the runs of an environment, which steps itself."""
+        spec = getattr(env, "spec", None)
+        name = getattr(spec, "id", None) or type(env.unwrapped).__name__
+        return cls(name, model, episodes, steps, seed=seed, spread=0.0)
 
     @property
-    def sleep_note(self) -> str:
-        """Sentence about a model with sleep, which is not simulated; else empty."""
-        return SLEEP_NOTE if can_sleep(*load_model(self.model)) else ""
+    def mj(self) -> Any:
+        """The module mujoco."""
+        return import_mujoco()
 
     def with_start_states(self, states: Any) -> Runs:
         """Return these runs with start states from any source of `read_states`; None keeps the model's own."""
         if states is None:
             return self
-        return replace(self, starts=read_states(*self.load_model(), states).select_evenly(self.worlds))
+        starts = read_states(self.mj, self.model, states)
+        return replace(self, starts=starts.select_evenly(self.worlds), notes=(*self.notes, *starts.notes))
+
+    def with_other_model(self, source: Any) -> Runs:
+        """Return these runs with another model that solves the same steps; None for none.
+
+        Raises
+        ------
+        InputError
+            The model cannot be read, or its states have another size.
+        """
+        if source is None:
+            return self
+        mj, model = load_model(source)
+        sizes = [mj.mj_stateSize(m, mj.mjtState.mjSTATE_INTEGRATION) for m in (self.model, model)]
+        if sizes[0] != sizes[1] or self.model.nv != model.nv:
+            raise InputError(
+                f"against names {name_model(source)}, a state of which has {sizes[1]} numbers, and a state of "
+                f"{self.name} {sizes[0]}; a model with the same state is needed, such as one with other options"
+            )
+        return replace(self, against=(name_model(source), without_sleep(mj, model)))
 
     @property
     def n_exact_worlds(self) -> int:
@@ -131,12 +182,11 @@ class Runs:
         The second result is a sentence about a choice that is not the largest; else it is empty. If these worlds
         diverge without noise, too, the largest is chosen.
         """
-        mj, model = self.load_model()
         trial = range(self.n_exact_worlds, min(self.worlds, self.n_exact_worlds + N_TRIAL_WORLDS))
-        with count_engine_warnings(mj):
+        with count_engine_warnings(self.mj):
             for spread in SPREADS:
                 runs = replace(self, spread=spread)
-                if all(simulate_world(mj, model, runs, world)[1] is None for world in trial):
+                if all(simulate_world(runs, world)[1] is None for world in trial):
                     break
             else:
                 return replace(self, spread=SPREADS[0]), ""
@@ -147,8 +197,9 @@ class Runs:
             f"{SPREADS[SPREADS.index(spread) - 1]:g} m/s and not with {spread:g} m/s (--spread)."
         )
 
-    def create_start_data(self, mj: Any, model: Any, world: int) -> Any:
+    def create_start_data(self, world: int) -> Any:
         """Create the MjData with which a world starts."""
+        mj, model = self.mj, self.model
         data = mj.MjData(model)
         if self.starts is not None:
             state = self.starts.vectors[world % len(self.starts)]
@@ -157,9 +208,9 @@ class Runs:
             data.qvel[:] += self.spread * np.random.default_rng([self.seed, world]).standard_normal(model.nv)
         return data
 
-    def make_controller(self, model: Any, world: int) -> Any:
+    def make_controller(self, world: int) -> Any:
         """Return the function (data, step) -> controls of a world."""
-        drive = make_controller(model, self.control, self.seed + world)
+        drive = make_controller(self.model, self.control, self.seed + world)
         if self.starts is None or self.starts.controls is None:
             return drive
         first = self.starts.controls[world % len(self.starts)]
@@ -214,6 +265,10 @@ class Frame(NamedTuple):
         Number of rows that are not padding.
     contacts : (worlds,) int
         Number of contacts with rows that are not padding.
+    converged : (worlds,) bool, optional
+        The engine's claims.
+    n_dropped : int
+        Number of rows for which the engine had no memory.
     """
 
     batch: Batch
@@ -221,6 +276,24 @@ class Frame(NamedTuple):
     state: dict[str, FloatArray]
     rows: np.ndarray
     contacts: np.ndarray
+    converged: np.ndarray | None = None
+    n_dropped: int = 0
+
+    @classmethod
+    def of_step(cls, step: EngineStep) -> Frame:
+        """Make the frame of a converted step of an engine with claims."""
+        batch = step.batch
+        contacts = batch.contact_counts
+        if contacts is None:
+            contacts = np.zeros(len(batch), int)
+            for i in range(len(batch)):
+                with contextlib.suppress(
+                    InputError
+                ):  # A world with numbers that are not finite is not judged.
+                    contacts[i] = count_contacts(batch[i])
+        dropped = step.claims.residuals.get("dropped_rows", np.zeros(1))
+        claims = np.asarray(step.claims.converged, bool), int(np.sum(dropped))
+        return cls(batch, step.impulse, step.state or {}, batch.row_counts, contacts, *claims)
 
 
 @contextlib.contextmanager
@@ -237,7 +310,7 @@ def count_engine_warnings(mj: Any) -> Iterator[Counter[str]]:
         mj.set_mju_user_warning(handler)
 
 
-def simulate_world(mj: Any, model: Any, runs: Runs, world: int) -> tuple[FloatArray, Divergence | None]:
+def simulate_world(runs: Runs, world: int) -> tuple[FloatArray, Divergence | None]:
     """Simulate a world.
 
     Returns
@@ -247,11 +320,13 @@ def simulate_world(mj: Any, model: Any, runs: Runs, world: int) -> tuple[FloatAr
         diverged, and in that step if MuJoCo raised an error.
     divergence : Divergence or None
     """
-    kind = mj.mjtState.mjSTATE_INTEGRATION
-    data, drive = runs.create_start_data(mj, model, world), runs.make_controller(model, world)
+    mj, model, kind = runs.mj, runs.model, runs.mj.mjtState.mjSTATE_INTEGRATION
+    data, drive = runs.create_start_data(world), runs.make_controller(world)
     states = np.empty((runs.steps, mj.mj_stateSize(model, kind)))
     for step in range(runs.steps):
-        data.ctrl[:] = drive(data, step)
+        ctrl = drive(data, step)
+        if ctrl is not None:
+            data.ctrl[:] = ctrl
         mj.mj_getState(model, data, states[step], kind)
         try:
             mj.mj_step(model, data)
@@ -293,33 +368,35 @@ def _find_cause_of_reset(
     return Divergence(world, step, "acceleration", False)
 
 
-def split_state_vector(mj: Any, model: Any, state: FloatArray) -> dict[str, FloatArray]:
+def split_state_vector(model: Any, state: FloatArray) -> dict[str, FloatArray]:
     """Convert a state vector to a dict by the names of MjData."""
+    mj = import_mujoco()
     data = mj.MjData(model)
     mj.mj_setState(model, data, state, mj.mjtState.mjSTATE_INTEGRATION)
     return {name: np.array(getattr(data, name)) for name in STEP_FIELDS}
 
 
-def iterate_frames(engine: str, runs: Runs) -> Iterator[Frame]:
+def iterate_frames(engine: str, runs: Runs, njmax: int | None = None) -> Iterator[Frame]:
     """Step all worlds by MJX or MuJoCo Warp and yield the frame of each step.
 
     Raises
     ------
     InputError
         The package is not installed, or does not accept the model.
-    CapabilityError
-        A world has more rows than MuJoCo Warp has memory for.
     """
-    mj, model = runs.load_model()
-    model = copy.copy(model)
+    mj, model = runs.mj, copy.copy(runs.model)
     model.opt.jacobian = mj.mjtJacobian.mjJAC_DENSE
-    starts = [runs.create_start_data(mj, model, world) for world in range(runs.worlds)]
-    drives = [runs.make_controller(model, world) for world in range(runs.worlds)]
+    starts = [runs.create_start_data(world) for world in range(runs.worlds)]
+    drives = [runs.make_controller(world) for world in range(runs.worlds)]
     names = ("qpos", "qvel") if runs.starts is None else START_FIELDS
     start_arrays = {name: np.array([getattr(d, name) for d in starts], np.float32) for name in names}
-    not_accepted = f"engine {engine!r} does not accept {runs.model}"
+    not_accepted = f"engine {engine!r} does not accept {runs.name}"
     try:
-        step = {"mjx": _make_mjx_stepper, "mujoco_warp": WarpWorlds}[engine](mj, model, start_arrays)
+        step: Any = (
+            _make_mjx_stepper(mj, model, start_arrays)
+            if engine == "mjx"
+            else WarpWorlds(mj, model, start_arrays, njmax)
+        )
     except ImportError as error:
         package = {"mjx": "mujoco-mjx", "mujoco_warp": "mujoco-warp"}[engine]
         raise InputError(f"engine {engine!r} cannot be imported ({error}): pip install {package}") from None
@@ -333,7 +410,7 @@ def iterate_frames(engine: str, runs: Runs) -> Iterator[Frame]:
             NotImplementedError
         ) as error:  # MJX raises it in the first step, for example for an integrator.
             raise InputError(f"{not_accepted}: {error}") from None
-        yield make_frame(mj, model, *arrays)
+        yield make_frame(mj, model, *arrays)._replace(n_dropped=getattr(step, "n_dropped", 0))
 
 
 def make_frame(mj: Any, model: Any, state: Any, efc: Any, mass: Any, contact: Any, extra: Any) -> Frame:
@@ -432,32 +509,34 @@ class WarpWorlds:
         Model with the option of a dense Jacobian.
     start_arrays : dict of (worlds, ...)
         State in which the worlds start, by the names of MjData.
+    njmax : int, optional
+        Rows of each world for which memory is allocated. Further rows are dropped by the engine and counted in
+        `n_dropped`. Default: memory grows with the rows, and nothing is dropped.
     """
 
-    def __init__(self, mj: Any, model: Any, start_arrays: dict[str, Any]) -> None:
+    def __init__(self, mj: Any, model: Any, start_arrays: dict[str, Any], njmax: int | None = None) -> None:
         import mujoco_warp as mjw
         import warp as wp
 
         wp.config.log_level = getattr(wp, "LOG_WARNING", 30)  # Do not print a line for each kernel.
-        self.mjw, self.wp, self.nv = mjw, wp, model.nv
-        first = mj.MjData(model)
-        mj.mj_forward(model, first)
-        self.rows = max(MIN_WARP_ROWS, 2 * int(first.nefc))
-        self.n = len(start_arrays["qpos"])
-        self.data = mjw.put_data(model, first, nworld=self.n, njmax=self.rows, nconmax=self.rows)
-        self.configure(model)
-        self.start(start_arrays)
-
-    def configure(self, model: Any) -> None:
-        """Use the options of `model`, which otherwise equals the model of these worlds."""
-        self.device_model = self.mjw.put_model(model)
+        self.mj, self.mjw, self.wp, self.model, self.n_dropped = mj, mjw, wp, model, 0
+        self.n, self.can_grow = len(start_arrays["qpos"]), njmax is None
+        self.first, start = mj.MjData(model), mj.MjData(model)
+        mj.mj_forward(model, start)
+        self.rows = njmax or max(MIN_WARP_ROWS, 2 * int(start.nefc))
+        # A world has at least one row for each contact.
+        self.contacts = max(MIN_WARP_ROWS, self.rows)
+        self.device_model = mjw.put_model(model)
         if hasattr(self.device_model.opt, "warn_overflow"):
-            # Do not print a line for each solve that uses up its iterations.
+            # Do not print a line for each solve that uses up its iterations, or for rows that this class counts.
             self.device_model.opt.warn_overflow = 0
+        self._allocate(start_arrays)
 
-    def start(self, start_arrays: dict[str, Any]) -> None:
-        """Set the state of all worlds to `start_arrays`, arrays (worlds, ...) by the names of MjData."""
-        for name, x in start_arrays.items():
+    def _allocate(self, state: dict[str, Any]) -> None:
+        """Allocate memory for `rows` rows and `contacts` contacts of each world, and set their state."""
+        sizes = {"njmax": self.rows, "nconmax": self.contacts}
+        self.data = self.mjw.put_data(self.model, self.first, nworld=self.n, **sizes)
+        for name, x in state.items():
             if x.size:
                 getattr(self.data, name).assign(x)
 
@@ -465,38 +544,39 @@ class WarpWorlds:
         """Return copies of some arrays of the state."""
         return {name: getattr(self.data, name).numpy().copy() for name in names}
 
-    def advance(self, ctrl: Any) -> None:
-        """Step all worlds with these controls, and wait until the step is complete."""
-        self.data.ctrl.assign(ctrl)
-        self.mjw.step(self.device_model, self.data)
-        self.wp.synchronize()
-
-    def compute_body_positions(self) -> Any:
-        """Return the positions of all bodies (worlds, bodies, 3) [m] in the present state."""
-        self.mjw.kinematics(self.device_model, self.data)
-        return self.data.xpos.numpy().astype(float)
+    def _forward(self) -> int:
+        """Run the forward pass, with more memory if rows or contacts did not fit; return the number of contacts."""
+        while True:
+            self.mjw.forward(self.device_model, self.data)
+            # The engine counts the rows and contacts that it has no memory for, too.
+            needed, contacts = int(self.data.nefc.numpy().max()), int(self.data.nacon.numpy()[0])
+            fits_contacts = contacts <= self.n * self.contacts
+            if (needed <= self.rows and fits_contacts) or not self.can_grow:
+                excess = np.maximum(self.data.nefc.numpy() - self.rows, 0).sum()
+                self.n_dropped = int(excess) + max(contacts - self.n * self.contacts, 0)
+                return min(contacts, self.n * self.contacts)
+            state = self.read_state((*START_FIELDS, "ctrl", "time"))
+            self.rows = max(self.rows, 2 * needed)
+            self.contacts = max(self.contacts, 2 * -(-contacts // self.n))
+            self._allocate(state)
 
     def __call__(self, ctrl: Any) -> Any:
         """Step all worlds with these controls; return states, constraint rows, mass matrices and contacts."""
-        data, rows = self.data, self.rows
-        data.ctrl.assign(ctrl)
+        self.data.ctrl.assign(ctrl)
         state = self.read_state(STEP_FIELDS)
-        self.mjw.forward(self.device_model, data)
-        if int(data.nefc.numpy().max()) > rows or int(data.nacon.numpy()[0]) > self.n * rows:
-            raise CapabilityError(
-                f"the worlds have up to {int(data.nefc.numpy().max())} rows, and "
-                f"{int(data.nacon.numpy()[0])} contacts together; memory was allocated for {rows} rows in "
-                f"each of {self.n} worlds: use a model with fewer contacts"
-            )
+        k = self._forward()
+        data, rows = self.data, self.rows
         e, c = data.efc, data.contact
         efc = {name: getattr(e, name).numpy()[:, :rows].copy() for name in
                ("D", "aref", "type", "frictionloss", "force")}  # fmt: skip
-        efc["J"] = e.J.numpy()[:, :rows, : self.nv].copy()
-        k = int(data.nacon.numpy()[0])
+        efc["J"] = e.J.numpy()[:, :rows, : self.model.nv].copy()
         parts = [c.worldid, c.efc_address, c.dim, c.friction, c.geom]
         world_of, address, dim, friction, geom = (x.numpy()[:k].copy() for x in parts)
+        # A contact with dropped rows has no address.
+        address = np.where((address < rows).all(axis=1), address[:, 0], -1)
         extra = self.read_state((*ACCELERATION_FIELDS, "nefc"))
-        step_data = state, efc, data.M.numpy().copy(), (world_of, address[:, 0], dim, friction, geom)
+        extra["nefc"] = np.minimum(extra["nefc"], rows)
+        step_data = state, efc, data.M.numpy().copy(), (world_of, address, dim, friction, geom)
         self.mjw.step(self.device_model, data)
         return *step_data, extra
 

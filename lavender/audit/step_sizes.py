@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lavender.report.table import Table
 from lavender.report.text import format_count, format_percent
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 # If a smaller fraction of the judged steps has contact, `tune` recommends no setting and an audit warns: mean times,
 # and the error that 1 % of the steps exceed, then describe steps without contact. Examples: 6 % of the steps of
@@ -51,15 +53,16 @@ class StepSizes:
         return f"{self._n_with_contact} of {n} steps judged have {object_name}{fraction}, fewer than {needed}"
 
     @property
-    def size_table(self) -> Table:
-        """Table of the median and maximum number of rows and contacts, and the fraction of steps that have any."""
-        rows = []
-        for name, counts in (("rows", self.rows), ("contacts", self.contacts)):
-            if len(counts):
-                with_any = format_percent(int(np.count_nonzero(counts)), len(counts), 1)
-                rows.append([name, f"{np.median(counts):g}", str(counts.max()), with_any])
-        heads = ["in a step", "median", "maximum", "steps with any"]
-        return Table(heads, rows, words=frozenset(heads[:1]))
+    def table(self) -> pd.DataFrame:
+        """Median and maximum number of rows and contacts, and the fraction of steps that have any."""
+        import pandas as pd
+
+        rows = [
+            (name, f"{np.median(counts):g}", counts.max(),
+             format_percent(int(np.count_nonzero(counts)), len(counts), 1))
+            for name, counts in (("rows", self.rows), ("contacts", self.contacts)) if len(counts)
+        ]  # fmt: skip
+        return pd.DataFrame(rows, columns=["in a step", "median", "maximum", "steps with any"])
 
     @property
     def as_dict(self) -> dict[str, Any]:

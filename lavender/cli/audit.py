@@ -15,7 +15,6 @@ from lavender.cli.options import (
     FILE,
     FOLDER,
     add_worlds_options,
-    is_option_set,
     limit_to_one_thread,
     precision_option,
     print_escaped,
@@ -24,15 +23,15 @@ from lavender.cli.options import (
 )
 from lavender.io.stored import lock_output
 
-DEFAULT_CLAIM_WORLDS = 8  # Default number of worlds for engines with claims, which step all worlds at once.
-
 
 @click.command()
-@click.argument("model", metavar="MODEL.xml|SCENE.py", type=FILE)
+@click.argument("model", metavar="MODEL.xml|MODEL.mjb|SCENE.py", type=FILE)
 @add_worlds_options(worlds=None, steps=200)
 @click.option("--engine", default="mujoco", show_default=True,
               metavar="mujoco|mjx|mujoco_warp|kamino|newton-mujoco|genesis", shell_complete=complete_choice,
               help="Engine that steps the worlds.")  # fmt: skip
+@click.option("--against", type=FILE, metavar="MODEL.xml|MODEL.mjb",
+              help="Another model, such as one with other options, that solves the same steps.")  # fmt: skip
 @click.option("--max-velocity-error", type=float, metavar="M/S",
               help="Exit with 1 if a step above its floor has a larger velocity error [m/s, rad/s].")  # fmt: skip
 @click.option("--keep", type=int, metavar="N",
@@ -42,8 +41,13 @@ DEFAULT_CLAIM_WORLDS = 8  # Default number of worlds for engines with claims, wh
               "--states of tune, slip, record and report.")  # fmt: skip
 @threshold_option
 @precision_option
+@click.option("--njmax", type=int, metavar="N",
+              help="Rows of a world for mujoco_warp, as in your simulation; default: as many as needed.")  # fmt: skip
 @click.option("--workers", type=int, default=-1, help="Processes, for mujoco; -1: one for each core.")
 @click.option("--backend", default="loky", show_default=True, help="A backend of joblib, such as dask.")
+@click.option(
+    "--no-reuse", is_flag=True, help="Judge all worlds again, also worlds of an earlier audit in OUT."
+)
 @click.option("--out", type=FOLDER, default=Path("lavender-audit"),
               show_default=True, help="Folder of the page, the records and the worst worlds.")  # fmt: skip
 @click.pass_context
@@ -52,86 +56,46 @@ def audit(
     /,
     model: Path,
     out: Path,
-    max_velocity_error: float | None,
-    keep: int | None,
     save_states: tuple[str, Path] | None,
+    no_reuse: bool,
     **options: Any,
 ) -> None:
     """Judge every step of many worlds of a MuJoCo model.
 
-    MODEL.xml is an MJCF file. For kamino, newton-mujoco and genesis, SCENE.py is a Python file whose function build()
-    returns a newton.ModelBuilder, or build(worlds) a built genesis.Scene; or it is the name of a builder in
-    newton.tests.utils.basics. The page then compares what the engine claims about each solve with the verdict.
+    MODEL is an MJCF file, or an .mjb file of a model that was changed after loading. For kamino, newton-mujoco and
+    genesis, SCENE.py is a Python file whose function build() returns a newton.ModelBuilder, or build(worlds) a built
+    genesis.Scene; or it is the name of a builder in newton.tests.utils.basics. The page then compares what the engine
+    claims about each solve with the verdict.
 
     Without --worlds the audit takes about a minute; the remaining time is shown. The page
     shows how many steps were judged, how many of these stopped before convergence,
     their errors with time and body, and the numbers of rows and contacts. The worst worlds are problem files in
-    OUT/worst; OUT/states.npz holds the states before them, from which --states starts again.
+    OUT/worst; OUT/states.npz holds the states before them, from which --states starts again. After a stop, the same
+    command judges the other worlds and reuses the complete ones in OUT.
 
-    Exit code 1: a world diverged, a step could not be judged, or an answer that is not at its floor has a velocity
-    error above --max-velocity-error. Exit code 130: stopped by Ctrl-C; the page shows the completed steps.
+    Exit code 1: a world diverged, a step could not be judged, too few steps have contact, the engine dropped rows, or
+    an answer that is not at its floor has a velocity error above --max-velocity-error. Exit code 130: stopped by
+    Ctrl-C; the page shows the completed steps.
     """
     from lavender.audit.audit import audit as run
-    from lavender.audit.engine_scenes import CLAIM_ENGINES
     from lavender.report.text import format_count
 
-    if max_velocity_error is not None and not max_velocity_error >= 0.0:
-        raise InputError(f"--max-velocity-error is {max_velocity_error}; a velocity error in m/s is needed")
-    if options["engine"] != "mujoco":
-        for name in ("workers", "backend", "precision"):
-            if is_option_set(context, name):
-                raise InputError(
-                    f"--{name} has no effect with another engine than MuJoCo: leave it out, or give "
-                    "--engine mujoco"
-                )
-    if options["engine"] in CLAIM_ENGINES:
-        if is_option_set(context, "control"):
-            raise InputError(
-                f"--controls needs a model of MuJoCo; the scene of {options['engine']} sets its own controls"
-            )
-        reject_unused_options(context, ["keep", "save_states"], f"with --engine {options['engine']}")
-        _audit_claims(context, model, out, max_velocity_error, options)
-        return
+    limit, engine = options["max_velocity_error"], options["engine"]
+    if limit is not None and not limit >= 0.0:
+        raise InputError(f"--max-velocity-error is {limit}; a velocity error in m/s is needed")
+    if engine != "mujoco":
+        reject_unused_options(context, ["workers", "backend", "precision"], f"with --engine {engine}")
     context.with_resource(lock_output(out, folder=True))
     limit_to_one_thread()
     with explain_early_interrupt("the first step"), show_progress() as watch:
         result = run(
-            model, watch=watch, max_velocity_error=max_velocity_error, keep=keep,
+            model, watch=watch, folder=out, reuse=not no_reuse,
             keep_contact_states=save_states is not None and save_states[0] == "contact", **options,
         )  # fmt: skip
     result.write(out)
     if save_states is not None:
         n = result.save_states(*save_states)
         print_escaped(f"{save_states[1]}: {format_count(n, 'state')} for --states")
-    show_page(result.summary_page, out)
-    if result.n_diverged or result.n_unjudged or result.n_above_limit:
-        raise click.exceptions.Exit(EXIT_UNMET)
-
-
-def _audit_claims(
-    context: click.Context, scene: Path, out: Path, max_velocity_error: float | None, options: dict[str, Any]
-) -> None:
-    """Compare the claims of an engine with the verdicts, and write the page."""
-    from lavender.audit.claims import compare_claims
-    from lavender.audit.engine_scenes import step_scene
-    from lavender.audit.simulated_worlds import SPREADS
-
-    worlds, steps = options["worlds"] or DEFAULT_CLAIM_WORLDS, options["steps"]
-    starts = {name: options[name] for name in ("states", "seed")}
-    starts["spread"] = SPREADS[0] if options["spread"] is None else options["spread"]
-    stepped = step_scene(scene, options["engine"], worlds=worlds, steps=steps, **starts)
-    context.with_resource(lock_output(out, folder=True))
-    limit_to_one_thread()
-    with explain_early_interrupt("the first step of all worlds"), show_progress() as watch:
-        result = compare_claims(
-            stepped,
-            engine=options["engine"],
-            threshold=options["threshold"],
-            folder=out,
-            total=steps,
-            watch=watch,
-        )
-    result.error_limit = max_velocity_error
-    show_page(result.summary_page, out)
-    if result.is_any_lost or result.n_above_limit:
+    show_page(result.page, out)
+    if result.is_unmet:
         raise click.exceptions.Exit(EXIT_UNMET)

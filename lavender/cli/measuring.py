@@ -23,12 +23,13 @@ from lavender.cli.options import (
 )
 
 if TYPE_CHECKING:
+    from lavender.audit.page import ResultPage
     from lavender.report import Event, Item, Plan, Records
-    from lavender.report.summary_page import SummaryPage
 
 
 PROGRESS_INTERVAL = 10.0  # [s] Time between two lines of progress if the output is not a terminal.
 REDRAW_INTERVAL = 0.25  # [s] Time between two updates of the line on a terminal.
+MIN_DONE_FRACTION = 0.1  # The remaining time is not estimated before this fraction of the work is done.
 MIN_ELAPSED = 1.0  # [s] The remaining time is not estimated from a shorter time.
 
 
@@ -137,13 +138,13 @@ def _make_plan(context: click.Context, files: Sequence[str]) -> tuple[Plan, dict
     return Plan(**values, repeats=options["repeats"], time_limit=limit), {}
 
 
-def show_page(page: SummaryPage, folder: Path) -> None:
+def show_page(page: ResultPage, folder: Path) -> None:
     """Write a page and print its short form; exit if Ctrl-C ended the measurement."""
     path = page.write(folder)
     with continue_after_closed_output():
         page.print_short(make_console())
         print_escaped(f"\npage: {path}")
-    if page.stopped:
+    if page.is_stopped:
         exit_after_interrupt()
 
 
@@ -201,12 +202,14 @@ def show_progress() -> Iterator[Callable[[Event], None]]:
 
 
 def format_remaining_time(event: Event, elapsed: float, done: int | None = None) -> str:
-    """Return a phrase such as "about 40 s remain" from the time [s] in which `done` were done, by default all."""
-    remaining, done = event.remaining, event.done if done is None else done
-    if remaining is None:
-        if not (event.total and done > 0 and elapsed >= MIN_ELAPSED):
-            return ""
-        remaining = elapsed * (event.total - event.done) / done
+    """Return a phrase such as "about 40 s remain" from the time [s] in which `done` were done, by default all.
+
+    It is empty before a tenth of the work is done: the first parts contain the start of workers and compilation.
+    """
+    done = event.done if done is None else done
+    if done < max(1, MIN_DONE_FRACTION * event.total) or not event.total or elapsed < MIN_ELAPSED:
+        return ""
+    remaining = elapsed * (event.total - event.done) / done
     if remaining < 90.0:
         return f"about {max(1, round(remaining))} s remain"
     return f"about {round(remaining / 60.0)} min remain"

@@ -34,7 +34,8 @@ def slip(model: Path, states: str | None, steps: int, contacts: tuple[str, ...])
     from lavender.audit.slip_states import explain_slip_of_states
     from lavender.base.arrays import check_int
     from lavender.io.start_states import can_sleep, load_model
-    from lavender.report.render import format_count, print_table
+    from lavender.report.render import print_table
+    from lavender.report.text import format_count
 
     steps = check_int("steps", steps, 1)
     limit_to_one_thread()

@@ -8,16 +8,13 @@ from typing import Any
 import click
 
 from lavender.base.exits import EXIT_UNMET
-from lavender.cli.completion import complete_choice
 from lavender.cli.measuring import explain_early_interrupt, show_page, show_progress
 from lavender.cli.options import FILE, FOLDER, add_worlds_options, limit_to_one_thread, threshold_option
 from lavender.io.stored import lock_output
 
 
 @click.command()
-@click.argument("model", metavar="MODEL.xml|SCENE.py", type=FILE)
-@click.option("--engine", default="mujoco", show_default=True, metavar="mujoco|mujoco_warp|kamino",
-              shell_complete=complete_choice, help="Engine whose settings are measured.")  # fmt: skip
+@click.argument("model", metavar="MODEL.xml|MODEL.mjb", type=FILE)
 @add_worlds_options(worlds=16, steps=200)
 @click.option("--horizon", default=10, show_default=True, help="Steps after which the motion is compared.")
 @click.option("--repeats", default=5, show_default=True, help="Times that each setting is timed.")
@@ -25,18 +22,22 @@ from lavender.io.stored import lock_output
               help="Also recommend the fastest setting without a larger error in any step [m/s, rad/s].")  # fmt: skip
 @threshold_option
 @click.option("--out", type=FOLDER, default=Path("lavender-tune"),
-              show_default=True, help="Folder of the page.")  # fmt: skip
+              show_default=True, help="Folder of the page and of the settings judged.")  # fmt: skip
+@click.option(
+    "--no-reuse", is_flag=True, help="Judge all settings again, also settings of an earlier call in OUT."
+)
 @click.pass_context
-def tune(context: click.Context, /, model: Path, out: Path, **options: Any) -> None:
-    """Find faster or more accurate settings of an engine for a model.
+def tune(context: click.Context, /, model: Path, out: Path, no_reuse: bool, **options: Any) -> None:
+    """Find faster or more accurate settings of MuJoCo for a model.
 
-    MODEL.xml is an MJCF file. For kamino, SCENE.py is a Python file whose function build() returns a
-    newton.ModelBuilder of one world, or the name of a builder in newton.tests.utils.basics. The time and the error of a
-    step are measured with many settings on worlds of the model. Two lines with options are printed: one that is faster
-    and as accurate as the present setting, and one that is more accurate and as fast. Both are chosen on half of the
-    worlds and validated on the other half. With --max-velocity-error E, the first line is the fastest setting whose
-    errors do not exceed E on all worlds, or the one with the smallest error if there is none. No line is printed if
-    fewer than 20 % of the steps have contact: then start from states with contact (--states).
+    MODEL is an MJCF file or an .mjb file. The time and the error of a step are measured with many settings on worlds of
+    the model. Two lines with options are printed: one that is faster and as accurate as the present setting, and one
+    that is more accurate and as fast. Both are chosen on half of the worlds and validated on the other half. With
+    --max-velocity-error E, the first line is the fastest setting whose errors do not exceed E on all worlds, or the one
+    with the smallest error if there is none. No line is printed if fewer than 20 % of the steps have contact: then
+    start from states with contact (--states).
+
+    After a stop, the same command reuses the errors of the settings judged in OUT; times are measured again.
 
     Exit code 1: too few steps have contact, or no setting is within --max-velocity-error. Exit code 130: stopped by
     Ctrl-C; the page shows the completed part.
@@ -46,7 +47,7 @@ def tune(context: click.Context, /, model: Path, out: Path, **options: Any) -> N
     context.with_resource(lock_output(out, folder=True))
     limit_to_one_thread()
     with explain_early_interrupt("the present setting on the first steps"), show_progress() as watch:
-        tuning = run(model, watch=watch, **options)
-    show_page(tuning.summary_page, out)
+        tuning = run(model, watch=watch, folder=out, reuse=not no_reuse, **options)
+    show_page(tuning.page, out)
     if tuning.reason_without_line or (tuning.error_limit is not None and tuning.within_limit is None):
         raise click.exceptions.Exit(EXIT_UNMET)

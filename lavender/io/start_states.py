@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import dataclasses
+import hashlib
 import os
 import zipfile
 from collections.abc import Callable, Iterable, Mapping
@@ -25,7 +26,7 @@ from lavender.base.errors import InputError
 from lavender.io.mujoco_memory import import_mujoco
 from lavender.io.stored import SUFFIXES, Archive, as_path, read_first_bytes
 
-CONTROLS = ("zero", "random")
+CONTROLS = ("zero", "random", "hold")
 Control = str | Callable[[Any, Any, int], Any] | Any
 KEYFRAMES = "keyframes"
 VECTOR = "state"
@@ -34,27 +35,79 @@ OPTIONAL = (
     "act", "ctrl", "qacc_warmstart", "time", "mocap_pos", "mocap_quat", "userdata", "eq_active", "qfrc_applied",
     "xfrc_applied",
 )  # fmt: skip
-LABELS = ("world", "step")  # Additional arrays in the files of `lavender audit`: the origin of each state.
+LABELS = (
+    "world",
+    "step",
+    "model",
+)  # Additional arrays in the files of `lavender audit`: the origin of each state.
+# Arrays of a model with these prefixes determine the motion; together with a state they define a step's problem.
+MODEL_ARRAYS = (
+    "body_",
+    "jnt_",
+    "dof_",
+    "geom_",
+    "eq_",
+    "tendon_",
+    "wrap_",
+    "actuator_",
+    "pair_",
+    "flex_",
+    "qpos",
+)
+APPEARANCE = ("rgba", "matid", "user", "group", "plugin")  # Arrays with these words do not.
+# [m, rad] Equality constraints that a start state violates by more than this are named.
+MAX_EQUALITY_ERROR = 0.05
+MAX_CHECKED_STATES = 32  # Equality constraints are checked in up to this many start states.
 
 
-def load_model(path: str | os.PathLike[str]) -> tuple[Any, Any]:
-    """Return the module mujoco and the model of a file (MJCF).
+def load_model(source: Any) -> tuple[Any, Any]:
+    """Return the module mujoco and a model: of a file (MJCF, .mjb), or a mujoco.MjModel as it is.
 
     Raises
     ------
     InputError
-        MuJoCo is not installed, or cannot read the file, or the file is a problem.
+        MuJoCo is not installed, or cannot read the file, or the file is a problem, or `source` is another object.
     """
-    mj, path = import_mujoco(), str(as_path(path))
+    mj = import_mujoco()
+    if isinstance(source, mj.MjModel):
+        return mj, source
+    if not isinstance(source, (str, os.PathLike)):
+        raise InputError(
+            f"model is a {type(source).__name__}; the path of a model (MJCF, .mjb) or a mujoco.MjModel is needed"
+        )
+    path = str(as_path(source))
     if Path(path).suffix.lower() in SUFFIXES:
         raise InputError(
             f"{path} has the suffix of a problem file; a model of MuJoCo (MJCF) is needed: `lavender check` and "
             "`lavender report` read problems"
         )
+    is_binary = Path(path).suffix.lower() == ".mjb"
     try:
-        return mj, mj.MjModel.from_xml_path(path)
+        read = mj.MjModel.from_binary_path if is_binary else mj.MjModel.from_xml_path
+        return mj, read(path)
     except ValueError as error:  # MuJoCo raises it for a file that it cannot read.
         raise InputError(f"{path}: {error}") from None
+
+
+def name_model(source: Any) -> str:
+    """Return the name of a model: of its file, or in its MJCF."""
+    if isinstance(source, (str, os.PathLike)):
+        return Path(source).name
+    return bytes(source.names).split(b"\0", 1)[0].decode(errors="replace") or "model"
+
+
+def hash_model(model: Any, options: bool = False) -> str:
+    """Return a hash of the arrays of a model that determine its motion; with `options`, also of its options."""
+    digest = hashlib.sha256()
+    for name in dir(model):
+        if name.startswith(MODEL_ARRAYS) and not any(word in name for word in APPEARANCE):
+            values = getattr(model, name)
+            if isinstance(values, np.ndarray):
+                digest.update(name.encode() + np.ascontiguousarray(values).tobytes())
+    if options:
+        values = [getattr(model.opt, name) for name in dir(model.opt) if not name.startswith("_")]
+        digest.update(repr([x for x in values if not callable(x)]).encode())
+    return digest.hexdigest()
 
 
 def load_controls(control: Control) -> Control:
@@ -99,6 +152,8 @@ def make_controller(model: Any, control: Control, seed: int) -> Callable[[Any, i
             )
         if control == "zero":
             return lambda data, step: np.zeros(n)
+        if control == "hold":
+            return lambda data, step: None
         rng = np.random.default_rng(check_int("seed", seed, high=None))
         limited = np.array(model.actuator_ctrllimited, bool)[:, None]
         low, high = np.where(limited, np.array(model.actuator_ctrlrange), [-1.0, 1.0]).T
@@ -121,11 +176,30 @@ class StartStates:
         Controls of the first step; None if the source has none.
     missing : tuple of str
         Quantities on which a step depends and that arrays of states lack: "warm start", "controls".
+    misfit : str
+        Sentence on states that do not fit the model; else empty.
     """
 
     vectors: FloatArray
     controls: FloatArray | None = None
     missing: tuple[str, ...] = ()
+    misfit: str = ""
+
+    @property
+    def notes(self) -> list[str]:
+        """Sentences about quantities that the states lack, and about states that do not fit the model."""
+        consequences = {
+            "warm start": "the first solve of each world starts cold",
+            "controls": "the first step uses the controls of --controls",
+        }
+        notes = [self.misfit] if self.misfit else []
+        if self.missing:
+            changes = " and ".join(consequences[name] for name in self.missing)
+            notes.append(
+                f"The start states have no {' and no '.join(self.missing)}: {changes}. The first step therefore has "
+                "other errors than in the original simulation. Only the array `state` (mjSTATE_INTEGRATION) has both."
+            )
+        return notes
 
     def __len__(self) -> int:
         return len(self.vectors)
@@ -180,12 +254,40 @@ def read_states(mj: Any, model: Any, source: Any) -> StartStates:
         return source
     if isinstance(source, str) and source == KEYFRAMES:
         return _read_keyframes(mj, model)
+    arrays, label = source if isinstance(source, Mapping) else {VECTOR: source}, "states"
     if isinstance(source, (str, os.PathLike)):
         read_first_bytes(source)  # Raises an error if `source` is not a regular file.
+        label = f"states {os.fspath(source)}"
         with contextlib.closing(Archive(source)) as archive:
-            return _read_arrays(mj, model, dict(archive), f"states {os.fspath(source)}")
-    arrays = source if isinstance(source, Mapping) else {VECTOR: source}
-    return _read_arrays(mj, model, arrays, "states")
+            arrays = dict(archive)
+    states = _read_arrays(mj, model, arrays, label)
+    return dataclasses.replace(states, misfit=_describe_misfit(mj, model, arrays, states))
+
+
+def _describe_misfit(mj: Any, model: Any, arrays: Mapping[str, Any], states: StartStates) -> str:
+    """Return a sentence on states that belong to another model or violate equality constraints; else empty."""
+    advice = (
+        "If the model was changed after loading, as environments and domain randomisation do, the errors are those of "
+        "another problem: give the changed model as a mujoco.MjModel or as .mjb (mujoco.mj_saveModel)."
+    )
+    if "model" in arrays and {*np.atleast_1d(arrays["model"]).tolist()} != {hash_model(model)}:
+        return f"The start states are of a model with other bodies, geoms, joints or equalities. {advice}"
+    data, largest, name = mj.MjData(model), 0.0, ""
+    for state in states.select_evenly(MAX_CHECKED_STATES).vectors:
+        mj.mj_setState(model, data, state, mj.mjtState.mjSTATE_INTEGRATION)
+        try:
+            mj.mj_fwdPosition(model, data)
+        except mj.FatalError:
+            continue
+        is_equality = data.efc_type == mj.mjtConstraint.mjCNSTR_EQUALITY
+        errors = np.where(is_equality, np.abs(data.efc_pos), 0.0)
+        if errors.max(initial=0.0) > largest:
+            row = int(errors.argmax())
+            largest, which = float(errors[row]), int(data.efc_id[row])
+            name = mj.mj_id2name(model, mj.mjtObj.mjOBJ_EQUALITY, which) or str(which)
+    if largest <= MAX_EQUALITY_ERROR:
+        return ""
+    return f"The start states violate equality {name} by up to {largest:.2g} m or rad. {advice}"
 
 
 def check_array_names(source: str, names: Iterable[str], valid: Iterable[str]) -> None:

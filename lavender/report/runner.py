@@ -63,7 +63,6 @@ class Event:
     solver: str
     record: Record | None = None  # The record that was made last.
     reused: bool = False  # Whether this record was not measured now.
-    remaining: float | None = None  # [s] Estimate of the remaining time; None if only the counts are known.
     phase: str = ""  # The present phase, such as "measuring".
 
 

@@ -13,10 +13,15 @@ from rich.console import Console
 import lavender as lv
 from lavender.audit import audit as module
 from lavender.audit.audit import audit
-from lavender.audit.result import AUDIT_VERDICTS
+from lavender.audit.pieces import AUDIT_VERDICTS
 from lavender.audit.simulated_worlds import Frame, Runs
 from lavender.io.efc import from_efc
 from lavender.io.start_states import read_states
+
+
+def words_of(found):
+    """Return the headline and the notes of an audit."""
+    return " ".join([*found.headline, *found.advice])
 
 
 def own_errors(path, world, steps, seed=0, spread=0.1):
@@ -61,8 +66,6 @@ def test_without_a_number_as_many_worlds_are_judged_as_fit_in_the_duration(boxes
         "judging one world: 20 steps",
         "simulating trial worlds to choose the spread",
     ]
-    assert events[first].remaining == 0.5
-    assert all(event.remaining is not None and 0.0 <= event.remaining <= 60.0 for event in events[first:])
     assert events[-1].done == events[-1].total == 20 * found.runs.worlds
     same = audit(boxes(EARLY), worlds=found.runs.worlds, steps=20, workers=1)
     assert same.numbers.tobytes() == found.numbers.tobytes()
@@ -100,8 +103,8 @@ def make_frames(change):
     """Return frames of MuJoCo as frames of another engine, with `change(arrays of one world, step)` instead of them."""
     names = ("qpos", "qvel", "qacc", "qacc_smooth", "qfrc_smooth", "efc_D", "efc_aref", "efc_force")
 
-    def frames(engine, runs):
-        _, model = runs.load_model()
+    def frames(engine, runs, njmax=None):
+        model = runs.model
         data = mj.MjData(model)
         for step in range(runs.steps):
             mj.mj_forward(model, data)
@@ -141,7 +144,7 @@ def test_a_world_of_another_engine_that_diverges_does_not_end_the_audit(boxes, m
     found = audit(boxes('jacobian="dense"'), worlds=2, steps=10, engine="mjx")
     assert (found.n_judged, found.n_unjudged, found.n_diverged) == (14, 6, 1)
     assert [(d.world, d.step, d.is_outside) for d in found.divergences] == [(1, 4, True)]
-    assert "1 world diverged, in step 4 at the earliest; 6 steps were not judged" in found.summary_text
+    assert "1 world diverged, in step 4 at the earliest; 6 steps not judged" in words_of(found)
 
 
 def test_ctrl_c_keeps_what_there_is(boxes, tmp_path, monkeypatch):
@@ -152,10 +155,10 @@ def test_ctrl_c_keeps_what_there_is(boxes, tmp_path, monkeypatch):
             raise KeyboardInterrupt
 
     found = audit(boxes(EARLY), worlds=3, steps=20, workers=1, watch=watch)
-    assert found.stopped and found.n_processed == 20
+    assert found.is_stopped and found.n_processed == 20
     assert np.isnan(found.numbers[:, 1:]).all()
     found.write(tmp_path / "out")
-    assert "Stopped before the end" in found.summary_page.write(tmp_path / "out").read_text()
+    assert "Stopped before the end" in found.page.write(tmp_path / "out").read_text()
 
 
 @pytest.mark.parametrize(
@@ -177,11 +180,11 @@ def test_ctrl_c_before_the_first_results_of_workers_returns_steps_of_world_0(
 
     path = boxes(EARLY)
     found = audit(path, worlds=worlds, steps=25, workers=1, watch=watch)
-    assert found.stopped and found.verdict.shape == shape and found.n_processed == judged
+    assert found.is_stopped and found.verdict.shape == shape and found.n_processed == judged
     want = [r.velocity for r in own_errors(path, 0, judged)]
     np.testing.assert_allclose(found.numbers[0, 0, :judged], want, rtol=1e-6, atol=1e-12)
     found.write(tmp_path / "out")
-    assert "Stopped before the end" in found.summary_page.write(tmp_path / "out").read_text()
+    assert "Stopped before the end" in found.page.write(tmp_path / "out").read_text()
 
 
 def test_ctrl_c_before_the_first_step_is_raised(boxes):
@@ -195,8 +198,8 @@ def test_ctrl_c_before_the_first_step_is_raised(boxes):
 def test_an_engine_of_joint_worlds_is_shown_as_compiling_until_its_first_step(boxes, monkeypatch):
     events = []
 
-    def compile_without_end(engine, runs):
-        assert events[-1].case == "compiling mjx, then 2 worlds of 10 steps"
+    def compile_without_end(engine, runs, njmax=None):
+        assert events[-1].case == "compiling mjx"
         raise KeyboardInterrupt
 
     monkeypatch.setattr(module, "iterate_frames", compile_without_end)
@@ -221,13 +224,12 @@ def test_a_world_in_which_mujoco_ends_in_an_error_is_not_judged_from_there_on(bo
     found = audit(boxes(), worlds=1, steps=12, workers=1)
     assert [AUDIT_VERDICTS[i] == "not judged" for i in found.verdict[0]] == [k >= 8 for k in range(12)]
     assert (found.n_judged, found.n_unjudged, found.n_diverged) == (8, 4, 1)
-    assert (
-        "none of 8 steps judged in 1 world stopped before convergence. 1 world diverged, in step 8"
-        in found.summary_text
+    assert "none of 8 steps judged in 1 world stopped before convergence. 1 world diverged, in step 8" in words_of(
+        found
     )
-    assert "4 steps were not judged" in found.summary_text
+    assert "4 steps not judged" in words_of(found)
     assert "out of memory" in found.divergences[0].cause
-    assert "outside" not in found.summary_text  # An error of MuJoCo says nothing about the solver.
+    assert "outside" not in words_of(found)  # An error of MuJoCo says nothing about the solver.
 
 
 # A motor that drives itself: its force grows with the velocity, so that no answer of the constraint solver helps.
@@ -244,17 +246,17 @@ def test_a_blow_up_after_exact_solves_has_its_cause_outside_the_solver(tmp_path,
     monkeypatch.chdir(tmp_path)  # MuJoCo writes a log there
     (tmp_path / "runaway.xml").write_text(RUNAWAY.format(gain=60).replace('"0.01"', f'"0.01" {options}'))
     found = audit("runaway.xml", worlds=3, steps=60, workers=1, threshold=threshold)
-    assert found.n_diverged == 3 and found.n_unjudged > 0 and "random velocities" not in found.summary_text
+    assert found.n_diverged == 3 and found.n_unjudged > 0 and "random velocities" not in words_of(found)
     assert found.n_judged + found.n_unjudged == found.verdict.size
     assert found.n_judged == np.isfinite(found.numbers[0]).sum()
-    assert f"of {found.n_judged} steps judged" in found.summary_text and "inf" not in found.summary_text
+    assert f"of {found.n_judged} steps judged" in words_of(found) and "inf" not in words_of(found)
     assert np.isfinite(found.max_velocity_error)
     exact = options == ""  # One sweep of PGS does not hold the box.
     assert found.is_unconverged.any() == (not exact and threshold < 1.0)
-    assert ("outside the constraint solver" in found.summary_text) == exact
+    assert ("outside the constraint solver" in words_of(found)) == exact
     # Otherwise a sentence says how to separate the solver from the model.
-    assert ('audit again with <option solver="Newton"' in found.summary_text) != exact
-    assert [row[-1] for row in found.table_of_diverged.cell_texts] == [["exact"], ["not exact"]][not exact] * 3
+    assert ('audit again with <option solver="Newton"' in words_of(found)) != exact
+    assert found.diverged["solves until then"].tolist() == ["exact" if exact else "not exact"] * 3
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -272,7 +274,7 @@ def test_shares_are_never_rounded_to_nothing(boxes):
     verdict = np.zeros((10, 320), np.int8)
     verdict[0, 0] = AUDIT_VERDICTS.index("stopped before convergence")
     many = replace(found, verdict=verdict, numbers=np.zeros((4, 10, 320)), rows=verdict, contacts=verdict + 1)
-    assert "1 of 3200 steps judged in 10 worlds stopped before convergence (0.03 %)" in many.summary_text
+    assert "1 of 3200 steps judged in 10 worlds stopped before convergence (0.03 %)" in words_of(many)
 
 
 def test_rows_and_contacts_are_those_of_the_run(boxes):
@@ -294,11 +296,11 @@ def test_rows_and_contacts_are_those_of_the_run(boxes):
 def test_an_audit_of_steps_without_contact_says_so(tmp_path):
     (tmp_path / "high.xml").write_text(BOXES.format(options="").replace("0 0 0.099", "0 0 9").replace("0.32", "20"))
     found = audit(tmp_path / "high.xml", worlds=2, steps=20, workers=1)
-    assert "Only 0 of 40 steps judged have contact (0 %), fewer than 20 %" in found.summary_text
+    assert "Only 0 of 40 steps judged have contact (0 %), fewer than 20 %" in words_of(found) and found.is_unmet
     none = BOXES.format(options="").replace('type="box"', 'type="box" contype="0" conaffinity="0"')
     (tmp_path / "none.xml").write_text(none.replace('type="capsule"', 'type="capsule" contype="0" conaffinity="0"'))
     found = audit(tmp_path / "none.xml", worlds=1, steps=20, workers=1)
-    assert not found.can_touch and "0 of 20 steps judged have a constraint (0 %)" in found.summary_text
+    assert not found.can_touch and "0 of 20 steps judged have a constraint (0 %)" in words_of(found)
 
 
 @pytest.mark.parametrize("names", [("state",), ("qpos", "qvel", "act", "ctrl", "qacc_warmstart", "world", "step")])
@@ -329,12 +331,12 @@ def test_states_without_warm_start_or_controls_are_warned_of(boxes, names, words
     worst = audit(path, worlds=3, steps=25, workers=1).worst
     states = {name: np.array([w.state[name] for w in worst]) for name in names}
     found = audit(path, worlds=2, steps=1, workers=1, states=states)  # two of three states are selected
-    assert words in found.start_warning and bool(found.start_warning) == bool(words)
-    assert found.start_warning in found.summary_page.warning
+    notes = [note for note in found.notes if note.startswith("The start states")]
+    assert len(notes) == bool(words) and words in "".join(notes)
     same = [w.velocity for w in worst][:1] == found.numbers[0, :1, 0].tolist()
     if "no controls: " not in words:  # The worst row does not depend on the controls.
         assert same == (not words)
-    assert not audit(path, worlds=1, steps=1, workers=1).start_warning
+    assert not any("start states" in note for note in audit(path, worlds=1, steps=1, workers=1).notes)
 
 
 def test_physics_vectors_are_states_without_warm_start_and_controls(boxes):
@@ -404,7 +406,7 @@ def test_mujoco_s_own_warnings_are_counted_and_not_printed(boxes, monkeypatch, t
     found = audit(boxes(), worlds=3, steps=5, workers=1, spread=1e12)
     ((text, count),) = found.engine_warnings.items()
     assert count >= found.n_diverged == 2 and text.startswith("Nan, Inf or huge value in QVEL at DOF N")
-    assert f"MuJoCo's own warnings: {text} ({count} times)." in found.summary_text
+    assert f"MuJoCo's own warnings: {text} ({count} times)." in words_of(found)
     assert found.totals["engine_warnings"] == {text: count}
     assert "WARNING" not in "".join(capfd.readouterr()) and not (tmp_path / "MUJOCO_LOG.TXT").exists()
     assert mj.get_mju_user_warning() is handler
@@ -433,7 +435,7 @@ def test_an_engine_that_is_not_installed_says_how(boxes, engine, package, monkey
 def test_other_engines_pose_the_problem_that_mujoco_poses(boxes, engine, package, options):
     pytest.importorskip(package, reason="needs the engine")
     path = str(boxes(options + ' iterations="100" ls_iterations="50"'))
-    (frame,) = list(module.iterate_frames(engine, Runs(path, 2, 1)))
+    (frame,) = list(module.iterate_frames(engine, Runs.of_model(path, 2, 1)))
     made = mj.MjModel.from_xml_path(path)
     for world in range(2):
         data = mj.MjData(made)
@@ -465,8 +467,8 @@ def test_audit_of_a_model_with_sleep_simulates_and_replays_without_it(tmp_path):
         judged = lv.residual(lv.io.from_mujoco(awake, data), lv.io.mujoco.impulse(awake, data))
         assert found.numbers[0, 0, step] == pytest.approx(judged.velocity, rel=1e-6, abs=1e-12)
         mj.mj_step(awake, data)
-    assert "Sleep was off" in found.summary_page.warning
-    assert "Sleep" not in audit(path_without_sleep(tmp_path), worlds=1, steps=2, workers=1).summary_page.warning
+    assert "Sleep was off" in words_of(found)
+    assert "Sleep" not in words_of(audit(path_without_sleep(tmp_path), worlds=1, steps=2, workers=1))
 
 
 def path_without_sleep(folder):
@@ -496,19 +498,18 @@ def fragile(tmp_path, monkeypatch):
 def test_audit_of_worlds_that_diverge_by_their_random_velocities_blames_these(fragile):
     found = audit(fragile, worlds=9, steps=50, workers=1, spread=0.5)
     assert found.n_diverged > 2 and 0 not in [d.world for d in found.divergences]
-    assert "World 0, which starts without random velocities, did not diverge" in found.summary_text
-    assert f"{found.divergences[0].world}, " in found.summary_text
-    assert "the random velocities are the cause, not the model or its solver" in found.summary_text
-    assert "--spread 0" in found.summary_text and "outside the constraint" not in found.summary_text
+    assert "World 0, which starts without random velocities, did not diverge" in words_of(found)
+    assert f"{found.divergences[0].world}, " in words_of(found)
+    assert "--spread 0" in words_of(found) and "outside the constraint" not in words_of(found)
 
 
 @pytest.mark.filterwarnings("ignore")
 def test_audit_without_a_spread_chooses_one_that_trial_worlds_survive(fragile, boxes):
     found = audit(fragile, worlds=4, steps=50, workers=1)
     assert (found.runs.spread, found.n_diverged) == (0.01, 0)
-    assert "0.01 m/s (rad/s) only, because worlds diverged with 0.1 m/s" in found.summary_page.warning
+    assert "0.01 m/s (rad/s) only, because worlds diverged with 0.1 m/s" in words_of(found)
     found = audit(boxes(), worlds=2, steps=5, workers=1)
-    assert (found.runs.spread, found.notes) == (0.1, "")
+    assert found.runs.spread == 0.1 and not any("start velocities" in note for note in found.notes)
 
 
 def test_audit_with_keep_has_the_worst_steps_of_a_world(boxes, tmp_path):
@@ -518,7 +519,7 @@ def test_audit_with_keep_has_the_worst_steps_of_a_world(boxes, tmp_path):
     found.write(tmp_path)
     assert len(np.load(tmp_path / "states.npz")["state"]) == 7
     terminal = Console(file=io.StringIO(), width=200)
-    found.summary_page.print_short(terminal)
+    found.page.print_short(terminal)
     assert [f"worst_{i}.npz" in terminal.file.getvalue() for i in range(1, 9)] == [True] * 7 + [False]
 
 
@@ -548,18 +549,21 @@ def test_audit_of_an_engine_whose_acceleration_is_not_finite_does_not_judge_its_
     found = audit(boxes('jacobian="dense"'), worlds=1, steps=6, engine="mjx", spread=0.0)
     assert np.flatnonzero(found.verdict[0] == AUDIT_VERDICTS.index("not judged")).tolist() == [3]
     assert [(d.step, d.is_outside) for d in found.divergences] == [(3, False)]
-    assert "1 step was not judged, because numbers are not finite" in found.summary_text
-    assert "no better than zero forces" not in found.summary_text
-    assert "--engine mujoco" in found.summary_text
+    assert "1 step not judged: numbers not finite" in words_of(found)
+    assert "--engine mujoco" in words_of(found)
 
 
 def test_audit_counts_each_verdict_once(boxes):
     found = audit(boxes(EARLY), worlds=2, steps=20, workers=1)
-    counts = {row[0]: int(row[1]) for row in found.table_of_verdicts.cell_texts}
+    verdicts = found.verdicts
+    counts = dict(zip(verdicts["verdict"], verdicts["steps"], strict=True))
     unconverged, wrong = counts["stopped before convergence"], counts["wrong"]
     assert unconverged and wrong
-    assert f": {unconverged} of 40 steps judged in 2 worlds stopped before convergence (" in found.summary_text
-    assert f", and {wrong} are wrong ({2.5 * wrong:.1f} %): no better than zero forces, in " in found.summary_text
-    assert found.table_of_rows.heads[1] == "stopped before convergence or wrong"
-    assert sum(int(row[1]) for row in found.table_of_rows.cell_texts) == unconverged + wrong
+    share = f"({2.5 * unconverged:.1f} %), {wrong} wrong ({2.5 * wrong:.1f} %)."
+    assert f": {unconverged} of 40 steps judged in 2 worlds stopped before convergence {share}" in words_of(found)
+    # The table has the same percentages as the headline.
+    shares = dict(zip(verdicts["verdict"], verdicts["share"], strict=True))
+    assert shares["wrong"] == f"{2.5 * wrong:.1f} %" and f"({shares['stopped before convergence']})" in words_of(found)
+    assert found.worst_rows["steps"].sum() == unconverged + wrong
     assert (found.totals["unconverged"], found.totals["wrong"]) == (unconverged + wrong, wrong)
+    assert len(found.headline) <= 3

@@ -14,8 +14,7 @@ from lavender.audit.settings import MujocoSetting as Setting
 from lavender.audit.simulated_worlds import Runs
 from lavender.audit.step_sizes import StepSizes
 from lavender.audit.tune import Measured, Tuning, mujoco_settings, sweep, tune
-from lavender.audit.tune.mujoco_settings import MujocoStage as Stage
-from lavender.audit.tune.mujoco_settings import list_first_settings
+from lavender.audit.tune.mujoco_settings import Stage, list_first_settings
 
 mj = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[mujoco]'")
 
@@ -46,10 +45,9 @@ def test_a_model_without_actuators_has_settings_too(tmp_path, monkeypatch):
 
 
 def test_the_converged_run_does_not_move_away_from_itself(boxes):
-    runs = Runs(str(boxes()), 1, 20)
-    handle, made = runs.load_model()
-    stage = Stage.from_stretches_of_runs(handle, made, runs, [0], 10)
-    same = stage.judge_setting(Setting.from_options(handle, made, **mujoco_settings.CONVERGED_OPTIONS))
+    runs = Runs.of_model(boxes(), 1, 20)
+    stage = Stage.from_stretches_of_runs(runs, [0], 10)
+    same = stage.judge_setting(Setting.from_options(mj, runs.model, **mujoco_settings.CONVERGED_OPTIONS))
     assert same.motion.max() == 0.0 and same.worst_error < 1e-9
 
 
@@ -77,6 +75,11 @@ def measured(time, error, **options):
     )
 
 
+def html_of(tuning, folder):
+    """Return the page of a tuning."""
+    return tuning.page.write(folder).read_text()
+
+
 def chosen(*some, held=(), threshold=1e-6):
     return Tuning("m.xml", 10, list(some), list(held), threshold)
 
@@ -87,7 +90,7 @@ def test_no_line_is_recommended_if_few_steps_have_contact(with_contact, is_enoug
     contacts = (np.arange(100) < with_contact).astype(int)
     found = replace(chosen(now, quick), sizes=StepSizes(contacts + 1, contacts, True))
     assert bool(found.lines) == is_enough == (not found.reason_without_line)
-    assert ("No setting is recommended: 19 of 100" in found.summary_page.head) != is_enough
+    assert ("No setting is recommended: 19 of 100" in " ".join(found.headline)) != is_enough
     assert "(19.0 %)" in found.reason_without_line or is_enough
     # A model without geoms that can collide is judged by its rows.
     assert replace(found, sizes=StepSizes(contacts + 1, 0 * contacts, False)).lines
@@ -119,12 +122,12 @@ def test_errors_on_the_worlds_held_back_do_not_change_the_choice():
 
 def test_headline_gain_is_the_one_on_the_worlds_held_back():
     now, exact = measured(10.0, 61e-3), measured(10.0, 1e-3, tolerance=1e-9)
-    assert "less" not in chosen(now, exact).summary_page.head
+    assert "less" not in chosen(now, exact).headline[-1]
     held = [measured(10.0, 9e-3), replace(exact, error=np.full(100, 1e-3))]
-    head = chosen(now, exact, held=held).summary_page.head
+    head = chosen(now, exact, held=held).headline[-1]
     assert "In the same time the error can be 9.0 times less on worlds that were held back" in head
     worse = [measured(10.0, 1e-3), replace(exact, error=np.full(100, 2e-3))]
-    assert "No setting is as fast and more accurate" in chosen(now, exact, held=worse).summary_page.head
+    assert "No setting is as fast and more accurate" in chosen(now, exact, held=worse).headline[-1]
 
 
 def test_of_equally_fast_settings_the_largest_iteration_limit_is_recommended():
@@ -146,7 +149,7 @@ def test_a_smaller_worst_error_does_not_hide_a_larger_median():
     assert chosen(now, quick).faster is quick
 
 
-def test_the_fastest_setting_within_a_limit_of_the_error_is_recommended():
+def test_the_fastest_setting_within_a_limit_of_the_error_is_recommended(tmp_path):
     now, quick = measured(10.0, 1e-1), measured(8.0, 1e-2, iterations=9)
     rare, good = measured(11.0, 1e-5, tolerance=1e-5), measured(12.0, 1e-5, tolerance=1e-6)
     rare.error[0] = 0.5  # One step in a hundred: the limit is for every step.
@@ -155,7 +158,7 @@ def test_the_fastest_setting_within_a_limit_of_the_error_is_recommended():
     assert found.within_limit is found.limit_choice is good
     assert found.lines[0] == '<option tolerance="1e-06"/>  <!-- error at most 0.001 m/s, fastest -->'
     assert found.lines[1].endswith("(at most 1.0e-5 in 100 steps)") and "not measured" in found.lines[2]
-    assert "On other states they can be larger" in found.summary_page.render_html()
+    assert "On other states they can be larger" in html_of(found, tmp_path)
     # What exceeds the limit on the worlds held back is not within it.
     refuted = replace(found, held_errors={good.setting: 2e-3})
     assert refuted.within_limit is slow
@@ -165,7 +168,7 @@ def test_the_fastest_setting_within_a_limit_of_the_error_is_recommended():
         "error at most 1e-12 m/s: none of 5 settings; the most accurate is",
         '<option tolerance="1e-15"/>  <!-- most accurate -->',
     ]
-    assert none.summary_page.numbers["is_limit_met"] is False
+    assert none.page.numbers["is_limit_met"] is False
     equal = measured(12.0 * (1.0 + 1e-3), 1e-8, iterations=30)  # within the noise of times
     assert replace(chosen(now, good, equal, slow), error_limit=1e-3).within_limit is equal
     own = replace(chosen(now, slow), error_limit=0.2)
@@ -196,8 +199,8 @@ def test_mujoco_s_defaults_are_measured_and_named(boxes, monkeypatch):
     applied, plain = default.setting.apply_to(mj, model).opt, mj.MjOption()
     assert all(getattr(applied, name) == getattr(plain, name) for name in mujoco_settings.OPTIONS)
     assert model.opt.ls_iterations == 8 and applied.ls_iterations == 50
-    assert found.summary_page.render_html().count("MuJoCo&#39;s defaults: &lt;option") >= 1
-    assert "MuJoCo's defaults" in [row[0] for row in found.terminal_table.cell_texts]
+    (section,) = (s for s in found.page.sections if s.short_frame is not None)
+    assert any(name.startswith("MuJoCo's defaults (") for name in section.short_frame["setting"])
     assert default in found.terminal_settings and found.terminal_settings[0] is found.present_result
     line = replace(chosen(measured(10.0, 1.0), replace(default, times=np.full(10, 1.0)))).lines[0]
     assert line.endswith("<!-- as accurate as now, faster, MuJoCo's defaults -->")
@@ -231,11 +234,11 @@ def test_a_gain_that_the_held_back_worlds_do_not_have_is_told_as_none():
 
 
 @pytest.mark.parametrize("how", [{"stopped": True}, {"busy": "The machine was busy: load 9.0"}])
-def test_lines_of_an_interrupted_or_busy_measurement_are_marked(how):
+def test_lines_of_an_interrupted_or_busy_measurement_are_marked(how, tmp_path):
     now, quick = measured(10.0, 1e-3), measured(8.0, 1e-3, iterations=9)
     found = replace(chosen(now, quick), **how)
     assert found.lines[0].startswith('<option iterations="9"/>  <!-- PROVISIONAL, the m')
-    page = found.summary_page.render_html()
+    page = html_of(found, tmp_path)
     assert "Provisional lines" in page and "Lines to copy" not in page and "measure again" in page
     assert "PROVISIONAL" not in chosen(now, quick).lines[0]
     none = replace(chosen(now), **how)
@@ -246,14 +249,14 @@ def test_a_busy_machine_invalidates_the_times(boxes, monkeypatch):
     fewer(monkeypatch)
     cores = sweep.os.cpu_count()
     monkeypatch.setattr(sweep.machine, "count_runnable_processes", lambda: cores + 2.0)
-    page = tune(boxes(EARLY), worlds=2, steps=10, repeats=1).summary_page
-    assert f"The machine was busy: load {cores + 2:.1f} on {cores} core" in page.warning
-    assert "The times are invalid" in page.warning and page.warning in page.render_html()
+    (note,) = tune(boxes(EARLY), worlds=2, steps=10, repeats=1).page.notes
+    assert f"The machine was busy: load {cores + 2:.1f} on {cores} core" in note
+    assert "The times are invalid" in note
     monkeypatch.setattr(sweep.machine, "count_runnable_processes", lambda: 1.0)
     assert not tune(boxes(EARLY), worlds=2, steps=10, repeats=1).busy
 
 
-def test_ctrl_c_keeps_what_there_is(boxes, monkeypatch):
+def test_ctrl_c_keeps_what_there_is(boxes, monkeypatch, tmp_path):
     fewer(monkeypatch)
 
     def watch(event):
@@ -265,30 +268,30 @@ def test_ctrl_c_keeps_what_there_is(boxes, monkeypatch):
     seen = []
     found = tune(boxes(EARLY), worlds=2, steps=10, repeats=1, watch=watch)
     assert found.stopped and len(found.measured) == 5 and not found.held
-    assert "Stopped before the end" in found.summary_page.render_html()
+    assert "Stopped before the end" in html_of(found, tmp_path)
     assert "not measured" in "".join(found.lines) or found.faster is found.closer is None
 
 
-def test_ctrl_c_before_the_first_round_returns_the_present_setting(boxes, monkeypatch):
+def test_ctrl_c_before_the_first_round_returns_the_present_setting(boxes, monkeypatch, tmp_path):
     fewer(monkeypatch)
-    simulate = sweep.MujocoStage.from_stretches_of_runs.__func__
+    simulate = sweep.Stage.from_stretches_of_runs.__func__
 
-    def stop_after_first_stage(cls, mj, model, runs, worlds, horizon):
+    def stop_after_first_stage(cls, runs, worlds, horizon):
         if runs.steps > horizon:
             raise KeyboardInterrupt
-        return simulate(cls, mj, model, runs, worlds, horizon)
+        return simulate(cls, runs, worlds, horizon)
 
     def stop_at_timing(event):
         if event.case.startswith("timing"):
             raise KeyboardInterrupt
 
     whole = tune(boxes(EARLY), worlds=4, steps=20, repeats=1, watch=stop_at_timing)
-    monkeypatch.setattr(sweep.MujocoStage, "from_stretches_of_runs", classmethod(stop_after_first_stage))
+    monkeypatch.setattr(sweep.Stage, "from_stretches_of_runs", classmethod(stop_after_first_stage))
     brief = tune(boxes(EARLY), worlds=4, steps=20, repeats=1)
     for found, n_steps in ((whole, 2 * 20), (brief, 10)):  # two of the four worlds; one stretch
         assert found.stopped and [m.setting.options for m in found.measured] == [()]
         assert len(found.measured[0].error) == n_steps and not found.held
-        assert "Stopped before the end" in found.summary_page.render_html()
+        assert "Stopped before the end" in html_of(found, tmp_path)
 
 
 def test_worlds_are_simulated_with_a_label_and_without_a_count(boxes, monkeypatch):
@@ -325,29 +328,3 @@ def test_a_setting_with_which_mujoco_ends_in_an_error_is_left_out(boxes, monkeyp
     monkeypatch.setattr(Stage, "judge_setting", lambda self, setting: measured(np.inf, np.inf))
     with pytest.raises(lv.InputError, match="diverge"):
         tune(boxes(), worlds=2, steps=10, repeats=1)
-
-
-def test_settings_of_mujoco_warp_are_measured(boxes, monkeypatch):
-    pytest.importorskip("mujoco_warp")
-    from lavender.audit.tune.world_settings import WarpEngine
-
-    keep_values(monkeypatch, WarpEngine, "table", {1, 1e-2, 20}, {"Newton", ""})
-    found = tune(boxes(EARLY), engine="mujoco_warp", worlds=2, steps=10, repeats=1)
-    by = {m.setting.option_line: m for m in found.measured}
-    one, twenty = (by[f'<option solver="Newton" iterations="{n}"/>'] for n in (1, 20))
-    assert twenty.worst_error < 0.1 * one.worst_error
-    assert all(0.0 < m.mean_step_time < np.inf and len(m.error) == 10 for m in found.measured)
-
-
-def test_settings_of_kamino_are_measured(monkeypatch):
-    pytest.importorskip("newton")
-    from lavender.audit.tune.world_settings import KaminoEngine
-
-    keep_values(monkeypatch, KaminoEngine, "table", {1e-3, 10, 400}, {""})
-    found = tune("boxes_stacked_on_plane", engine="kamino", worlds=2, steps=10, repeats=1)
-    by = {m.setting.option_line: m for m in found.measured}
-    few, many = (by[f"config.padmm.max_iterations = {n}"] for n in (10, 400))
-    assert many.worst_error < 0.1 * few.worst_error and many.worst_motion < few.worst_motion
-    assert "config.padmm.rho_0 = 10.0" in by
-    with pytest.raises(lv.InputError, match="sets its own"):
-        tune("boxes_stacked_on_plane", engine="kamino", control="zero")

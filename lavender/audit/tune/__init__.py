@@ -1,8 +1,8 @@
-"""Choose settings of an engine: measured on worlds of a model (`sweep`), and recommended as lines to copy."""
+"""Choose settings of MuJoCo: measured on worlds of a model (`sweep`), and recommended as lines to copy."""
 
-from lavender.audit.settings import Setting
+from lavender.audit.settings import MujocoSetting
 from lavender.audit.tune.measured import Measured
 from lavender.audit.tune.recommendation import Tuning
-from lavender.audit.tune.sweep import TUNE_ENGINES, tune
+from lavender.audit.tune.sweep import tune
 
-__all__ = ["TUNE_ENGINES", "Measured", "Setting", "Tuning", "tune"]
+__all__ = ["Measured", "MujocoSetting", "Tuning", "tune"]

@@ -1,6 +1,6 @@
 """Settings of an engine, their results, and the timing in which settings alternate.
 
-A `Stage` holds worlds of one engine and measures settings on them. Each world is run with the present setting and cut
+A `Stage` holds worlds of a model and measures settings on them. Each world is run with the present setting and cut
 into stretches of `horizon` steps. Each setting steps from the start of every stretch by itself. Measured are
 
     time    [s] of each step, per world: the minimum of several repeats, in which settings alternate
@@ -10,14 +10,13 @@ into stretches of `horizon` steps. Each setting steps from the start of every st
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from lavender.audit.settings import Setting
+from lavender.audit.settings import MujocoSetting
 from lavender.base.arrays import FloatArray
 from lavender.report import machine
 from lavender.report.runner import Event
@@ -33,7 +32,7 @@ class Measured:
 
     Parameters
     ----------
-    setting : Setting
+    setting : MujocoSetting
     solver : str
     error : (steps,) m/s
     motion : (stretches,) m
@@ -42,7 +41,7 @@ class Measured:
     rows, contacts : (steps,) int
     """
 
-    setting: Setting
+    setting: MujocoSetting
     solver: str
     error: FloatArray = field(repr=False)
     motion: FloatArray = field(repr=False)
@@ -90,49 +89,7 @@ class Progress:
         self.expected -= 1
 
 
-class Stage(ABC):
-    """Worlds of one engine, on which settings are measured."""
-
-    @property
-    @abstractmethod
-    def own_setting(self) -> Setting:
-        """The present setting."""
-
-    @abstractmethod
-    def list_first_settings(self) -> list[Setting]:
-        """List the settings that are tried first; the present one is the first of them."""
-
-    @abstractmethod
-    def list_variants(self, setting: Setting) -> list[Setting]:
-        """List variants of a setting, which are tried if the setting is near the Pareto front of time and error."""
-
-    @abstractmethod
-    def judge_setting(self, setting: Setting) -> Measured:
-        """Judge a setting without timing it; its errors are infinite if a world diverges."""
-
-    @abstractmethod
-    def prepare_timing(self, setting: Setting) -> Callable[[], FloatArray]:
-        """Return a function that runs all stretches with a setting and returns the times of the steps [s]."""
-
-    def time_settings(self, settings: list[Measured], repeats: int, progress: Progress) -> None:
-        """Time the steps of all settings, which alternate in `repeats` rounds; the first is the present setting.
-
-        A setting with which a world diverges is not timed.
-        """
-        settings = [m for m in settings if np.isfinite(m.error).all()]
-        runs = [self.prepare_timing(m.setting) for m in settings]
-        for round_index in range(repeats):
-            for m, run in zip(settings, runs, strict=True):
-                # Compare medians over the steps, so that an interrupted step does not exclude a setting.
-                if round_index and np.median(m.times) > MAX_TIME_RATIO * np.median(settings[0].times):
-                    continue
-                progress.begin_measurement(
-                    "timing", f"round {round_index + 1} of {repeats}, {m.setting.name}"
-                )
-                m.times = np.minimum(m.times, run())
-
-
-def make_unmeasured(setting: Setting, solver: str) -> Measured:
+def make_unmeasured(setting: MujocoSetting, solver: str) -> Measured:
     """Build the result of a setting with which a world diverges: its error, motion and times are infinite."""
     never = np.full(1, np.inf)
     return Measured(setting, solver, never, never, never)

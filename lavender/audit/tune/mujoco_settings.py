@@ -1,4 +1,4 @@
-"""Settings of MuJoCo, and stretches of simulated worlds on which they are measured.
+"""Settings of MuJoCo that `tune` tries, and stretches of simulated worlds on which they are measured.
 
 A stretch is `horizon` steps of a simulated world (`lavender.audit.tune.measured`). Each setting steps from the
 start of each stretch by itself, warm-started from its own answers. A setting with another cone, impratio or number of
@@ -9,24 +9,49 @@ shows how far it deviates, and it is not recommended.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from time import perf_counter
-from types import SimpleNamespace
-from typing import Any
+from types import MappingProxyType, SimpleNamespace
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from lavender.audit.audit import MAX_PROBLEMS_IN_MEMORY
-from lavender.audit.settings import OPTIONS, MujocoSetting, Setting, get_option_value
+from lavender.audit.settings import OPTIONS, MujocoSetting, get_option_value
 from lavender.audit.simulated_worlds import Runs, has_diverged, simulate_world
-from lavender.audit.tune.measured import Measured, Stage, make_unmeasured
-from lavender.audit.tune.tables import MUJOCO, list_options
+from lavender.audit.tune.measured import MAX_TIME_RATIO, Measured, Progress, make_unmeasured
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.batch.residuals import residual_many
 from lavender.io.efc import from_mujoco_many
 
+NOTHING: Mapping[str, Any] = MappingProxyType({})
+
+
+class Field(NamedTuple):
+    """An attribute of `<option>`, the values that are tried, its meaning, and the attributes tried together with it."""
+
+    name: str
+    values: tuple[Any, ...]
+    meaning: str
+    fixed: Mapping[str, Any] = NOTHING
+
+
+NEWTON, CG, PGS = ({"solver": name} for name in ("Newton", "CG", "PGS"))
+TOLERANCES = (1e-3, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15)
+#: Options of MuJoCo, attributes of `<option>`. The last three change the constraint problem itself.
+MUJOCO = (
+    Field("tolerance", TOLERANCES, "improvement below which Newton's method stops", NEWTON),
+    Field("iterations", (1, 2, 3, 5, 10), "budget of Newton's method", NEWTON),
+    Field("tolerance", TOLERANCES, "improvement below which conjugate gradients stop", CG),
+    Field("iterations", (3, 6, 12, 25, 50), "budget of conjugate gradients", CG),
+    Field("tolerance", TOLERANCES, "improvement below which projected Gauss-Seidel stops", PGS),
+    Field("iterations", (3, 6, 12, 25, 50, 100), "budget of projected Gauss-Seidel", PGS),
+    Field("cone", ("pyramidal", "elliptic"), "shape of the friction cone"),
+    Field("impratio", (1.0, 10.0), "stiffness of friction over that of normal contact"),
+    Field("noslip_iterations", (0, 3, 10), "sweeps of friction after the solve"),
+)
 CONVERGED_OPTIONS = {
     "solver": "Newton",
     "iterations": 300,
@@ -43,7 +68,7 @@ def get_default_options(mj: Any) -> dict[str, Any]:
 
 
 @dataclass(eq=False)
-class MujocoStage(Stage):
+class Stage:
     """Worlds of a MuJoCo model on which settings are measured.
 
     Parameters
@@ -64,24 +89,28 @@ class MujocoStage(Stage):
     ends: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
-    def from_stretches_of_runs(
-        cls, mj: Any, model: Any, runs: Runs, worlds: Iterable[int], horizon: int
-    ) -> MujocoStage:
+    def from_stretches_of_runs(cls, runs: Runs, worlds: Iterable[int], horizon: int) -> Stage:
         """Cut worlds that run with the model's own setting into stretches."""
-        starts, controls = [], []
+        mj, model, starts, controls = runs.mj, runs.model, [], []
+        data, kind = mj.MjData(model), mj.mjtState.mjSTATE_INTEGRATION
         for world in worlds:
-            drive = runs.make_controller(model, world)
-            world_controls = np.array([drive(None, step) for step in range(runs.steps)])
-            ctrl = world_controls.reshape(runs.steps // horizon, horizon, model.nu)
-            starts.append(simulate_world(mj, model, runs, world)[0][::horizon])
-            controls.append(ctrl)
-        configured = cls(mj, model, np.concatenate(starts), np.concatenate(controls))
+            states = simulate_world(runs, world)[0]
+            for state in states:
+                mj.mj_setState(model, data, state, kind)
+                controls.append(np.array(data.ctrl))
+            starts.append(states[::horizon])
+        configured = cls(
+            mj,
+            model,
+            np.concatenate(starts),
+            np.reshape(controls, (len(controls) // horizon, horizon, model.nu)),
+        )
         try:
             configured.ends = configured.run_stretches(
                 MujocoSetting.from_options(mj, model, **CONVERGED_OPTIONS).apply_to(mj, model)
             )[1]
         except mj.FatalError as error:
-            raise InputError(f"{runs.model}: MuJoCo raised an error, {error}") from None
+            raise InputError(f"{runs.name}: MuJoCo raised an error, {error}") from None
         return configured
 
     def run_stretches(self, model: Any, states: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
@@ -108,9 +137,12 @@ class MujocoStage(Stage):
             ends[i] = np.nan if has_diverged(mj, data) else data.xpos
         return step_times, ends
 
-    def judge_setting(self, setting: Setting) -> Measured:
+    def get_solver(self, setting: MujocoSetting) -> str:
+        """Return the name of MuJoCo's solver with a setting."""
+        return str(get_option_value(self.mj, setting.apply_to(self.mj, self.model), "solver"))
+
+    def judge_setting(self, setting: MujocoSetting) -> Measured:
         """Judge a setting without timing it; its errors are infinite if a world diverges."""
-        assert isinstance(setting, MujocoSetting)
         mj, model = self.mj, setting.apply_to(self.mj, self.model)
         result = make_unmeasured(setting, str(get_option_value(mj, model, "solver")))
         states = np.empty((self.controls.shape[0] * self.controls.shape[1], self.starts.shape[1]))
@@ -138,24 +170,27 @@ class MujocoStage(Stage):
             result, error=np.nan_to_num(np.concatenate(errors), nan=np.inf), motion=distance, **sizes
         )
 
-    @property
-    def own_setting(self) -> Setting:
-        """The model's own setting."""
-        return MujocoSetting()
-
-    def list_first_settings(self) -> list[Setting]:
-        """List the first settings."""
-        return [*list_first_settings(self.mj, self.model)]
-
-    def list_variants(self, setting: Setting) -> list[Setting]:
-        """List variants of a setting."""
-        return [*list_variants(self.mj, self.model, setting)]
-
-    def prepare_timing(self, setting: Setting) -> Callable[[], FloatArray]:
+    def prepare_timing(self, setting: MujocoSetting) -> Callable[[], FloatArray]:
         """Return a function that runs all stretches and returns the time of each step."""
-        assert isinstance(setting, MujocoSetting)
         model = setting.apply_to(self.mj, self.model)
         return lambda: self.run_stretches(model)[0]
+
+    def time_settings(self, settings: list[Measured], repeats: int, progress: Progress) -> None:
+        """Time the steps of all settings, which alternate in `repeats` rounds; the first is the present setting.
+
+        A setting with which a world diverges is not timed.
+        """
+        settings = [m for m in settings if np.isfinite(m.error).all()]
+        runs = [self.prepare_timing(m.setting) for m in settings]
+        for round_index in range(repeats):
+            for m, run in zip(settings, runs, strict=True):
+                # Compare medians over the steps, so that an interrupted step does not exclude a setting.
+                if round_index and np.median(m.times) > MAX_TIME_RATIO * np.median(settings[0].times):
+                    continue
+                progress.begin_measurement(
+                    "timing", f"round {round_index + 1} of {repeats}, {m.setting.name}"
+                )
+                m.times = np.minimum(m.times, run())
 
 
 def list_first_settings(mj: Any, model: Any) -> list[MujocoSetting]:
@@ -164,13 +199,16 @@ def list_first_settings(mj: Any, model: Any) -> list[MujocoSetting]:
     Settings that change the problem are last.
     """
     enough = {"iterations": max(100, int(model.opt.iterations))}
-    tried = [enough | x if "tolerance" in x else x for x in list_options(MUJOCO)]
+    tried = [
+        enough | x if "tolerance" in x else x
+        for x in ({**f.fixed, f.name: x} for f in MUJOCO for x in f.values)
+    ]
     own = MujocoSetting.from_options(mj, model)
     default = replace(MujocoSetting.from_options(mj, model, **get_default_options(mj)), is_default=True)
     return list(dict.fromkeys([own, default, *(MujocoSetting.from_options(mj, model, **x) for x in tried)]))
 
 
-def list_variants(mj: Any, model: Any, setting: Setting) -> list[MujocoSetting]:
+def list_variants(mj: Any, model: Any, setting: MujocoSetting) -> list[MujocoSetting]:
     """List variants of a setting: other line searches, and dense instead of sparse J or the reverse."""
     options = dict(setting.options)
     stored = "dense" if mj.mj_isSparse(model) else "sparse"

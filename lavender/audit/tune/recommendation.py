@@ -5,26 +5,25 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lavender.audit.settings import Setting
+from lavender.audit.page import ResultPage
+from lavender.audit.settings import MERGE_NOTE, MujocoSetting
 from lavender.audit.step_sizes import StepSizes, describe_exceedance
 from lavender.audit.tune.measured import Measured
 from lavender.base.deadline import format_seconds
 from lavender.problem.derived import cached_property
 from lavender.report.figures import Curve, Figure
-from lavender.report.summary_page import PageSection, SummaryPage
-from lavender.report.table import Cell, Table
+from lavender.report.render import Section
 from lavender.report.text import format_ratio, format_size
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 # Times that differ by at most this fraction count as equal: noise is a few per cent.
 TIME_NOISE_FRACTION = 0.05
-# The terminal shows up to this many settings of the front that are slower than the present one.
-N_SLOWER_ROWS = 4
-# The error of each of these does not exceed this fraction of the error of the one before.
-MAX_ERROR_RATIO = 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +49,7 @@ class Tuning:
         Rows and contacts of the steps of all worlds with the model's own setting.
     busy : str
         A warning if other processes used the processors during the timing; else empty.
-    notes : str
+    notes : tuple of str
         Sentences about the differences from a simulation of the model as it is: no sleep, a smaller spread.
     n_held_worlds : int
         Number of worlds held back.
@@ -68,10 +67,10 @@ class Tuning:
     stopped: bool = False
     sizes: StepSizes | None = None
     busy: str = ""
-    notes: str = ""
+    notes: tuple[str, ...] = ()
     n_held_worlds: int = 0
     error_limit: float | None = None
-    held_errors: Mapping[Setting, float] = field(default_factory=dict)
+    held_errors: Mapping[MujocoSetting, float] = field(default_factory=dict)
 
     @property
     def present_result(self) -> Measured:
@@ -168,7 +167,7 @@ class Tuning:
 
     @property
     def most_accurate(self) -> Measured:
-        """Setting with the smallest maximum error on all worlds on which it was judged."""
+        """MujocoSetting with the smallest maximum error on all worlds on which it was judged."""
         return min(self._same_problem, key=self._compute_largest_error)
 
     @property
@@ -259,9 +258,8 @@ class Tuning:
         description = f"{self._provisional_prefix}{description}"
         held = self._find_held_back(m)
         line = m.setting.option_line
-        comment = m.setting.comment.format(description)
         return [
-            f"{line}  {comment}" if line else f"{description}: {m.setting.name}",
+            f"{line}  <!-- {description} -->" if line else f"{description}: {m.setting.name}",
             f"    chosen on: {comparison}",
             f"    held back: {'not measured' if held is None else _format_with_largest_error(held, self.held[0])}",
         ]
@@ -282,7 +280,7 @@ class Tuning:
                 )
             if len(self.held) > 1 and self.n_held_worlds:
                 sentences.append(describe_exceedance(self.n_held_worlds))
-            sentences.append(self.present_result.setting.merge_note)
+            sentences.append(MERGE_NOTE)
         return " ".join(filter(None, sentences))
 
     def _describe_gain(self) -> str:
@@ -292,54 +290,35 @@ class Tuning:
             return ""
         error, before = tested.worst_error, self.held[0].worst_error
         if error >= before:
-            return " No setting is as fast and more accurate on the worlds held back."
+            return "No setting is as fast and more accurate on the worlds held back."
         gain = f"{format_ratio(before / error)} less" if error else "exactly 0"
-        return f" In the same time the error can be {gain} on worlds that were held back from the choice."
+        return f"In the same time the error can be {gain} on worlds that were held back from the choice."
 
-    def _build_table_of_settings(self, settings: Iterable[Measured]) -> Table:
+    def _tabulate_settings(self, settings: Iterable[Measured]) -> pd.DataFrame:
         """Build the table of some settings."""
-        rows: list[list[str | Cell]] = [
-            [
-                m.setting.name if m.setting.options else "model's own setting", Cell.time(m.mean_step_time),
-                f"{m.mean_step_time / self.present_result.mean_step_time:.2f}", Cell.size(m.worst_error),
-                Cell.size(float(m.error.max())), Cell.size(m.worst_motion),
-            ]
+        import pandas as pd
+
+        now = self.present_result.mean_step_time
+        rows = [
+            (m.setting.short_name, f"{m.mean_step_time / now:.2f}", m.worst_error, float(m.error.max()),
+             m.mean_step_time, m.worst_motion)
             for m in settings
         ]  # fmt: skip
-        motion = f"motion after {self.horizon} [m]"
-        heads = ["setting", "a step", "relative time", "error 99 % [m/s]", "worst", motion]
-        return Table(heads, rows, words=frozenset({"setting"}))
-
-    @property
-    def terminal_table(self) -> Table:
-        """Table of `terminal_settings`, narrow enough for a terminal of 80 columns."""
-        now = self.present_result.mean_step_time
-        rows: list[list[str | Cell]] = [
-            [m.setting.short_name, f"{m.mean_step_time / now:.2f}", Cell.size(m.worst_error),
-             Cell.size(float(m.error.max()))]
-            for m in self.terminal_settings
-        ]  # fmt: skip
-        heads = ["setting", "relative time", "error 99 % [m/s]", "worst"]
-        return Table(heads, rows, words=frozenset({"setting"}))
+        motion = f"motion after {self.horizon} steps [m]"
+        heads = ["setting", "relative time", "error 99 % [m/s]", "largest error [m/s]", "a step [s]", motion]
+        return pd.DataFrame(rows, columns=heads)
 
     @property
     def terminal_settings(self) -> list[Measured]:
         """Settings in the table of the terminal: the present one first, the others by time.
 
-        The others are MuJoCo's defaults; of the Pareto front the fastest setting, the one with the smallest error
-        in the present time, and up to `N_SLOWER_ROWS` that take more time, with the smallest error of all.
+        The others are MuJoCo's defaults, and of the Pareto front the fastest, the last one in the present time,
+        and the last one, which have the smallest errors.
         """
         now, front = self.present_result, self.pareto_front
-        max_time = (1.0 + TIME_NOISE_FRACTION) * now.mean_step_time
-        slower: list[Measured] = []
-        for m in front:
-            last_error = slower[-1].worst_error if slower else np.inf
-            if m.mean_step_time > max_time and m.worst_error <= MAX_ERROR_RATIO * last_error:
-                slower.append(m)
-        quick = [m for m in front if m.mean_step_time <= max_time]
-        spaced = np.linspace(0, max(0, len(slower) - 1), min(N_SLOWER_ROWS, len(slower))).round().astype(int)
+        quick = [m for m in front if m.mean_step_time <= (1.0 + TIME_NOISE_FRACTION) * now.mean_step_time]
         defaults = [m for m in self._same_problem if m.setting.is_default]
-        shown = dict.fromkeys([*quick[:1], *quick[-1:], *(slower[i] for i in spaced.tolist()), *defaults])
+        shown = dict.fromkeys([*quick[:1], *quick[-1:], front[-1], *defaults])
         shown.pop(now, None)
         return [now, *sorted(shown, key=lambda m: m.mean_step_time)]
 
@@ -362,42 +341,46 @@ class Tuning:
                       "error that 1 % of the steps exceed [m/s]", tuple(parts), x_log=True)  # fmt: skip
 
     @property
-    def summary_page(self) -> SummaryPage:
-        """Page with the result in a sentence, figures and tables, as `lavender tune` writes it."""
+    def headline(self) -> list[str]:
+        """Time and error of the present setting, the gain, and the reason if no line is recommended."""
         now = self.present_result
-        head = (
-            f"{Path(self.model).name}: a step takes {format_seconds(now.mean_step_time)}, and 1 % of the steps "
-            f"have errors above {format_size(now.worst_error)} m/s."
+        own = (
+            f"{self.model}: a step takes {format_seconds(now.mean_step_time)}, and 1 % of the steps have errors above "
+            f"{format_size(now.worst_error)} m/s."
         )
-        head += self._describe_gain()
-        if self.reason_without_line:
-            head += f" {self.reason_without_line}"
+        return [own, *filter(None, (self._describe_gain(), self.reason_without_line))]
+
+    @property
+    def page(self) -> ResultPage:
+        """Page with the result in sentences, figures and tables, as `lavender tune` writes it."""
+        now = self.present_result
         other = [m for m in self.measured if m.setting.changes_problem]
         shown = [now, *(m for m in self.pareto_front if m is not now)]
         every = sorted(self.measured, key=lambda m: m.mean_step_time)
-        sizes = [] if self.sizes is None else [self.sizes.size_table]
         figures = [] if self.reason_without_line else [self.figure]
-        return SummaryPage(
-            "lavender tune", head,
-            [
-                PageSection("Provisional lines" if self.reason_provisional else "Lines to copy", code=self.lines,
-                     note=self._lines_note),
-                PageSection("Rows and contacts", sizes, short=2,
-                     note="Rows and contacts of the steps with the model's own setting."),
-                PageSection("Fastest settings by error", [self._build_table_of_settings(shown)], figures,
-                     terminal_table=self.terminal_table),
-                PageSection("Other problems", [self._build_table_of_settings(other)], short=2,
-                     note="Settings that change the problem: the error is that of its own problem."),
-                PageSection("Every setting", [self._build_table_of_settings(every)],
-                     note="Settings with which a world diverges are left out."),
+        title = "Provisional lines" if self.reason_provisional else "Lines to copy"
+        short = self._tabulate_settings(self.terminal_settings).iloc[:, :4]
+        numbers = {
+            "model": self.model, "lines": self.lines, "why_no_line": self.reason_without_line, "busy": self.busy,
+            "error_limit": self.error_limit,
+            "is_limit_met": None if self.error_limit is None else self.within_limit is not None,
+            **({} if self.sizes is None else self.sizes.as_dict), "stopped": self.stopped,
+            "measured": list(map(_to_dict, self.measured)), "held": list(map(_to_dict, self.held)),
+        }  # fmt: skip
+        sizes = [] if self.sizes is None else [self.sizes.table]
+        return ResultPage(
+            title="lavender tune", headline=self.headline, sections=[
+                Section(title, code=self.lines, note=self._lines_note),
+                Section("Rows and contacts", sizes, short=2,
+                        note="Rows and contacts of the steps with the model's own setting."),
+                Section("Fastest settings by error", [self._tabulate_settings(shown)], figures=figures,
+                        short_frame=short),
+                Section("Other problems", [self._tabulate_settings(other)], short=2,
+                        note="Settings that change the problem: the error is that of its own problem."),
+                Section("Every setting", [self._tabulate_settings(every)],
+                        note="Settings with which a world diverges are left out."),
             ],
-            {"model": self.model, "lines": self.lines, "why_no_line": self.reason_without_line, "busy": self.busy,
-             "error_limit": self.error_limit,
-             "is_limit_met": None if self.error_limit is None else self.within_limit is not None,
-             **({} if self.sizes is None else self.sizes.as_dict), "stopped": self.stopped,
-             "measured": [_to_dict(m) for m in self.measured], "held": [_to_dict(m) for m in self.held]},
-            stopped=self.stopped,
-            warning=" ".join(filter(None, (self.notes, self.busy))),
+            numbers=numbers, notes=list(filter(None, (*self.notes, self.busy))), is_stopped=self.stopped,
         )  # fmt: skip
 
 

@@ -1,8 +1,7 @@
-"""Measure an engine's settings on worlds of one model or scene: time of a step, error, and the line to copy.
+"""Measure settings of MuJoCo on worlds of one model: time of a step, error, and the line to copy.
 
     result = tune("ant.xml", worlds=16, steps=200)
-    result.faster, result.closer; result.summary_page.write("lavender-tune")
-    tune("scene.py", engine="kamino")
+    result.faster, result.closer; result.page.write("lavender-tune")
 
 Settings are chosen on the worlds with even numbers. The chosen settings are tested on the worlds with odd numbers,
 which are held back. `lavender.audit.tune.measured` describes the measurements. If less than the fraction
@@ -11,42 +10,47 @@ which are held back. `lavender.audit.tune.measured` describes the measurements. 
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lavender.audit.settings import Setting
-from lavender.audit.simulated_worlds import SPREADS, Runs, can_any_geoms_collide, count_engine_warnings
+from lavender.audit.audit import hash_parameters
+from lavender.audit.pieces import Judging
+from lavender.audit.settings import MujocoSetting
+from lavender.audit.simulated_worlds import Runs, can_any_geoms_collide, count_engine_warnings
 from lavender.audit.step_sizes import StepSizes
-from lavender.audit.tune.measured import Measured, Progress, Stage
-from lavender.audit.tune.mujoco_settings import MujocoStage
+from lavender.audit.tune.measured import Measured, Progress, make_unmeasured
+from lavender.audit.tune.mujoco_settings import Stage, list_first_settings, list_variants
 from lavender.audit.tune.recommendation import Tuning
-from lavender.audit.tune.world_settings import make_kamino_stages, make_warp_stages
 from lavender.base.arrays import check_float, check_int
-from lavender.base.errors import InputError, check_name
+from lavender.base.errors import InputError
 from lavender.io.efc import from_mujoco_many
 from lavender.io.start_states import Control
+from lavender.io.stored import write_arrays
 from lavender.judge.residuals import DEFAULT_THRESHOLD
 from lavender.report import machine
 from lavender.report.runner import Event
 
-TUNE_ENGINES = ("mujoco", "mujoco_warp", "kamino")
 # After this many rounds of timing, variants of the settings near the Pareto front are tried.
 N_TRIAL_ROUNDS = 2
-# Variants of a setting on the Pareto front are tried if it takes at most this multiple of the present setting's time.
+# Variants of a setting on the Pareto front are tried if it takes up to this multiple of the present setting's time.
 MAX_VARIED_TIME_RATIO = 1.5
 # Assumed number of settings with variants that are tried, to estimate the remaining time.
 EXPECTED_VARIED_SETTINGS = 4
 TUNE_BUSY_CONSEQUENCE = "The times are invalid; measure again on an idle machine."
+JUDGED_FILE = "judged.npz"  # Errors of the settings judged, which a later call reuses.
 
 
 def tune(
-    model: str | os.PathLike[str],
+    model: Any,
     *,
-    engine: str = "mujoco",
     worlds: int = 16,
     steps: int = 200,
     control: Control = "random",
@@ -57,21 +61,20 @@ def tune(
     repeats: int = 5,
     threshold: float = DEFAULT_THRESHOLD,
     max_velocity_error: float | None = None,
+    folder: str | os.PathLike[str] | None = None,
+    reuse: bool = True,
     watch: Callable[[Event], None] | None = None,
 ) -> Tuning:
-    """Measure an engine's settings on worlds of a model or scene.
+    """Measure settings of MuJoCo on worlds of a model.
 
     Parameters
     ----------
-    model : path (MJCF)
-        For "kamino" the path of a Python file or a name, as for `lavender.audit.engine_scenes.step_scene`.
-    engine : {"mujoco", "mujoco_warp", "kamino"}
-        The last two step all worlds at once; the time of a step is divided by the number of worlds.
+    model : path of a model (MJCF, .mjb) or mujoco.MjModel
     worlds, steps, control, seed, spread
         See `Runs` and, for the default spread, `audit`. Half of the worlds are held back; `steps` is a multiple of
-        `horizon`. Scenes of Kamino set their own controls.
+        `horizon`.
     states : path of an .npz, "keyframes", or arrays, optional
-        States in which the worlds start: see `audit`, and for "kamino" `lavender.audit.engine_scenes`.
+        States in which the worlds start: see `audit`.
     horizon : int
         Number of steps of a stretch.
     repeats : int
@@ -80,6 +83,9 @@ def tune(
         Errors [m/s] and distances [m] up to this number count as accurate enough.
     max_velocity_error : float, m/s, optional
         Also recommend the fastest setting with an error of at most this number in every step of all worlds.
+    folder : path, optional
+        The errors of the settings judged are written there, and errors of an earlier call with the same model and
+        parameters are reused from there, unless `reuse` is false. Times are always measured again.
     watch : callable, optional
         Called with the progress.
 
@@ -92,105 +98,91 @@ def tune(
     Raises
     ------
     InputError
-        The model cannot be read, the engine is not installed, there are fewer than two worlds, or `horizon` does not
-        divide `steps`.
+        The model cannot be read, there are fewer than two worlds, or `horizon` does not divide `steps`.
     CapabilityError
-        MuJoCo does not store the matrix of the integrator "discrete" (see `lavender.io.from_mujoco`), or a world has
-        more rows than the engine has memory for.
-    UnknownName
-        The engine is unknown.
+        MuJoCo does not store the matrix of the integrator "discrete" (see `lavender.io.from_mujoco`).
     """
-    check_name("engine", engine, TUNE_ENGINES)
     worlds = check_int("worlds", worlds, 2, None)
     horizon, repeats = check_int("horizon", horizon, 1, None), check_int("repeats", repeats, 1, None)
-    threshold, name = check_float("threshold", threshold, low=0.0), os.fspath(model)
+    threshold = check_float("threshold", threshold, low=0.0)
     if spread is not None:
         check_float("spread", spread, low=0.0)
-    if max_velocity_error is not None:
-        max_velocity_error = check_float("max_velocity_error", max_velocity_error, low=0.0)
+    error_limit = max_velocity_error
+    if error_limit is not None:
+        error_limit = check_float("max_velocity_error", error_limit, low=0.0)
     if check_int("steps", steps, 1, None) % horizon:
         raise InputError(f"steps is {steps} and horizon is {horizon}; steps must be a multiple of horizon")
-    if engine == "kamino":
-        if control != "random":
-            raise InputError(
-                "control needs a model of MuJoCo; a scene of kamino sets its own controls: leave it out"
-            )
-        start = {"states": states, "spread": SPREADS[0] if spread is None else spread, "seed": seed}
-        return run_tuning(
-            lambda: make_kamino_stages(name, worlds, steps, horizon, **start),
-            name, horizon, repeats, threshold, can_touch=True, n_held_worlds=worlds // 2,
-            error_limit=max_velocity_error, watch=watch, first_phase="compiling kamino, then simulating the worlds",
-        )  # fmt: skip
-    runs = Runs(name, worlds, steps, control=control, seed=seed).with_start_states(states)
-    note = ""
-    mj, configured = runs.load_model()
+    runs = Runs.of_model(model, worlds, steps, control=control, seed=seed).with_start_states(states)
     # Raise the error of an unsupported model here, before any world is simulated.
-    from_mujoco_many(configured, np.zeros((0, configured.nq + configured.nv)))
-
-    def make_stages() -> Sequence[Stage]:
-        """Simulate all worlds; return the stages of the worlds with even numbers and of those with odd numbers."""
-        nonlocal runs, note
-        runs, note = runs.choose_spread() if spread is None else (replace(runs, spread=spread), "")
-        if engine == "mujoco_warp":
-            return make_warp_stages(mj, configured, runs, horizon)
-        return [
-            MujocoStage.from_stretches_of_runs(mj, configured, runs, range(i, worlds, 2), horizon)
-            for i in (0, 1)
-        ]
-
-    def make_first_stage() -> Stage:
-        """Simulate the first stretch of world 0, which starts without noise."""
-        first = replace(runs, steps=horizon)
-        return MujocoStage.from_stretches_of_runs(mj, configured, first, range(1), horizon)
-
-    with count_engine_warnings(mj):  # Settings with which worlds diverge are left out.
-        tuning = run_tuning(
-            make_stages, name, horizon, repeats, threshold, can_touch=can_any_geoms_collide(mj, configured),
-            n_held_worlds=worlds // 2, error_limit=max_velocity_error, watch=watch,
-            make_first_stage=make_first_stage if engine == "mujoco" else None,
-            first_phase=f"{'simulating' if engine == 'mujoco' else f'compiling {engine}, then simulating'} the worlds",
-        )  # fmt: skip
-    return replace(tuning, notes=" ".join(filter(None, (runs.sleep_note, note))))
+    from_mujoco_many(runs.model, np.zeros((0, runs.model.nq + runs.model.nv)))
+    can_touch = can_any_geoms_collide(runs.mj, runs.model)
+    key = hash_parameters(replace(runs, name=""), Judging("float64", threshold), spread)
+    judged = JudgedSettings(folder, reuse, f"{key}, {worlds} worlds, horizon {horizon}")
+    with count_engine_warnings(runs.mj):  # Settings with which worlds diverge are left out.
+        return _run_tuning(runs, spread, horizon, repeats, threshold, can_touch, error_limit, judged, watch)
 
 
-def run_tuning(
-    make_stages: Callable[[], Sequence[Stage]],
-    model: str,
-    horizon: int,
-    repeats: int,
-    threshold: float,
-    *,
-    can_touch: bool,
-    n_held_worlds: int,
-    error_limit: float | None = None,
-    watch: Callable[[Event], None] | None = None,
-    make_first_stage: Callable[[], Stage] | None = None,
-    first_phase: str = "simulating the worlds",
-) -> Tuning:
-    """Measure settings on one stage, and measure the chosen settings on a second stage.
+class JudgedSettings:
+    """Results of settings without times, kept in a file.
 
     Parameters
     ----------
-    make_stages : callable
-        Returns the stage on which settings are chosen, and the stage of the worlds held back.
-    model : str
-        Name in messages and tables.
-    horizon, repeats, threshold, watch
-        As for `tune`.
-    can_touch : bool
-        Whether bodies of the model can collide, see `StepSizes`.
-    n_held_worlds : int
-        Number of worlds held back.
-    error_limit : float, m/s, optional
-        Also choose the fastest setting whose error does not exceed this number on both stages.
-    make_first_stage : callable, optional
-        Returns a small stage, on which the present setting is measured first: the result of a measurement that Ctrl-C
-        stops before this setting is measured on the other stages.
-    first_phase : str
-        Shown until the first measurement.
+    folder : path or None
+        Folder of the file; None: nothing is kept.
+    reuse : bool
+        Whether to read the file of an earlier call.
+    key : str
+        Description of the model and the parameters; a file with another one is replaced.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str] | None, reuse: bool, key: str) -> None:
+        self.path = None if folder is None else Path(folder) / JUDGED_FILE
+        self.key, self.n_reused = key, 0
+        self.arrays: dict[str, Any] = {}
+        if self.path is not None and reuse:
+            with suppress(OSError, ValueError, KeyError), np.load(self.path, allow_pickle=False) as file:
+                if str(file["key"]) == key:
+                    self.arrays = {name: file[name] for name in file.files if name != "key"}
+
+    @property
+    def note(self) -> str:
+        """Sentence on the number of reused results; empty if there are none."""
+        return f"The errors of {self.n_reused} settings are reused (--no-reuse)." * bool(self.n_reused)
+
+    def judge(self, stage: Stage, half: int, setting: MujocoSetting) -> Measured:
+        """Return the judged result of a setting on a stage of even (0) or odd (1) worlds."""
+        options = hashlib.sha256(json.dumps(setting.options).encode()).hexdigest()[:16]
+        names = {name: f"{options}_{half}_{name}" for name in ("error", "motion", "rows", "contacts")}
+        solver = stage.get_solver(setting)
+        if names["error"] in self.arrays:
+            self.n_reused += 1
+            result = make_unmeasured(setting, solver)
+            return replace(result, **{name: self.arrays[key] for name, key in names.items()})
+        result = stage.judge_setting(setting)
+        self.arrays |= {key: np.asarray(getattr(result, name)) for name, key in names.items()}
+        if self.path is not None:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            write_arrays(self.path, {**self.arrays, "key": np.array(self.key)})
+        return result
+
+
+def _run_tuning(
+    runs: Runs,
+    spread: float | None,
+    horizon: int,
+    repeats: int,
+    threshold: float,
+    can_touch: bool,
+    error_limit: float | None,
+    judged: JudgedSettings,
+    watch: Callable[[Event], None] | None,
+) -> Tuning:
+    """Measure settings on the worlds with even numbers, and the chosen settings on the others.
+
+    The parameters are described in `tune`; `can_touch` states whether bodies of the model can collide.
     """
     progress = Progress(watch)
-    held_errors: dict[Setting, float] = {}
+    held_errors: dict[MujocoSetting, float] = {}
     measured: list[Measured] = []
     held: list[Measured] = []
     early: list[Measured] = []  # The present setting, timed once; the result until the first round of timing.
@@ -201,16 +193,17 @@ def run_tuning(
         timed = [m for m in measured if np.isfinite(m.mean_step_time)] or early
         busy = machine.make_busy_warning(progress.loads, os.cpu_count() or 1, TUNE_BUSY_CONSEQUENCE)
         return Tuning(
-            model, horizon, timed, held, threshold=threshold, stopped=stopped, sizes=sizes, busy=busy,
-            n_held_worlds=n_held_worlds, error_limit=error_limit, held_errors=dict(held_errors),
+            runs.name, horizon, timed, held, threshold=threshold, stopped=stopped, sizes=sizes, busy=busy,
+            n_held_worlds=runs.worlds // 2, error_limit=error_limit, held_errors=dict(held_errors),
+            notes=tuple(filter(None, (*runs.notes, note, judged.note))),
         )  # fmt: skip
 
-    def judge(stage: Stage, settings: list[Setting]) -> list[Measured]:
+    def judge(stage: Stage, settings: list[MujocoSetting]) -> list[Measured]:
         """Return the judged results of settings on a stage."""
         results = []
         for setting in settings:
             progress.begin_measurement("judging", setting.name)
-            results.append(stage.judge_setting(setting))
+            results.append(judged.judge(stage, int(stage is held_back), setting))
         return results
 
     def measure_early(stage: Stage, judged: Measured) -> None:
@@ -222,15 +215,19 @@ def run_tuning(
             early[:] = [timed]
             sizes = StepSizes(timed.rows, timed.contacts, can_touch)
 
+    note = ""
     if watch is not None:
-        watch(Event(0, 0, first_phase, ""))
+        watch(Event(0, 0, "simulating the worlds", ""))
     try:
-        if make_first_stage is not None:
-            first_stage = make_first_stage()
-            measure_early(first_stage, first_stage.judge_setting(first_stage.own_setting))
-        stage, held_back = make_stages()
-        own, first_settings = stage.own_setting, stage.list_first_settings()
-        n_variants = len(stage.list_variants(own)) * EXPECTED_VARIED_SETTINGS
+        # The first stretch of world 0, which starts without noise, gives an early result.
+        first_stage = Stage.from_stretches_of_runs(replace(runs, steps=horizon), range(1), horizon)
+        measure_early(first_stage, first_stage.judge_setting(MujocoSetting()))
+        runs, note = runs.choose_spread() if spread is None else (replace(runs, spread=spread), "")
+        stage, held_back = (
+            Stage.from_stretches_of_runs(runs, range(i, runs.worlds, 2), horizon) for i in (0, 1)
+        )
+        own, first_settings = MujocoSetting(), list_first_settings(runs.mj, runs.model)
+        n_variants = len(list_variants(runs.mj, runs.model, own)) * EXPECTED_VARIED_SETTINGS
         n_first, n_trial = len(first_settings), min(N_TRIAL_ROUNDS, repeats)
         # Three settings on the worlds held back, each timed in twice as many rounds.
         n_held = 3 * (1 + 2 * repeats)
@@ -238,7 +235,7 @@ def run_tuning(
         measured += judge(stage, [own])
         if not np.isfinite(measured[0].error).all():
             raise InputError(
-                f"{model}: worlds diverge with the model's own setting, so other settings cannot be "
+                f"{runs.name}: worlds diverge with the model's own setting, so other settings cannot be "
                 "compared with it: give other controls, states or fewer steps"
             )
         measure_early(stage, measured[0])
@@ -258,7 +255,9 @@ def run_tuning(
             if m.mean_step_time <= MAX_VARIED_TIME_RATIO * measured[0].mean_step_time
         ]
         known = {m.setting for m in measured}
-        more = dict.fromkeys(x for s in [own, *near] for x in stage.list_variants(s) if x not in known)
+        more = dict.fromkeys(
+            x for s in [own, *near] for x in list_variants(runs.mj, runs.model, s) if x not in known
+        )
         progress.expected = len(more) + (len(measured) + len(more)) * repeats + n_held
         measured += judge(stage, list(more))
         stage.time_settings(measured, repeats, progress)
@@ -267,7 +266,7 @@ def run_tuning(
         last += judge(held_back, list(other))
         held_errors |= {m.setting: float(m.error.max()) for m in last}
         # Judge the fastest setting within the limit on the worlds held back; if it exceeds the limit there, the next.
-        tested: dict[Setting, Measured] = {m.setting: m for m in last}
+        tested: dict[MujocoSetting, Measured] = {m.setting: m for m in last}
         while error_limit is not None and (setting := make_result(False).limit_choice.setting) not in tested:
             (tested[setting],) = judge(held_back, [setting])
             held_errors[setting] = float(tested[setting].error.max())

@@ -1,0 +1,282 @@
+"""Audits of models as they are: changed after loading, in an environment, against another model, and resumed."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from calls import BOXES
+from calls import EARLY_BOXES as EARLY
+from mujoco_scene import mj
+
+import lavender as lv
+from lavender.audit import audit as module
+from lavender.audit.audit import audit
+from lavender.io.start_states import hash_model, load_model, read_states
+
+
+def judge_forward(model, data):
+    """Return the judge's velocity error [m/s] of MuJoCo's answer in the present state."""
+    copied = mj.MjData(model)
+    state = np.empty(mj.mj_stateSize(model, mj.mjtState.mjSTATE_INTEGRATION))
+    mj.mj_getState(model, data, state, mj.mjtState.mjSTATE_INTEGRATION)
+    mj.mj_setState(model, copied, state, mj.mjtState.mjSTATE_INTEGRATION)
+    mj.mj_forward(model, copied)
+    return lv.residual(lv.io.from_mujoco(model, copied), lv.io.mujoco.impulse(model, copied)).velocity
+
+
+def make_changed_model(options=EARLY):
+    """Return a model whose friction, masses and gravity were changed after loading."""
+    model = mj.MjModel.from_xml_string(BOXES.format(options=options))
+    model.geom_friction[:] *= 0.1
+    model.body_mass[:] *= 3.0
+    model.opt.gravity[0] = 2.0
+    return model
+
+
+def test_audit_judges_the_changed_model_in_memory_and_as_mjb_alike(boxes, tmp_path):
+    model = make_changed_model()
+    mj.mj_saveModel(model, str(tmp_path / "changed.mjb"))
+    data, rng = mj.MjData(model), np.random.default_rng(0)
+    expected = []
+    for _ in range(30):
+        data.ctrl[:] = rng.uniform(-1.0, 1.0, model.nu)
+        expected.append(judge_forward(model, data))
+        mj.mj_step(model, data)
+    for source in (model, tmp_path / "changed.mjb", str(tmp_path / "changed.mjb")):
+        found = audit(source, worlds=1, steps=30, workers=1)
+        np.testing.assert_allclose(found.numbers[0, 0], expected, rtol=1e-6, atol=1e-12)
+    assert not np.allclose(audit(boxes(EARLY), worlds=1, steps=30, workers=1).numbers[0, 0], expected)
+
+
+@pytest.mark.parametrize("source", [3, None, {"qpos": 1}])
+def test_audit_of_another_object_is_an_input_error(source):
+    with pytest.raises(lv.InputError, match=r"the path of a model \(MJCF, .mjb\) or a mujoco.MjModel"):
+        audit(source, worlds=1, steps=2)
+
+
+def test_control_hold_keeps_the_controls_of_the_start_state(boxes, tmp_path):
+    path = boxes(EARLY)
+    model = mj.MjModel.from_xml_path(str(path))
+    states = {"qpos": model.qpos0[None], "qvel": np.zeros((1, model.nv)), "ctrl": np.full((1, model.nu), 0.7)}
+    found = audit(path, worlds=1, steps=10, workers=1, control="hold", states=states)
+    same = audit(path, worlds=1, steps=10, workers=1, control=np.full((1, model.nu), 0.7), states=states)
+    assert (found.numbers == same.numbers).all()
+
+
+class Environment:
+    """An environment of the boxes that changes their friction in each reset and in each step, like randomisation."""
+
+    spec = SimpleNamespace(id="Boxes-v0")
+
+    def __init__(self, length=4, options=EARLY):
+        self.model = mj.MjModel.from_xml_string(BOXES.format(options=options))
+        self.data, self.unwrapped, self.length = mj.MjData(self.model), self, length
+        self.action_space = SimpleNamespace(seed=self.seed_actions, sample=lambda: self.rng.uniform(-1.0, 1.0, 1))
+        self.errors = []  # Of every step, by the judge of one problem.
+
+    def seed_actions(self, seed):
+        self.rng = np.random.default_rng(seed)
+
+    def reset(self, seed=None):
+        self.count = 0
+        if seed is not None:
+            self.random = np.random.default_rng(seed)
+        mj.mj_resetData(self.model, self.data)
+        self.model.geom_friction[:, 0] = self.random.uniform(0.05, 1.0)
+        self.data.qvel[:] = self.random.normal(size=self.model.nv)
+        mj.mj_step(self.model, self.data)  # A step of the reset is not judged.
+        return self.data.qpos.copy(), {}
+
+    def step(self, action):
+        self.data.ctrl[:] = action
+        self.model.body_mass[1] *= 1.01
+        for _ in range(3):
+            self.errors.append(judge_forward(self.model, self.data))
+            mj.mj_step(self.model, self.data)
+        mj.mj_step(self.model, mj.MjData(self.model))  # Data of a planner are not judged.
+        self.count += 1
+        return self.data.qpos.copy(), 0.0, self.count == self.length, False, {}
+
+
+def test_audit_of_an_environment_judges_each_step_with_the_model_at_its_time(tmp_path):
+    env, mj_step = Environment(), mj.mj_step
+    found = audit(env, worlds=2, steps=30, policy=lambda observation: np.sin(observation[:1]))
+    assert mj.mj_step is mj_step and (found.runs.name, found.runs.worlds) == ("Boxes-v0", 2)
+    expected = np.array(env.errors).reshape(2, 30)
+    np.testing.assert_allclose(found.numbers[0], expected, rtol=1e-6, atol=1e-12)
+    assert found.is_unconverged.any() and len(found.worst) == 2
+    found.write(tmp_path)
+    # A state of the environment does not belong to the model that was loaded.
+    loaded = mj.MjModel.from_xml_string(BOXES.format(options=EARLY))
+    assert "are of a model with other bodies" in read_states(mj, loaded, tmp_path / "states.npz").misfit
+    notes = audit(loaded, worlds=1, steps=1, workers=1, states=tmp_path / "states.npz").advice
+    assert any("give the changed model" in note for note in notes)
+
+
+def test_audit_of_an_environment_without_policy_is_reproducible():
+    first, second = (audit(Environment(), worlds=2, steps=12) for _ in range(2))
+    assert (first.numbers[0] == second.numbers[0]).all()
+
+
+class FallingOff(Environment):
+    """An environment whose velocity becomes infinite in its third step."""
+
+    def step(self, action):
+        self.data.ctrl[:] = action
+        if self.count == 2:
+            self.data.qvel[0] = np.inf
+        mj.mj_step(self.model, self.data, nstep=3)
+        self.count += 1
+        return self.data.qpos.copy(), 0.0, False, False, {}
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_audit_of_an_environment_that_diverges_judges_the_steps_before():
+    found = audit(FallingOff(), worlds=2, steps=12)
+    assert (found.n_judged, found.n_unjudged, found.n_diverged) == (12, 12, 2)
+    assert [(d.world, d.step) for d in found.divergences] == [(0, 6), (1, 6)]
+
+
+def test_objects_without_a_model_of_mujoco_are_rejected():
+    env = SimpleNamespace(reset=None, step=None, unwrapped=SimpleNamespace())
+    with pytest.raises(lv.InputError, match=r"no model and data of MuJoCo as env.unwrapped.model"):
+        audit(env)
+    with pytest.raises(lv.InputError, match="policy needs a gymnasium environment"):
+        audit("m.xml", policy=lambda observation: None)
+    with pytest.raises(lv.InputError, match="control has no effect with an environment"):
+        audit(Environment(), control="zero")
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_audit_of_a_gymnasium_environment_counts_its_steps():
+    gymnasium = pytest.importorskip("gymnasium")
+    pytest.importorskip("imageio", reason="needs the extra mujoco of gymnasium")
+    env = gymnasium.make("Hopper-v5")
+    found = audit(env, worlds=2, steps=20)
+    assert found.n_judged == 40 and found.runs.name == "Hopper-v5" and found.rows.max() > 0
+
+
+# -- states that do not fit ----------------------------------------------------------------------------------
+
+WELDED = """<mujoco><worldbody><body name="hand" mocap="true" pos="0 0 1"><geom size=".01" contype="0" conaffinity="0"/>
+  </body><body name="arm" pos="0 0 1"><freejoint/><geom size=".05"/></body></worldbody>
+  <equality><weld name="grip" body1="hand" body2="arm"/></equality></mujoco>"""
+
+
+def test_states_that_violate_a_weld_are_named():
+    """As gymnasium's Fetch does, the weld is changed after loading, and the states belong to the changed weld."""
+    model = mj.MjModel.from_xml_string(WELDED)
+    qpos = model.qpos0.copy()
+    qpos[0] += 0.3
+    states = {"qpos": qpos[None], "qvel": np.zeros((1, model.nv))}
+    assert "violate equality grip by up to 0.3 m or rad" in read_states(mj, model, states).misfit
+    model.eq_data[0, 3] = 0.3  # The arm is 0.3 m in front of the hand.
+    assert read_states(mj, model, states).misfit == ""
+
+
+def test_states_of_a_model_with_other_options_fit(boxes, tmp_path):
+    audit(boxes(EARLY), worlds=2, steps=30, workers=1).write(tmp_path)
+    model = mj.MjModel.from_xml_string(BOXES.format(options='solver="CG" iterations="3"'))
+    assert read_states(mj, model, tmp_path / "states.npz").misfit == ""
+    model.geom_rgba[:] = 0.3  # The appearance does not count.
+    assert hash_model(model) == hash_model(load_model(boxes(EARLY))[1])
+    model.dof_damping[0] = 1.0
+    assert "other bodies, geoms, joints" in read_states(mj, model, tmp_path / "states.npz").misfit
+
+
+# -- against another model -----------------------------------------------------------------------------------
+
+
+def test_against_judges_the_other_model_on_the_same_states(boxes, tmp_path):
+    path, other = boxes(EARLY), tmp_path / "other.xml"
+    other.write_text(BOXES.format(options='solver="Newton" iterations="100" tolerance="1e-15"'))
+    found = audit(path, worlds=2, steps=30, workers=1, against=other)
+    alone = audit(path, worlds=2, steps=30, workers=1)
+    assert found.numbers.tobytes() == alone.numbers.tobytes()
+    model = mj.MjModel.from_xml_path(str(path))
+    converged = mj.MjModel.from_xml_path(str(other))
+    data, rng = mj.MjData(model), np.random.default_rng(0)
+    copied, state = mj.MjData(converged), np.empty(mj.mj_stateSize(model, mj.mjtState.mjSTATE_INTEGRATION))
+    expected = []
+    for _ in range(30):
+        data.ctrl[:] = rng.uniform(-1.0, 1.0, model.nu)
+        mj.mj_getState(model, data, state, mj.mjtState.mjSTATE_INTEGRATION)
+        mj.mj_setState(converged, copied, state, mj.mjtState.mjSTATE_INTEGRATION)
+        expected.append(judge_forward(converged, copied))
+        mj.mj_step(model, data)
+    np.testing.assert_allclose(found.against.numbers[0, 0], expected, rtol=1e-6, atol=1e-13)
+    table = found.comparison
+    assert table.columns.tolist()[1:] == [f"{path.name} [m/s]", "other.xml [m/s]"]
+    assert table.iloc[-1, 1:].tolist() == [alone.numbers[0].max(), found.against.numbers[0].max()]
+    assert "Against other.xml, on the same 60 states" in found.advice[0]
+    found.write(tmp_path / "out")
+    assert (np.load(tmp_path / "out" / "records.npz")["against"] == found.against.numbers[0]).all()
+
+
+def test_against_a_model_with_another_state_is_an_input_error(boxes, tmp_path):
+    (tmp_path / "small.xml").write_text("<mujoco><worldbody/></mujoco>")
+    with pytest.raises(lv.InputError, match="a model with the same state is needed"):
+        audit(boxes(), worlds=1, steps=2, workers=1, against=tmp_path / "small.xml")
+    with pytest.raises(lv.InputError, match="'mujoco' is needed"):
+        audit(boxes(), worlds=1, steps=2, engine="mjx", against=boxes())
+
+
+# -- resume --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("worlds", [4, None])
+def test_an_interrupted_audit_resumes_with_the_numbers_of_an_uninterrupted_one(boxes, tmp_path, monkeypatch, worlds):
+    monkeypatch.setattr(module, "STEPS_PER_TASK", 20)
+    monkeypatch.setattr(module, "choose_world_count", lambda duration, processes: 4)
+    path, judged = boxes(EARLY), []
+    audit_worlds = module.audit_worlds
+    monkeypatch.setattr(module, "audit_worlds", lambda *words: judged.append(words[2]) or audit_worlds(*words))
+
+    def stop(event):
+        if event.done >= 40:
+            raise KeyboardInterrupt
+
+    same = {"worlds": worlds, "steps": 20, "workers": 1, "folder": tmp_path}
+    first = audit(path, **same, watch=stop)
+    assert first.is_stopped and first.n_processed == 40
+    first.write(tmp_path)
+    judged.clear()
+    second = audit(path, **same)
+    n = second.runs.worlds
+    assert [list(x) for x in judged] == [[i] for i in range(2, n)] and not second.is_stopped
+    assert "2 worlds of an earlier audit reused (--no-reuse)." in second.notes
+    whole = audit(path, worlds=n, steps=20, workers=1)
+    assert second.numbers.tobytes() == whole.numbers.tobytes() and second.where == whole.where
+    assert [(w.world, w.step, w.where) for w in second.worst] == [(w.world, w.step, w.where) for w in whole.worst]
+    assert (second.verdict == whole.verdict).all() and (second.contacts == whole.contacts).all()
+    second.write(tmp_path)
+    third = tmp_path / "states.npz"
+    assert len(np.load(third)["state"]) == 3
+    # Another parameter, or --no-reuse, judges everything again.
+    for change in ({"seed": 1}, {"reuse": False}, {"threshold": 1e-3}, {"control": "zero"}):
+        assert not any("reused" in note for note in audit(path, **same | {"worlds": n} | change).notes)
+
+
+def test_results_of_complete_worlds_are_written_while_the_audit_runs(boxes, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "STEPS_PER_TASK", 20)
+    monkeypatch.setattr(module, "SAVE_INTERVAL", 0.0)
+    seen = []
+
+    def watch(event):
+        if (tmp_path / "records.npz").is_file():
+            seen.append(int((np.load(tmp_path / "records.npz")["verdict"] >= 0).sum()))
+
+    audit(boxes(EARLY), worlds=3, steps=20, workers=1, folder=tmp_path, watch=watch)
+    assert seen == sorted(seen) and seen[-1] >= 40
+
+
+def test_numbers_of_an_audit_are_json(boxes, tmp_path):
+    page = audit(boxes(EARLY), worlds=2, steps=20, workers=1).page
+    page.write(tmp_path)
+
+    def reject(word):
+        raise AssertionError(word)
+
+    numbers = json.loads((tmp_path / "numbers.json").read_text(), parse_constant=reject)
+    assert numbers["judged"] == 40
