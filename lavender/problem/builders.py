@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypedDict, TypeVar
@@ -28,11 +28,6 @@ if TYPE_CHECKING:
 
 ProblemT = TypeVar("ProblemT", bound="Builders")
 
-#: Keywords that every method which builds a problem passes on to `Problem`.
-PROBLEM_KEYWORDS = ("name", "names", "key", "friction", "guess", "compliance", "precision", "copy")
-#: Keywords of `from_rows` for the bounds of rows.
-ROW_BOUND_KEYWORDS = ("lower", "upper", "mu", "tangents", "patch_radius", "rolling", "shape")
-
 
 class NewProblemOptions(TypedDict, total=False):
     """Keywords that every method that builds a problem passes on to `Problem`, for type checkers."""
@@ -50,17 +45,6 @@ class ProblemOptions(NewProblemOptions, total=False):
     names: Sequence[str] | None
     friction: str
     compliance: ArrayLike | None
-
-
-def check_keywords(method: str, keywords: Iterable[str], own: Sequence[str] = ()) -> None:
-    """Raise InputError at a keyword that is not in PROBLEM_KEYWORDS; the message lists all.
-
-    `own` names the explicit arguments of `Problem.method`, for the message.
-    """
-    for name in keywords:
-        if name not in PROBLEM_KEYWORDS:
-            valid = ", ".join(f"{word}=" for word in (*own, *PROBLEM_KEYWORDS))
-            raise InputError(f"Problem.{method} has no argument {name}=; it takes {valid}")
 
 
 def check_rhs_length(A: Any, b: FloatArray) -> None:
@@ -84,7 +68,6 @@ class Builders(Operators):
         **more
             Keywords of `Problem`: name, names, ...
         """
-        check_keywords("linear", more)
         b = as_array("b", b, (None,), unit="m/s")
         check_rhs_length(A, b)
         return cls(b, Cones.free(len(b)), A, **more)
@@ -108,7 +91,6 @@ class Builders(Operators):
         **more
             Keywords of `Problem`: name, names, ...
         """
-        check_keywords("lcp", more, ("lower", "upper"))
         b = as_array("b", b, (None,), unit="m/s")
         check_rhs_length(A, b)
         bounds = [
@@ -154,7 +136,6 @@ class Builders(Operators):
             The number of rows does not fit the number of contacts, or mu > 0 for contacts without friction rows. Or
             the contacts would have one tangent, and the rows are also those of contacts with two: give `tangents`.
         """
-        check_keywords("contact", more, ("mu", "patch_radius", "rolling", "tangents"))
         b = as_array("b", b, (None,), unit="m/s")
         check_rhs_length(A, b)
         cones = make_contacts_of_rows("b", len(b), mu, tangents, patch_radius, rolling)
@@ -203,7 +184,6 @@ class Builders(Operators):
         >>> lv.solve(problem, tol=1e-9).impulse.tolist()  # [N s]: the first tangent slides, the second holds
         [10.0, 5.0, -1.0]
         """
-        check_keywords("from_findex", more, ("lower", "upper", "findex"))
         b = as_array("b", b, (None,), unit="m/s")
         order, cones = convert_from_findex(lower, upper, findex, len(b))
         if (order[1:] < order[:-1]).any():
@@ -305,7 +285,6 @@ class Builders(Operators):
         >>> round(float(v * dt), 6)  # m: it rises by its depth
         0.01
         """
-        check_keywords("from_rows", more, ("target", *ROW_BOUND_KEYWORDS))
         if not isinstance(rows, Rows):
             raise InputError(f"rows is a {type(rows).__name__}; a Rows is needed")
         mu = as_array("mu", mu, (rows.n_contacts,))
@@ -387,7 +366,6 @@ class Builders(Operators):
         >>> round(float((inside.generalized.velocity_of(inside.velocity(pushed.impulse)))[0] / 60), 6)  # m
         0.01
         """
-        check_keywords("from_jacobian", more, ("target", "cones", "mu", "tangents", "dof_names"))
         if (cones is None) == (mu is None):
             raise InputError(
                 f"cones and mu are {'missing' if mu is None else 'both given'}; one of them is needed: mu= if all rows "
@@ -472,7 +450,6 @@ class Builders(Operators):
         >>> answer.x.round(9).tolist(), answer.y.round(9).tolist(), answer.z_box.round(9).tolist()
         ([0.3, 0.7], [-1.95], [0.0, 0.1])
         """
-        check_keywords("from_qp", more, ("P", "q", "G", "h", "A", "b", "lb", "ub"))
         qp = make_quadratic_program(unpack_qp_arguments((P, q, G, h, A, b, lb, ub)))
         if qp.is_singular:
             n, m = len(qp.q), len(qp.target)

@@ -56,15 +56,15 @@ if hasattr(os, "register_at_fork"):  # Windows has no fork.
 class cached_property(Generic[T]):
     """A property that is computed at its first use and then stored as an attribute of the object.
 
-    Two threads may compute it at the same time, with identical bits. `functools.cached_property` is not used: before
+    With `is_locked`, one thread computes it while others wait for the lock in `derived` of the object; otherwise two
+    threads may compute it at the same time, with identical bits. `functools.cached_property` is not used: before
     Python 3.12 it holds one lock for all objects, so that threads wait for properties of other problems, and a process
     that is forked at that moment waits forever.
     """
 
-    def __init__(self, function: Callable[[Any], T]) -> None:
-        self.function = function
+    def __init__(self, function: Callable[[Any], T], name: str = "", is_locked: bool = False) -> None:
+        self.function, self.name, self.is_locked = function, name or function.__name__, is_locked
         self.__doc__ = function.__doc__
-        self.name = function.__name__
 
     @overload
     def __get__(self, instance: None, owner: type) -> cached_property[T]: ...
@@ -73,48 +73,40 @@ class cached_property(Generic[T]):
     def __get__(self, instance: object, owner: type) -> T: ...
 
     def __get__(self, instance: Any, owner: type) -> Any:
+        """Compute the property, unless another thread has done so."""
         if instance is None:
             return self
-        return instance.__dict__.setdefault(self.name, self.function(instance))
-
-
-class computed_once(cached_property[T]):
-    """A `cached_property` of an object with `derived`, which one thread computes while others wait."""
-
-    def __get__(self, instance: Any, owner: type) -> Any:
-        """Compute the property under the lock of the object, unless another thread has done so."""
-        if instance is None:
-            return self
-        attributes, cache = instance.__dict__, instance.derived.cache
+        attributes = instance.__dict__
+        if not self.is_locked:
+            return attributes.setdefault(self.name, self.function(instance))
+        cache = instance.derived.cache
         with cache.get(_process) or cache.setdefault(_process, RLock()):
             if self.name not in attributes:
                 attributes[self.name] = self.function(instance)
             return attributes[self.name]
 
 
-class late_field:
-    """A field of a dataclass that is computed, if it was not set, when it is first read; set after the decoration.
+def computed_once(function: Callable[[Any], T]) -> cached_property[T]:
+    """Decorate a property that one thread computes while others wait."""
+    return cached_property(function, is_locked=True)
+
+
+def late_field(name: str) -> cached_property[Any]:
+    """Return a property for a field of a dataclass that is computed, if it was not set, when it is first read.
 
     The attribute `_rest` of the object is a function and its arguments; the function returns the late fields by name.
-    `_late_<name>` is a function and its arguments that compute one field without the others.
     """
 
-    def __init__(self, name: str) -> None:
-        self.name, self.own = name, f"_late_{name}"
-
-    def __get__(self, instance: Any, owner: type) -> Any:
-        """Compute this field, or all fields that were not set, and return this one."""
-        if instance is None:
-            return self
+    def compute(instance: Any) -> Any:
         attributes = instance.__dict__
-        if (own := attributes.get(self.own)) is not None:
-            return attributes.setdefault(self.name, own[0](*own[1]))
         rest = attributes.get("_rest")
         if rest is not None:
             function, arguments = rest
-            for name, value in function(*arguments).items():
-                attributes.setdefault(name, value)  # Another thread may have set an equal value.
+            for field, value in function(*arguments).items():
+                attributes.setdefault(field, value)  # Another thread may have set an equal value.
             attributes.pop("_rest", None)
-        if self.name not in attributes:
-            raise AttributeError(f"{type(instance).__name__!r} object has no attribute {self.name!r}")
-        return attributes[self.name]
+        if name not in attributes:
+            raise AttributeError(f"{type(instance).__name__!r} object has no attribute {name!r}")
+        return attributes[name]
+
+    return cached_property(compute, name)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from functools import wraps
-from inspect import Parameter, signature
+from collections.abc import Iterable
 from math import dist, hypot, inf
-from typing import Any, NoReturn, ParamSpec, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -56,59 +54,6 @@ RANGES: dict[str, dict[str, float]] = {
 RANGES["restitution"]["high"] = 1.0
 
 
-Arguments = ParamSpec("Arguments")
-Result = TypeVar("Result")
-
-
-def check_arguments(method: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Decorate a method of `RowBuilder` so that unknown, missing and surplus arguments raise a helpful InputError."""
-
-    @wraps(method)
-    def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-        try:
-            return method(*args, **kwargs)
-        except TypeError:
-            try:
-                signature(method).bind(*args, **kwargs)
-            except TypeError:
-                reject_call(method, args, kwargs)
-            raise
-
-    return call
-
-
-def reject_call(method: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> NoReturn:
-    """Raise InputError for arguments that a method of `RowBuilder` does not have, or that it needs."""
-    call = "RowBuilder" if method.__name__ == "__init__" else f"RowBuilder.{method.__name__}"
-    valid = dict(list(signature(method).parameters.items())[1:])  # Without `self`.
-    for name in kwargs:
-        if name not in valid:
-            raise InputError(f"{call} has no argument {name}=; it takes {_list(valid)}") from None
-    positional = [name for name, x in valid.items() if x.kind is Parameter.POSITIONAL_OR_KEYWORD]
-    given = len(args) - 1
-    if given > len(positional):
-        others = [name for name in valid if name not in positional]
-        named = f"; give all others by name: {_list(others)}" if others else ""
-        raise InputError(
-            f"{call} takes {len(positional)} positional arguments, {', '.join(positional)}; {given} were given{named}"
-        ) from None
-    for name in positional[:given]:
-        if name in kwargs:
-            raise InputError(f"{call} has {name} twice, by position and by name: leave one out") from None
-    missing = [
-        name for name, x in valid.items()
-        if x.default is Parameter.empty and name not in positional[:given] and name not in kwargs
-    ]  # fmt: skip
-    usage = (
-        ": builder.velocity_after(problem, solution.impulse)" if method.__name__ == "velocity_after" else ""
-    )
-    raise InputError(f"{call} lacks {_list(missing)}{usage}") from None
-
-
-def _list(names: Iterable[str]) -> str:
-    return ", ".join(f"{name}=" for name in names)
-
-
 def name_block(key: int) -> str:
     """Return the default name of a block, such as "hinge 0 of world and body 3", from its key."""
     bodies = ((key >> shift & MAX_KEYED_BODIES) - 1 for shift in (38, 16))
@@ -156,7 +101,6 @@ class RowAssembly:
     convert other types, and word the messages.
     """
 
-    @check_arguments
     def __init__(
         self,
         inv_mass: ArrayLike,

@@ -16,14 +16,7 @@ from lavender.base.arrays import ArrayLike, FloatArray, check_int
 from lavender.base.errors import InputError, check_name
 from lavender.problem.data import Names
 from lavender.problem.problem import Problem
-from lavender.problem.row_assembly import (
-    ARGUMENTS,
-    PLANAR_VELOCITIES,
-    RowAssembly,
-    check_arguments,
-    name_block,
-    reject_call,
-)
+from lavender.problem.row_assembly import ARGUMENTS, PLANAR_VELOCITIES, RowAssembly, name_block
 from lavender.problem.rows import Rows
 
 
@@ -111,7 +104,6 @@ class RowBuilder(RowAssembly):
 
     # -- joints --------------------------------------------------------------------------------------------------
 
-    @check_arguments
     def ball(
         self, a: int | None, b: int | None, anchor: ArrayLike, anchor_b: ArrayLike | None = None,
         *, feature: int | None = None, name: str = "",
@@ -139,7 +131,6 @@ class RowBuilder(RowAssembly):
         """
         return self._add("ball", a, b, feature, name, anchor, anchor_b)
 
-    @check_arguments
     def hinge(
         self, a: int | None, b: int | None, anchor: ArrayLike, axis: ArrayLike | None = None,
         anchor_b: ArrayLike | None = None, axis_b: ArrayLike | None = None,
@@ -161,7 +152,6 @@ class RowBuilder(RowAssembly):
         """
         return self._add("hinge", a, b, feature, name, anchor, anchor_b, axis, axis_b)
 
-    @check_arguments
     def weld(
         self, a: int | None, b: int | None, anchor: ArrayLike, anchor_b: ArrayLike | None = None,
         *, angle_error: ArrayLike = 0.0, feature: int | None = None, name: str = "",
@@ -178,7 +168,6 @@ class RowBuilder(RowAssembly):
         """
         return self._add("weld", a, b, feature, name, anchor, anchor_b, angle_error)
 
-    @check_arguments
     def slider(
         self, a: int | None, b: int | None, anchor: ArrayLike, axis: ArrayLike, anchor_b: ArrayLike | None = None,
         *, angle_error: ArrayLike = 0.0, feature: int | None = None, name: str = "",
@@ -199,7 +188,6 @@ class RowBuilder(RowAssembly):
         """
         return self._add("slider", a, b, feature, name, anchor, anchor_b, axis, angle_error)
 
-    @check_arguments
     def distance(
         self, a: int | None, b: int | None, anchor_a: ArrayLike, anchor_b: ArrayLike, length: float | None = None,
         *, feature: int | None = None, name: str = "",
@@ -218,7 +206,6 @@ class RowBuilder(RowAssembly):
         """
         return self._add("distance", a, b, feature, name, anchor_a, anchor_b, length)
 
-    @check_arguments
     def spring(
         self, a: int | None, b: int | None, anchor_a: ArrayLike, anchor_b: ArrayLike, length: float,
         *, stiffness: float, damping: float = 0.0, feature: int | None = None, name: str = "",
@@ -241,7 +228,6 @@ class RowBuilder(RowAssembly):
         """
         return self._add("spring", a, b, feature, name, anchor_a, anchor_b, length, stiffness, damping)
 
-    @check_arguments
     def motor(
         self, a: int | None, b: int | None, axis: ArrayLike | None = None, *, speed: float,
         max_torque: float | None = None, max_force: float | None = None, anchor: ArrayLike | None = None,
@@ -268,7 +254,6 @@ class RowBuilder(RowAssembly):
         """
         return self._add("motor", a, b, feature, name, axis, anchor, speed, max_torque, max_force)
 
-    @check_arguments
     def limit(
         self, a: int | None, b: int | None, axis: ArrayLike | None = None, *, value: float, lower: float = -inf,
         upper: float = inf, anchor: ArrayLike | None = None, feature: int | None = None, name: str = "",
@@ -296,7 +281,6 @@ class RowBuilder(RowAssembly):
         """
         return self._add("limit", a, b, feature, name, axis, anchor, value, lower, upper)
 
-    @check_arguments
     def gear(
         self, a: int | None, b: int | None, axis_a: ArrayLike | None = None, axis_b: ArrayLike | None = None,
         *, ratio: float, angle_error: float = 0.0, feature: int | None = None, name: str = "",
@@ -319,7 +303,6 @@ class RowBuilder(RowAssembly):
 
     # -- contacts ------------------------------------------------------------------------------------------------
 
-    @check_arguments
     def contact(
         self, a: int | None, b: int | None, point: ArrayLike, normal: ArrayLike, *, gap: float = 0.0, mu: float = 0.0,
         restitution: float = 0.0, restitution_threshold: float = 1.0, tangent: ArrayLike | None = None,
@@ -357,7 +340,6 @@ class RowBuilder(RowAssembly):
 
     # -- arrays of blocks ----------------------------------------------------------------------------------------
 
-    @check_arguments
     def contacts(
         self, bodies: ArrayLike, points: ArrayLike, normals: ArrayLike, *, gap: ArrayLike = 0.0, mu: ArrayLike = 0.0,
         restitution: ArrayLike = 0.0, restitution_threshold: ArrayLike = 1.0, tangents: ArrayLike | None = None,
@@ -395,7 +377,6 @@ class RowBuilder(RowAssembly):
         values = (points, normals, tangents, gap, mu, restitution, restitution_threshold)
         return self._add_many("contact", bodies, feature, names, values)
 
-    @check_arguments
     def joints(
         self, block_type: str, bodies: ArrayLike, *, feature: ArrayLike | None = None,
         names: Sequence[str] | None = None, **arguments: Any,
@@ -423,20 +404,17 @@ class RowBuilder(RowAssembly):
         ------
         InputError
             An argument is invalid; the message has the number of the first invalid joint. No joint is added.
+        TypeError
+            The method has no argument of this name, or an argument is missing.
         """
         check_name("block_type", block_type, [name for name in ARGUMENTS if name != "contact"])
-        method = getattr(type(self), block_type)
-        try:
-            bound = signature(method).bind(self, None, None, **arguments)
-        except TypeError:
-            reject_call(method, (self, None, None), arguments)
+        bound = signature(getattr(type(self), block_type)).bind(self, None, None, **arguments)
         bound.apply_defaults()
         values = [bound.arguments[name.rstrip("?")] for name in ARGUMENTS[block_type]]
         return self._add_many(block_type, bodies, feature, names, values)
 
     # -- results -------------------------------------------------------------------------------------------------
 
-    @check_arguments
     def problem(self, friction: str = "coulomb", *, shape: str = "disk", name: str = "") -> Problem:
         """Return the problem of the blocks added so far, with keys for warm starts and names for reports.
 
@@ -509,7 +487,6 @@ class RowBuilder(RowAssembly):
             raise InputError(f"key is {wanted}; a key that a method of this builder returned is needed")
         return slice(found[0], found[0] + found[1])
 
-    @check_arguments
     def velocity_after(self, problem: Problem, impulse: ArrayLike) -> FloatArray:
         """Return the velocities of the bodies after the step, v + M^-1 J^T impulse.
 

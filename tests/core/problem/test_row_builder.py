@@ -418,7 +418,6 @@ def test_array_calls_repeat_one_vector_and_one_number():
         ({"bodies": [(-1, 0), (-1, 0)], "feature": [1, 1]}, "contact 1: an earlier one of the same bodies"),
         ({"points": np.zeros((3, 3))}, r"point has shape \(3, 3\)"),
         ({"names": ["one"]}, "names has 1 entries for 2"),
-        ({"gaps": 0.1}, r"RowBuilder.contacts has no argument gaps="),
     ],
 )
 def test_invalid_arrays_are_rejected_and_add_nothing(change, message):
@@ -433,9 +432,9 @@ def test_invalid_arrays_are_rejected_and_add_nothing(change, message):
 
 def test_joints_reject_arguments_that_their_method_does_not_have():
     builder = spatial(np.zeros((1, 6)), np.zeros((1, 3)))
-    with pytest.raises(lv.InputError, match=r"RowBuilder.ball has no argument axis=; it takes a=, b=, anchor="):
+    with pytest.raises(TypeError, match="unexpected keyword argument 'axis'"):
         builder.joints("ball", [(-1, 0)], anchor=np.zeros(3), axis=np.zeros(3))
-    with pytest.raises(lv.InputError, match=r"RowBuilder.hinge lacks anchor="):
+    with pytest.raises(TypeError, match="missing a required argument: 'anchor'"):
         builder.joints("hinge", [(-1, 0)], axis=np.ones(3))
     with pytest.raises(lv.InputError, match="hinge 0: axis is None"):
         builder.joints("hinge", [(-1, 0)], anchor=np.zeros(3))
