@@ -1,4 +1,4 @@
-"""The command line `lavender`, with one module for each command.
+"""The command line `lavender`, with one module for each command; `tools` has the small ones.
 
 A command imports its modules when it runs, so that --help is fast.
 """

@@ -31,9 +31,9 @@ COMMAND_GROUPS = {
 }
 #: Module of each command.
 COMMANDS = {
-    name: "lavender.sim.web.command" if name == "web" else f"lavender.cli.{name}"
-    for names in COMMAND_GROUPS.values()
-    for name in names
+    **{name: f"lavender.cli.{name}" for names in COMMAND_GROUPS.values() for name in names},
+    **dict.fromkeys(("explain", "record", "contract", "doctor", "export"), "lavender.cli.tools"),
+    "web": "lavender.sim.web.command",
 }
 
 
