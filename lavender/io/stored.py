@@ -11,15 +11,12 @@ import errno
 import json
 import math
 import os
-import re
 import stat
 import struct
-import time
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from threading import get_native_id
 from tokenize import TokenError
@@ -48,9 +45,6 @@ WITHOUT_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
 # [s] An output counts as locked if its lock is not obtained in this time, which allows several attempts.
 LOCK_TIMEOUT = 0.2
 NUMBER_BYTES = 8  # Bytes of a number in memory: float64, or an index before it is checked.
-TEMPORARY_NAME = re.compile(r"\..*\.(\d+)\.\d+\.part(\.\w+)?")  # Names of files that are not complete yet.
-# [s] Older temporary files are removed: no write takes this long, so their writer was killed.
-MAX_TEMPORARY_AGE = 86400.0
 
 MAX_NPY_HEADER_BYTES = 10_000  # [bytes] A longer .npy header is rejected; 100 bytes are usual.
 MAX_ARCHIVE_ENTRIES = 1000  # Largest accepted number of entries in an archive; a problem has up to 30.
@@ -255,7 +249,6 @@ def write_atomically(path: str | os.PathLike[str], write: Callable[[Path], Any])
     target = resolve_destination(path)
     short = target.name[:TEMPORARY_NAME_CHARACTERS]
     temporary = target.with_name(f".{short}.{os.getpid()}.{get_native_id()}.part")
-    _remove_old_temporaries(target.parent)
     try:
         write(temporary)
         # A new file has no permissions to keep, and some file systems have none.
@@ -267,37 +260,6 @@ def write_atomically(path: str | os.PathLike[str], write: Callable[[Path], Any])
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
-
-
-@lru_cache
-def _remove_old_temporaries(folder: Path) -> None:
-    """Remove temporary files of killed writers from a folder; once per process, since folders can be large."""
-    with contextlib.suppress(OSError):
-        for entry in os.scandir(folder):
-            part = TEMPORARY_NAME.fullmatch(entry.name)
-            if (
-                part
-                and time.time() - entry.stat().st_mtime > MAX_TEMPORARY_AGE
-                and not _is_process_running(int(part[1]))
-            ):
-                os.unlink(entry)
-
-
-def _is_process_running(process: int) -> bool:
-    """Return whether a process of this machine is running, so that its temporary files are not removed.
-
-    A temporary file of a running process may look old if the clock was changed. On Windows, which does not remove open
-    files, the result is False.
-    """
-    if os.name != "posix":
-        return False
-    try:
-        os.kill(process, 0)
-        return True
-    except PermissionError:
-        return True
-    except (OSError, OverflowError):
-        return False
 
 
 def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:

@@ -43,7 +43,6 @@ from lavender.problem.derived import cached_property
 from lavender.problem.friction import (
     MIN_COEFFICIENT_RATIO,
     SHAPES,
-    SPIN_COEFFICIENT_LABEL,
     check_shape,
     convert_ellipse_coefficients,
     make_contact_blocks,
@@ -285,7 +284,10 @@ class Cones:
         >>> skates.shaped("box") == lv.Cones.contacts([(0.02, 0.8)] * 4, shape="box")
         True
         """
-        return cls._from_blocks(make_contact_blocks(mu, tangents, patch_radius, rolling, count, shape))
+        blocks = make_contact_blocks(mu, tangents, patch_radius, rolling, count, shape)
+        if blocks.fault:
+            _raise_fault(FAULT_NAMES[blocks.fault], int(blocks.index), blocks.arrays)
+        return cls._from_blocks(blocks)
 
     @property
     def n_blocks(self) -> int:
@@ -578,7 +580,9 @@ def _raise_fault(fault: str, index: int, fields: tuple[np.ndarray, ...]) -> NoRe
         )
     check_nonnegative_magnitudes("mu", mu, "-")
     check_nonnegative_magnitudes("patch_radius", radius, "m")
-    check_nonnegative_magnitudes(SPIN_COEFFICIENT_LABEL, np.where(kind == ROW, 0.0, mu * radius), "m")
+    check_nonnegative_magnitudes(
+        "mu patch_radius (of boxes and ellipses mu_2)", np.where(kind == ROW, 0.0, mu * radius), "m"
+    )
     check_nonnegative_magnitudes("rolling", rolling, "m")
     raise InputError(f"block {index} is invalid: {fault}")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,6 @@ import numpy as np
 from lavender.base.arrays import FloatArray, as_array, check_int, check_nonnegative_magnitudes, get_shape
 from lavender.base.errors import InputError, check_name
 from lavender_ext.core import blocks as kernels
-from lavender_ext.core.checks import MAX_MAGNITUDE, MIN_MAGNITUDE
 
 *_, BOX_KIND, _, ELLIPSE_KIND = kernels.KINDS
 
@@ -19,21 +19,12 @@ SHAPES = ("disk", "box")
 # Impulses of that size vanish by rounding when they are added to impulses along the second tangent. An ellipse with a
 # smaller ratio of its coefficients is rejected.
 MIN_COEFFICIENT_RATIO = 2.0**-60
-# Messages name the product of mu and patch_radius so.
-SPIN_COEFFICIENT_LABEL = "mu patch_radius (of boxes and ellipses mu_2)"
 
 
 def check_shape(name: str, shape: Any) -> str:
     """Return a shape of friction; raise UnknownName unless it is one of `SHAPES`."""
     check_name(name, shape, SHAPES)
     return shape
-
-
-def check_coefficients(name: str, value: Any, k: int, unit: str = "") -> FloatArray:
-    """Convert coefficients or radii to a checked array (k,), one for each of k contacts."""
-    array = as_array(name, value, (k,), unit=unit or "-")
-    check_nonnegative_magnitudes(name, array, unit or "-")
-    return array
 
 
 def check_friction_combination(
@@ -98,7 +89,7 @@ def convert_ellipse_coefficients(mu: Any) -> tuple[FloatArray, FloatArray | None
 def make_contact_blocks(
     mu: Any, tangents: int, patch_radius: Any, rolling: Any, count: int | None, shape: str
 ) -> kernels.Blocks:
-    """Build the blocks of k contacts with the same rows; `Cones.contacts` describes the arguments."""
+    """Build the blocks of k contacts with the same rows, which may have a fault; `Cones.contacts` has the arguments."""
     if type(tangents) is not int or not 0 <= tangents <= 5:
         tangents = check_int("tangents", tangents, 0, 5)
     is_box = check_shape("shape", shape) == "box"
@@ -116,19 +107,15 @@ def make_contact_blocks(
         pair_kind = 0 if ratio is None else ELLIPSE_KIND
     size_of_mu = 1 if type(mu) is float or np.ndim(mu) == 0 else get_shape("mu", mu)[0]
     k = size_of_mu if count is None else check_int("count", count)
-    if type(mu) is not float or not (mu == 0.0 or MIN_MAGNITUDE <= mu <= MAX_MAGNITUDE):
-        mu = check_coefficients("mu", mu, k)
+    mu = mu if type(mu) is float and isfinite(mu) else as_array("mu", mu, (k,), unit="-")
     if patch_radius is not None:
-        patch_radius = check_coefficients("patch_radius", patch_radius, k, "m")
+        patch_radius = as_array("patch_radius", patch_radius, (k,), unit="m")
     if rolling is not None:
-        rolling = check_coefficients("rolling", rolling, k, "m")
+        rolling = as_array("rolling", rolling, (k,), unit="m")
     if ratio is not None:
         patch_radius = np.ascontiguousarray(np.broadcast_to(ratio, (k,)))
     blocks = kernels.make_contact_blocks(k, tangents, mu, patch_radius, rolling, pair_kind)
     if blocks is None:
-        if patch_radius is not None:
-            spin = np.broadcast_to(mu, (k,)) * patch_radius
-            check_nonnegative_magnitudes(SPIN_COEFFICIENT_LABEL, spin, "m")
         raise InputError(
             f"{k} contacts have more than 2^31 - 1 rows, which 32-bit indices cannot number: split the problem"
         )

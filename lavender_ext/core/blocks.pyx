@@ -220,7 +220,7 @@ cdef Blocks make_equally_bounded_rows(Py_ssize_t m, const double* lower, const d
 
 
 def make_contact_blocks(Py_ssize_t k, int32_t tangents, mu, radius, rolling, int32_t sides=0):
-    """Return k contacts, or None if the arguments need detailed validation.
+    """Return k contacts, whose `fault` is set; None if they have too many rows.
 
     Each contact has `tangents` tangent rows, a spin row if `radius` (k,) is given, and two rolling rows if `rolling` (k,)
     [m], mu_r, is given. mu is a float or an array (k,). `sides` is CONTACT_BOX or CONTACT_ELLIPSE (two tangents; `radius` is
@@ -238,16 +238,10 @@ def make_contact_blocks(Py_ssize_t k, int32_t tangents, mu, radius, rolling, int
         one = mu
     else:
         each = mu
-        if each.shape[0] != k:
-            return None
     if radius is not None:
         patch = radius
-        if patch.shape[0] != k:
-            return None
     if has_rolling:
         moment = rolling
-        if moment.shape[0] != k:
-            return None
     cdef Blocks blocks = allocate_blocks(k, k * size)
     (<int32_t*>blocks.at.ptr)[0] = 0
     for i in range(k):
@@ -257,4 +251,5 @@ def make_contact_blocks(Py_ssize_t k, int32_t tangents, mu, radius, rolling, int
         (<double*>blocks.at.patch_radius)[i] = 0.0 if patch is None else patch[i]
         (<double*>blocks.at.rolling)[i] = moment[i] if has_rolling else 0.0
     write_contact_bounds(&blocks.at)
-    return blocks if blocks.validate() else None
+    blocks.validate()
+    return blocks
