@@ -9,9 +9,10 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.diagnostics.bodies import are_normals_first
 from lavender.diagnostics.diagnostic import Diagnostic, make_diagnostic
+from lavender.judge.certificates import list_conflicting_blocks
 from lavender.judge.residuals import residual
 from lavender.problem import Problem
-from lavender.solvers.certify import find_conflict
+from lavender.solvers.certify import prove_relaxation_infeasible
 
 MAX_PLAUSIBLE_FRICTION = 10.0  # [-] No pair of materials has a larger friction coefficient.
 # Impulses this many times above the momentum of the problem are reported. At the foot of a stack of n bodies they
@@ -190,14 +191,11 @@ def diagnose_conflict(p: Problem) -> Iterator[Diagnostic]:
     """Yield a diagnostic that names the conflicting blocks if the problem provably has no solution."""
     if not 0 < p.m <= MAX_CONFLICT_ROWS or not np.isfinite(p.b).all():
         return
-    proof = find_conflict(p, CONFLICT_TOL)
+    proof = prove_relaxation_infeasible(p, CONFLICT_TOL)
     if proof is not None:
         law = "Of the convex relaxation, " if p.law == "coulomb" else ""
-        reason = law + proof.proof.message + (f"; {proof.advice}" if proof.advice else "")
-        soft = [p.row_name(i) for i in proof.soft_rows]
-        yield make_diagnostic(
-            p, "conflict", reason, proof.blocks, compliance=proof.compliance, soft_rows=soft
-        )
+        joints, contacts = list_conflicting_blocks(p, proof.y)
+        yield make_diagnostic(p, "conflict", law + proof.message, joints + contacts)
 
 
 CHECKS = (diagnose_friction, diagnose_keys, diagnose_row_order, diagnose_duplicate_contacts)

@@ -7,8 +7,7 @@ the linear program, the sum of |z_t| over the tangents replaces the norm. Every 
 with two tangents it misses a few.
 
 With Coulomb friction, the convex relaxation is tried last. A certificate y of the relaxation that has tangential
-components proves nothing for Coulomb's law, but it shows which blocks conflict: with compliance on the rows of y, the
-relaxation has a solution (`find_conflict`).
+components proves nothing for Coulomb's law, but it shows which blocks conflict (`prove_relaxation_infeasible`).
 
 With J and M, the certificate is computed from the smallest violation of J v = target, which does not depend on M
 (`certify_by_least_violation`).
@@ -19,7 +18,7 @@ accepts no rows with upper bounds, and other islands may have them. `log` is the
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -28,7 +27,7 @@ from lavender.base.arrays import FloatArray
 from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import sparse as sp
-from lavender.judge.certificates import Proof, list_conflicting_blocks, prove_infeasibility
+from lavender.judge.certificates import Proof, prove_infeasibility
 from lavender.judge.residuals import residual
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
@@ -46,8 +45,7 @@ LINEAR_PROGRAM_STAGE = "linear program"  # Name of the stage in the solution.
 SIMPLEX_STEPS_PER_ROW = 100  # Largest number of simplex steps per row.
 # Largest number of factorisations to prove that the convex relaxation has no solution.
 MAX_RELAXATION_STEPS = 150
-MAX_SOFTENED_STEPS = 300  # Largest number of factorisations to solve a problem with additional compliance.
-TRIED_COMPLIANCES = 1e-4, 1e-2  # [-] Additional compliances that `find_conflict` tries, as multiples of d.
+MAX_SOFTENED_STEPS = 300  # Largest number of factorisations to solve a problem with nearly rigid rows.
 # [-] Compliances eps of rigid rows, as multiples of d, which are tried one after the other to find a motion with the
 # smallest violation of the constraints.
 NEARLY_RIGID_COMPLIANCES = 1e-6, 1e-8, 1e-10
@@ -56,89 +54,29 @@ VIOLATION_TOLERANCE = 1e-6  # Relative residual to which the problems with these
 NEGLIGIBLE_ROW_FRACTION = 1e-6
 
 
-@dataclass(frozen=True)
-class Conflict:
-    """Conflicting constraints of a problem without a solution of its convex relaxation.
-
-    Parameters
-    ----------
-    proof : Proof
-        Proof that the relaxation has no solution.
-    blocks : tuple of int
-        Conflicting blocks.
-    soft_rows : tuple of int
-        Rows for which an additional compliance makes the problem solvable; empty if no tried compliance does.
-    compliance : float, 1/kg
-        Largest compliance that was added to a row of `soft_rows`.
-    soft : str
-        Names of the blocks of `soft_rows`.
-    """
-
-    proof: Proof
-    blocks: tuple[int, ...]
-    soft_rows: tuple[int, ...]
-    compliance: float
-    soft: str
-
-    @property
-    def advice(self) -> str:
-        """Recommended compliance, as a sentence; empty if there is none."""
-        if not self.soft_rows:
-            return ""
-        return f"a compliance of {self.compliance:.1g} 1/kg on {self.soft} gives an answer"
-
-
 @np.errstate(all="ignore")  # Results that overflow are judged.
-def find_conflict(problem: Problem, tol: float, deadline: Deadline | None = None) -> Conflict | None:
-    """Return the conflicting constraints if the convex relaxation is proved to have no solution, else None."""
+def prove_relaxation_infeasible(
+    problem: Problem, tol: float, deadline: Deadline | None = None
+) -> Proof | None:
+    """Return the proof that the convex relaxation has no solution, or None."""
     inner = problem.relaxed("cone")
-    claim = _run_newton(inner, MAX_RELAXATION_STEPS, tol, deadline)[1]
+    claim = _run_newton(inner, MAX_RELAXATION_STEPS, tol, deadline)
     if claim is None or claim.certificate is None:
         return None
     proof = prove_infeasibility(inner, claim.certificate, tol, deadline)
-    if proof.reason:
-        return None
-    joints, contacts = list_conflicting_blocks(problem, proof.y)
-    soft, first, last = joints or contacts, problem.cones.ptr[:-1], problem.cones.ptr[1:]
-    tries = [
-        (np.concatenate([np.arange(first[i], last[i]) for i in soft]), proof.conflict.split(" against ")[0])
-    ]
-    if contacts:  # Soften all contacts, as contacts that this proof does not contain may conflict, too.
-        tries.append((np.flatnonzero(problem.cones.contact_rows), "all contacts"))
-    for rows, names in tries:
-        for fraction in TRIED_COMPLIANCES:
-            compliance = np.zeros(problem.m)
-            compliance[rows] = fraction * problem.d[rows]
-            try:
-                softer = add_compliance(problem, compliance)
-            except InputError:  # A number of the softened problem exceeds the accepted range.
-                continue
-            if _run_newton(softer, MAX_SOFTENED_STEPS, tol, deadline)[0] <= tol:
-                largest = float(compliance.max())
-                return Conflict(proof, joints + contacts, tuple(map(int, rows)), largest, names)
-    return Conflict(proof, joints + contacts, (), 0.0, "")
+    return None if proof.reason else proof
 
 
-def add_compliance(problem: Problem, compliance: FloatArray) -> Problem:
-    """Return the problem with an additional compliance (m,) [1/kg]."""
-    if problem.matrix is None:
-        assert problem.compliance is not None
-        return replace(problem, compliance=problem.compliance + compliance)
-    return replace(problem, matrix=(problem.csr + sp.diags_array(compliance)).tocsr())
-
-
-def _run_newton(
-    problem: Problem, steps: int, tol: float, deadline: Deadline | None
-) -> tuple[float, Claim | None]:
-    """Run Newton's method from zero; return (relative residual, claim), or (inf, None) if it refuses the problem."""
+def _run_newton(problem: Problem, steps: int, tol: float, deadline: Deadline | None) -> Claim | None:
+    """Run Newton's method from zero; return its claim, or None if it refuses the problem."""
     spec, left = get("newton"), None if deadline is None else deadline.get_remaining_seconds()
     if spec.refuses(problem) is not None or (left is not None and left <= 0.0):
-        return np.inf, None
-    solver, impulse = spec.load()(), problem.start()
-    claim = solver.run(solver.prepare(problem), impulse, steps, tol, left)
+        return None
+    solver = spec.load()()
+    claim = solver.run(solver.prepare(problem), problem.start(), steps, tol, left)
     if claim.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
-    return residual(problem, impulse).relative, claim
+    return claim
 
 
 @np.errstate(all="ignore")  # Results that overflow are judged.
@@ -209,7 +147,7 @@ def certify_infeasibility(log: Any) -> None:
         certify_by_linear_programs(log)
     is_small = problem.m <= CERTIFICATE_ROWS
     if log.certificate is None and problem.law == "coulomb" and is_small and log.best > 1e-6:
-        log.conflict = find_conflict(problem, log.tol, log.deadline)
+        log.conflict = prove_relaxation_infeasible(problem, log.tol, log.deadline)
 
 
 def certify_by_linear_programs(log: Any) -> None:

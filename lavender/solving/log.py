@@ -65,7 +65,7 @@ class SolveLog:
         self.certificate: FloatArray | None = None  # Proof (m,) that no solution exists, if one was found.
         # Direction (m,) that gives a lower bound of every solution's impulse, but is not a certificate.
         self.direction: FloatArray | None = None
-        self.conflict: Any = None  # `certify.Conflict` of the convex relaxation.
+        self.conflict: Any = None  # `certificates.Proof` that the convex relaxation has no solution.
         self.recorder: Recorder | None = None  # Writes the history if one is requested.
 
     def start_from_better_impulse(self, start: FloatArray) -> None:
@@ -193,10 +193,8 @@ class SolveLog:
             self.failure,
             self.remark,
         ]
-        if self.conflict is not None and self.best > self.tol:
-            if self.certificate is None:
-                messages.append("of the convex relaxation, " + self.conflict.proof.message)
-            messages.append(self.conflict.advice)
+        if self.conflict is not None and self.certificate is None and self.best > self.tol:
+            messages.append("of the convex relaxation, " + self.conflict.message)
         return Claim(
             Status.INTERRUPTED if self.interrupted else status,
             self.iterations,
