@@ -21,6 +21,7 @@ NAMES = (
     "peers",
     "programs",
     "rates",
+    "recompute",
     "regret",
     "scale",
     "stability",

@@ -53,11 +53,14 @@ class SlipOfStates:
     diverged : tuple of int
         Indices of the states that are left out, because MuJoCo restarts the simulation in a step up to the explained
         one: its numbers are not finite, or above 1e10.
+    misfit : str
+        Sentence on states that do not fit the model; else empty.
     """
 
     explanations: tuple[SlipExplanation, ...]
     n_states: int
     diverged: tuple[int, ...] = ()
+    misfit: str = ""
 
     @property
     def worst(self) -> SlipExplanation:
@@ -71,13 +74,17 @@ class SlipOfStates:
 
     @property
     def notes(self) -> list[str]:
-        """A sentence about the states that are left out because they diverge; empty if there are none."""
+        """Sentences about states that do not fit the model, and that are left out because they diverge."""
+        notes = [self.misfit] if self.misfit else []
         if not self.diverged:
-            return []
+            return notes
         n, first = len(self.diverged), self.diverged[0]
         are = "is" if n == 1 else "are"
         left_out = f"{format_count(n, 'state')} of {self.n_states} {are} left out, the first is state {first}"
-        return [f"{left_out}: the simulation diverges up to the explained step, and MuJoCo restarts it."]
+        return [
+            *notes,
+            f"{left_out}: the simulation diverges up to the explained step, and MuJoCo restarts it.",
+        ]
 
 
 def explain_slip_of_states(
@@ -121,10 +128,12 @@ def explain_slip_of_states(
             raise InputError(
                 f"contacts names {entry!r}, but no geom's name contains it; the geoms are {known}"
             )
-    vectors = [None] if states is None else list(read_states(mj, model, states).vectors)
+    starts = None if states is None else read_states(mj, model, states)
+    vectors = [None] if starts is None else list(starts.vectors)
+    misfit = "" if starts is None else starts.misfit
     explanations: list[SlipExplanation] = []
     diverged: list[int] = []
-    starts = []  # State vector of each explanation.
+    explained = []  # State vector of each explanation.
     with count_engine_warnings(mj):
         for i, vector in enumerate(vectors):
             if watch is not None:
@@ -136,10 +145,10 @@ def explain_slip_of_states(
             explanation = _explain_state(mj, model, data, entries)
             if explanation is not None:
                 explanations.append(replace(explanation, state=i))
-                starts.append(_get_state(mj, model, data))
+                explained.append(_get_state(mj, model, data))
         if explanations:
-            _simulate_remedies(mj, model, explanations, starts, watch)
-    return SlipOfStates(tuple(explanations), len(vectors), tuple(diverged))
+            _simulate_remedies(mj, model, explanations, explained, watch)
+    return SlipOfStates(tuple(explanations), len(vectors), tuple(diverged), misfit)
 
 
 def _get_state(mj: Any, model: Any, data: Any) -> FloatArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -20,6 +20,7 @@ from lavender.cli.options import (
     print_escaped,
     threshold_option,
 )
+from lavender.io.stored import format_json
 
 if TYPE_CHECKING:
     from lavender.report.cases import Item
@@ -44,6 +45,9 @@ NARROW_CHECK_OMITS = (
 @click.option("--time-limit", type=float, metavar="S", help="Time limit of each solve.")
 @precision_option
 @threshold_option
+@click.option(
+    "--json", "as_json", is_flag=True, help="Print the comparisons as JSON, one entry for each problem."
+)
 @click.pass_context
 def check(
     context: click.Context,
@@ -54,6 +58,7 @@ def check(
     time_limit: float | None,
     precision: str | None,
     threshold: float,
+    as_json: bool,
 ) -> None:
     """Compare solvers with a reference solver and with the judge.
 
@@ -78,13 +83,15 @@ def check(
     from lavender.solving.limits import check_time_limit
 
     limit_to_one_thread()
+    show = partial(print_escaped, err=as_json)  # With --json, only the JSON is on stdout.
+    entries: list[dict[str, Any]] = []
     for name in files:
         if name.endswith(".jsonl"):
             raise InputError(
                 f"{name} holds records; only problems can be checked. `lavender report {name}` shows them again"
             )
     contradicted = unsolved = unaccepted = solutions = above = unmet = 0
-    errors = ErrorReporter(partial(print_escaped, style="yellow"))
+    errors = ErrorReporter(partial(show, style="yellow"))
     reason = ""
     judges_stored = precision is not None or is_option_set(context, "threshold")
     report.select_solver_names([*(solvers or ()), reference])
@@ -97,34 +104,36 @@ def check(
                 item.problem, solvers=solvers, reference=reference, tol=tol, time_limit=time_limit
             )
             stored = item.judge_stored_answer(precision, threshold)
-            print_escaped(item.name, style="bold")
-            print_escaped(comparison.description)
+            show(item.name, style="bold")
+            show(comparison.description)
             if comparison.reference is None and comparison.reference_note != reason:
                 reason = comparison.reference_note  # Problems that follow usually have the same.
-                print_escaped(f"no reference: {reason}")
-            print_table(make_console(), comparison.frame, optional=NARROW_CHECK_OMITS)
+                show(f"no reference: {reason}")
+            print_table(make_console(stderr=as_json), comparison.frame, optional=NARROW_CHECK_OMITS)
             if (exact := _describe_distances(item, comparison)) is not None:
-                print_escaped(exact)
+                show(exact)
+            entries.append(
+                {"case": item.name, "rows": item.problem.m, "law": item.problem.law, "reference": comparison.reference,
+                 "solvers": comparison.frame.to_dict("records"),
+                 "stored_verdict": None if stored is None else stored.verdict,
+                 "stored_velocity_error": None if stored is None else stored.velocity}
+            )  # fmt: skip
             if stored is not None:
                 solutions += 1
                 above += stored.verdict != AT_FLOOR
                 unmet += stored.verdict not in (AT_FLOOR, CLOSE)
-                print_escaped(f"stored solution ({stored.precision}): {stored.verdict_in_words}")
-                print_escaped(
-                    f"    worst row {stored.worst_name or 'none'}: {format_residual(stored.velocity)} m/s"
-                )
+                show(f"stored solution ({stored.precision}): {stored.verdict_in_words}")
+                show(f"    worst row {stored.worst_name or 'none'}: {format_residual(stored.velocity)} m/s")
             contradicted += len(comparison.contradicted)
             unaccepted += len(comparison.refused) == len(comparison.rows)
             if solvers or len(comparison.unsolved) + len(comparison.refused) == len(comparison.rows):
                 unsolved += len(comparison.unsolved)
     if contradicted:
-        print_escaped(f"{contradicted} claims are contradicted", style="bold red")
+        show(f"{contradicted} claims are contradicted", style="bold red")
     if unsolved:
-        print_escaped(f"{unsolved} of the solves did not solve their problem", style="bold red")
+        show(f"{unsolved} of the solves did not solve their problem", style="bold red")
     if unaccepted:
-        print_escaped(
-            f"{format_count(unaccepted, 'problem')} not accepted by any of these solvers", style="bold red"
-        )
+        show(f"{format_count(unaccepted, 'problem')} not accepted by any of these solvers", style="bold red")
     if judges_stored and not solutions:
         raise InputError(
             "--precision and --threshold apply to stored solutions, and no file has one (entry `impulse`): "
@@ -132,7 +141,9 @@ def check(
         )
     if solutions:
         shares = f"{above} of {solutions} above their floor, {unmet} also more than"
-        print_escaped(f"stored solutions: {shares} {format_tolerance(threshold)} m/s off")
+        show(f"stored solutions: {shares} {format_tolerance(threshold)} m/s off")
+    if as_json:
+        click.echo(format_json(entries, indent=1))
     errors.exit(contradicted or unsolved or unaccepted or (judges_stored and unmet))
 
 

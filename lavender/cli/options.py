@@ -237,8 +237,9 @@ threshold_option = add_options([THRESHOLD], show_default=True)
 RECORDING_OPTIONS: tuple[Option, ...] = (
     (("--steps",), {"default": 500, "help": "MODEL.xml: number of simulation steps."}),
     (("--record-every", "every"), {"default": 5, "help": "MODEL.xml: record every n-th step."}),
-    (("--controls", "control"), {"default": "random", "metavar": "zero|random|FILE",
-                                 "help": "MODEL.xml: its controls. FILE: .npy of shape (any, nu), repeated."}),
+    (("--controls", "control"), {"default": "random", "metavar": "zero|random|hold|FILE",
+                                 "help": "MODEL.xml: its controls. hold: those of the start state. FILE: .npy of shape "
+                                 "(any, nu), repeated."}),
     (("--seed",), {"default": 0, "help": "MODEL.xml: seed of random controls."}),
     (("--states",), {"default": None, "metavar": "FILE|keyframes",
                      "help": "MODEL.xml: start from these states. FILE: an .npz, best with `state`, vectors of "

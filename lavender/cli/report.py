@@ -29,6 +29,7 @@ from lavender.cli.options import (
     reject_unused_options,
     reject_unused_recording_options,
 )
+from lavender.io.start_states import MODEL_SUFFIXES
 from lavender.io.stored import lock_output, write_text
 
 
@@ -75,7 +76,7 @@ def report(
     Every solver runs on every case, to each tolerance and with each budget.
 
     FILES are problems (.npz, .hdf5), folders of them, folders of recorded steps, or cases of the built-in suite such as
-    "stack(n=64)"; without any, the built-in suite runs. A MuJoCo model (.xml) is simulated first, and its steps are
+    "stack(n=64)"; without any, the built-in suite runs. A MuJoCo model (.xml, .mjb) is simulated, and its steps are
     recorded in the folder of the report. For a records.jsonl, the report is written again without solving; --solvers
     then selects the solvers that it shows. After an interruption, the same command continues where it stopped.
 
@@ -176,7 +177,7 @@ def _reject_unused_options(
         reject_unused_options(
             context, timing_options, "with --workers, which measures no times and ends by iterations"
         )
-    reject_unused_recording_options(context, any(Path(f).suffix.lower() == ".xml" for f in files))
+    reject_unused_recording_options(context, any(Path(f).suffix.lower() in MODEL_SUFFIXES for f in files))
     # Records may contain solvers that are not installed here.
     if not any(f.endswith(".jsonl") for f in files):
         reject_options_without_effect(context, solvers)
@@ -191,7 +192,7 @@ def _record_model(
 
     Parameters
     ----------
-    word : argument of the command; a model is a file *.xml
+    word : argument of the command; a model is a file *.xml or *.mjb
     out : folder of the report
     used_folders : folders of the models before this one; the new folder is added
     reuse : reuse recorded steps
@@ -200,7 +201,7 @@ def _record_model(
     The name of the folder contains the folder and the file of the model, since many files are called scene.xml.
     """
     path = Path(word)
-    if path.suffix.lower() != ".xml":
+    if path.suffix.lower() not in MODEL_SUFFIXES:
         return word
     from lavender.io.recording import record_file
     from lavender.report.text import make_file_name

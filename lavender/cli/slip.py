@@ -12,7 +12,7 @@ from lavender.cli.options import FILE, limit_to_one_thread, make_console, print_
 
 
 @click.command()
-@click.argument("model", metavar="MODEL.xml", type=FILE)
+@click.argument("model", metavar="MODEL.xml|MODEL.mjb", type=FILE)
 @click.option("--states", metavar="FILE.npz|keyframes",
               help="States to explain, such as states.npz of an audit; default: the initial state.")  # fmt: skip
 @click.option("--steps", type=int, default=1, show_default=True,
@@ -22,7 +22,7 @@ from lavender.cli.options import FILE, limit_to_one_thread, make_console, print_
 def slip(model: Path, states: str | None, steps: int, contacts: tuple[str, ...]) -> None:
     """Explain why contacts of a MuJoCo model slip.
 
-    MODEL.xml is an MJCF file. The first table shows the speed of each contact along its surface after the step, and
+    MODEL is an MJCF or .mjb file. The first table shows the speed of each contact along its surface after the step, and
     the largest part of this speed with its cause: unfinished solving, shape of the cone, softness of friction, convex
     relaxation, or sliding at the friction limit. A part is the change of the speed if this property is replaced, too:
     exact solution, round cone, hard friction, Coulomb's law. Settings of MuJoCo are then simulated. The second table

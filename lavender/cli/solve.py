@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -11,7 +11,11 @@ from lavender.base.errors import InputError
 from lavender.base.exits import EXIT_INFEASIBLE, EXIT_INTERRUPTED, EXIT_UNMET
 from lavender.cli.completion import complete_case_or_file, complete_solver
 from lavender.cli.options import PATH, limit_to_one_thread, print_escaped
-from lavender.io.stored import check_writable, write_atomically
+from lavender.io.stored import check_writable, format_json, write_atomically
+
+if TYPE_CHECKING:
+    from lavender.judge.solution import Solution
+    from lavender.problem import Problem
 
 #: Fields of the solution and of its residual that --output writes, in addition to its status and solver.
 SAVED_FIELDS = ("impulse", "slack", "iterations", "setup_time", "solve_time")
@@ -31,7 +35,10 @@ SAVED_RESIDUAL_FIELDS = ("error", "relative", "energy", "velocity", "roundoff_fl
 @click.option("--order", help="Sweep order, for solvers that take one.")
 @click.option("--seed", type=int, help="Seed of a random order.")
 @click.option("--output", type=PATH, help="Write impulse, slack, status and residual to this .npz file.")
-def solve(file: str, solver: str, tol: float, output: Path | None, **options: Any) -> None:
+@click.option(
+    "--json", "as_json", is_flag=True, help="Print the judged result as JSON, with impulse and slack."
+)
+def solve(file: str, solver: str, tol: float, output: Path | None, as_json: bool, **options: Any) -> None:
     """Solve one problem and print the judged result.
 
     FILE is a file or a case of the suite. Exit code 0: the judge accepts the result (within --tol or --velocity-tol, or
@@ -69,19 +76,36 @@ def solve(file: str, solver: str, tol: float, output: Path | None, **options: An
                 np.savez(f, **results)
 
         write_atomically(output, write)
-    print_escaped(f"{item.name}: {item.problem.law}, {item.problem.m} rows")
-    print_escaped(str(solution))
-    if output is not None:
-        print_escaped(f"written: {output}")
+    if as_json:
+        click.echo(format_json(_describe_solution(item.name, item.problem, solution), indent=1))
+    else:
+        print_escaped(f"{item.name}: {item.problem.law}, {item.problem.m} rows")
+        print_escaped(str(solution))
+        if output is not None:
+            print_escaped(f"written: {output}")
     if solution.status.name == "INTERRUPTED":
         raise click.exceptions.Exit(EXIT_INTERRUPTED)
     if solution.status.name == "INFEASIBLE" and solution.claim_check == "confirmed":
         raise click.exceptions.Exit(EXIT_INFEASIBLE)
     judged = solution.residual
     if judged.nothing_to_do and judged.verdict != WRONG:
+        if as_json:
+            return
         click.echo(
             f"nothing to do: the zero impulse is a solution; this result differs by {judged.velocity:.1e} m/s"
         )
         return
     if tol > 0.0 and not (solution.success or judged.at_floor):
         raise click.exceptions.Exit(EXIT_UNMET)
+
+
+def _describe_solution(name: str, problem: Problem, solution: Solution) -> dict[str, Any]:
+    """Return the contents of `--json`: the claim of the solver and the numbers of the judge."""
+    judged = solution.residual
+    return {
+        "case": name, "law": problem.law, "rows": problem.m, "solver": solution.solver.name,
+        "status": solution.status.name, "success": solution.success, "verdict": judged.verdict,
+        **{name: getattr(judged, name) for name in ("relative", "energy", "velocity", "roundoff_floor")},
+        "worst_row": judged.worst_name,
+        **{name: getattr(solution, name) for name in SAVED_FIELDS},
+    }  # fmt: skip

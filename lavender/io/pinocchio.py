@@ -10,6 +10,9 @@ M is computed by `crba`, J by each constraint model; rows are in the order of th
     joint limits             lambda >= 0,             target as for contacts, with gap = distance to the limit
     joint friction           |lambda| <= dt times the model's limits, target = 0
 
+With level="acceleration", all rows are anchors with target = J v - dt (dJ/dt) v: then J (v+ - v) / dt = -(dJ/dt) v, and
+(v+ - v) / dt is the constrained acceleration. At the level of velocities it lacks the term (dJ/dt) v, for every dt.
+
 A contact's z axis points from the first joint's side to the second's: w > 0 along it is separation.
 """
 
@@ -21,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import as_array, check_float
+from lavender.base.arrays import as_array, check_choice, check_float
 from lavender.base.errors import CapabilityError, InputError, LavenderError
 from lavender.problem import Problem
 from lavender.problem.cones import Cones
@@ -29,6 +32,7 @@ from lavender.problem.cones import Cones
 OTHER_MODEL_ADVICE = (
     "The model was changed, or the data belong to another model: give data made from this model"
 )
+ANCHORS = {"PointAnchorConstraintModel", "FrameAnchorConstraintModel"}
 # Largest accepted deviation of a quaternion from unit length and of a matrix from a rotation [-]. With a larger one,
 # J does not map joint velocities to velocities.
 ROTATION_TOLERANCE = 1e-6
@@ -49,6 +53,7 @@ def from_pinocchio(
     friction: str = "coulomb",
     compliance: Any = None,
     correction: float = 0.2,
+    level: str = "velocity",
     name: str = "pinocchio",
 ) -> Problem:
     """Return the constraint problem of one step of a Pinocchio model.
@@ -72,6 +77,9 @@ def from_pinocchio(
         Default: none. The compliance of Pinocchio's constraint models is not read.
     correction : float, default 0.2
         Fraction of a position error that the step corrects.
+    level : {"velocity", "acceleration"}
+        "acceleration": (v+ - v) / dt is the acceleration of the constrained model, as of `pinocchio.constraintDynamics`
+        without stabilisation; anchors only. (dJ/dt) v is a central difference, exact to about 1e-9 of its size.
 
     Returns
     -------
@@ -82,8 +90,10 @@ def from_pinocchio(
     InputError
         Pinocchio cannot be imported, or an argument has the wrong type, size or value.
     CapabilityError
-        A constraint model of another kind, or accelerations that do not belong to M.
+        A constraint model of another kind, or accelerations that do not belong to M; with level="acceleration", a
+        constraint that is not an anchor.
     """
+    check_choice("level", level, ("velocity", "acceleration"))
     try:
         import pinocchio as pin
     except ImportError:
@@ -105,6 +115,14 @@ def from_pinocchio(
         data.q_in = q  # Pinocchio evaluates joint limits at q_in, which none of its algorithms sets.
     pairs = zip(constraint_models, constraint_datas, strict=True)
     rows, target, cones, names = _convert_constraints(model, data, pairs, dt, correction)
+    if level == "acceleration":
+        kinds = {type(_unwrap_constraint(constraint)).__name__ for constraint in constraint_models}
+        if kinds - ANCHORS:
+            raise CapabilityError(
+                f"level is 'acceleration' and there is a {min(kinds - ANCHORS)}; only anchors have an acceleration "
+                "level: give level='velocity' for contacts, limits and friction"
+            )
+        target = rows @ v - dt * _differentiate_constraint_velocity(pin, model, constraint_models, q, v)
     return Problem.from_jacobian(
         rows,
         mass,
@@ -116,6 +134,21 @@ def from_pinocchio(
         names=names,
         name=name,
     )
+
+
+def _differentiate_constraint_velocity(pin: Any, model: Any, constraints: Any, q: Any, v: Any) -> Any:
+    """Return (dJ/dt) v (m,): the central difference of J(q) v along v."""
+    # The step in which the error of the difference and its rounding are equal.
+    h = np.cbrt(np.finfo(float).eps) / max(1.0, float(np.abs(v).max(initial=0.0)))
+    speeds = []
+    for step in (h, -h):
+        data, moved = model.createData(), pin.integrate(model, q, step * v)
+        pin.forwardKinematics(model, data, moved, v)
+        pin.computeJointJacobians(model, data, moved)
+        data.q_in = moved
+        pairs = [(constraint, _unwrap_constraint(constraint).createData()) for constraint in constraints]
+        speeds.append(_convert_constraints(model, data, pairs, 1.0, 0.0)[0] @ v)
+    return (speeds[0] - speeds[1]) / (2.0 * h)
 
 
 def _convert_constraints(
@@ -311,7 +344,7 @@ def _convert_constraint(
     """
     kind = type(model).__name__
     order = list(range(n))
-    if kind in ("PointAnchorConstraintModel", "FrameAnchorConstraintModel"):
+    if kind in ANCHORS:
         return Cones.free(n), -correction / dt * np.array(data.constraint_position_error), order
     if kind == "PointContactConstraintModel":
         gap = np.array([float(data.constraint_position_error[2]), 0.0, 0.0])

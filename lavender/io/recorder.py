@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import contextlib
 import heapq
-import json
 import os
 import zipfile
 from collections.abc import Callable, Iterable, Mapping
@@ -30,7 +29,15 @@ from lavender.batch.data import Batch
 from lavender.batch.residuals import residual_many
 from lavender.io.engine_step import Claims, EngineStep
 from lavender.io.npz import write_npz
-from lavender.io.stored import ENGINE, STATES_FOLDER, lock_step_folder, make_folder, write_arrays, write_text
+from lavender.io.stored import (
+    ENGINE,
+    STATES_FOLDER,
+    format_json,
+    lock_step_folder,
+    make_folder,
+    write_arrays,
+    write_text,
+)
 from lavender.judge.residuals import DEFAULT_THRESHOLD, residual
 from lavender.problem import Problem
 
@@ -47,7 +54,7 @@ def describe_answer(problem: Problem, impulse: Any, threshold: float) -> dict[st
 
 def write_lines(folder: Path, lines: Iterable[Mapping[str, Any]]) -> None:
     """Write the lines of `engine.jsonl`."""
-    write_text(folder / ENGINE, "".join(f"{json.dumps(line)}\n" for line in lines))
+    write_text(folder / ENGINE, "".join(f"{format_json(line)}\n" for line in lines))
 
 
 @dataclass(frozen=True)

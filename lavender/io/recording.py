@@ -284,5 +284,14 @@ def record_file(
     result = record(model, mj.MjData(model), folder, steps, control=load_controls(control), **options)
     if not result.files:
         why = f" ({result.left_out[0]})" if result.left_out else ": more steps, or other controls"
+        every, seed = options.get("every", 1), options.get("seed", 0)
+        if every > 1 and not result.left_out:
+            drive = make_controller(model, load_controls(control), seed)
+            starts = options.get("states")
+            starts = None if starts is None else read_states(mj, model, starts).select_evenly(steps)
+            data = mj.MjData(model)
+            n = sum(data.nefc > 0 for _ in iterate_steps(mj, model, data, steps, 1, drive, starts))
+            if n:
+                why = f", but {n} of the {steps} steps had one: record every step (every is {every})"
         raise InputError(f"{path}: no step had a constraint that could be recorded{why}")
     return result

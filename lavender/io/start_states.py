@@ -29,6 +29,7 @@ from lavender.io.stored import SUFFIXES, Archive, as_path, read_first_bytes
 CONTROLS = ("zero", "random", "hold")
 Control = str | Callable[[Any, Any, int], Any] | Any
 KEYFRAMES = "keyframes"
+MODEL_SUFFIXES = (".xml", ".mjb")  # Suffixes of files with a model of MuJoCo.
 VECTOR = "state"
 NEEDED = ("qpos", "qvel")
 OPTIONAL = (

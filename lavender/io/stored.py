@@ -272,6 +272,21 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     write_bytes(path, text.encode())
 
 
+def format_json(value: Any, indent: int | None = None) -> str:
+    """Return JSON of numbers, texts, NumPy arrays and containers; numbers that are not finite become null."""
+
+    def convert(x: Any) -> Any:
+        """Convert a value to types that JSON has."""
+        if isinstance(x, Mapping):
+            return {str(name): convert(entry) for name, entry in x.items()}
+        x = x.tolist() if isinstance(x, (np.ndarray, np.generic)) else x
+        if isinstance(x, (list, tuple)):
+            return [convert(entry) for entry in x]
+        return None if isinstance(x, float) and not math.isfinite(x) else x
+
+    return json.dumps(convert(value), indent=indent, allow_nan=False)
+
+
 def load_or_make_file(path: Path, is_current: Callable[[bytes], bool], make: Callable[[], bytes]) -> bytes:
     """Return the content of a file if `is_current` accepts it; else return the result of `make` and try to store it."""
     if path.exists() and is_current(content := path.read_bytes()):

@@ -238,10 +238,13 @@ def _read_folder(folder: Path) -> EngineAnswers | None:
         try:
             entry = json.loads(line)
             left_out += "left_out" in entry
-            numbers = {name: float(entry[name]) for name in ("rows", "seconds", "relative")}
+            # JSON has null in place of numbers that are not finite.
+            values = {name: entry[name] for name in ("rows", "seconds", "relative")}
+            numbers = {name: math.nan if x is None else float(x) for name, x in values.items()}
             texts = {name: str(entry[name]) for name in ("verdict", "solver")}
             texts |= {name: str(entry.get(name, "")) for name in ("file", "worst")}
-            numbers["velocity"] = float(entry.get("velocity", math.nan))
+            velocity = entry.get("velocity")
+            numbers["velocity"] = math.nan if velocity is None else float(velocity)
             entries.append(numbers | {name: escape_unprintable(text) for name, text in texts.items()})
         except (ValueError, KeyError, TypeError, RecursionError):
             continue

@@ -479,3 +479,26 @@ def test_without_packages_a_sentence_names_what_to_install(call, message):
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert message in done.stdout + done.stderr
     assert "ModuleNotFoundError" not in done.stderr
+
+
+def reject_constant(word):
+    """Raise an error for a number that JSON does not have."""
+    raise AssertionError(word)
+
+
+def test_solve_json_has_the_judged_result(lavender, path):
+    code, out, _ = lavender("solve", path, "--json")
+    result = json.loads(out, parse_constant=reject_constant)
+    problem = lv.load(path)
+    judged = lv.residual(problem, np.array(result["impulse"]))
+    assert code == 0 and result["status"] == "CONVERGED" and result["success"] is True
+    assert (result["relative"], result["velocity"]) == (judged.relative, judged.velocity)
+    assert result["rows"] == problem.m and result["worst_row"] == judged.worst_name
+
+
+def test_check_json_is_the_only_output(lavender, path):
+    code, out, _ = lavender("check", path, path, "--solvers", "newton", "pgs", "--json")
+    entries = json.loads(out, parse_constant=reject_constant)
+    assert code == 0 and len(entries) == 2
+    assert [row["solver"] for row in entries[0]["solvers"]] == ["newton", "pgs"]
+    assert entries[0]["solvers"][0]["verdict"] == "agrees"

@@ -73,3 +73,9 @@ def test_record_then_report_from_the_command_line(lavender, tmp_path):
     for text in ((page / "index.html").read_text(), (page / "summary.md").read_text()):
         assert "own Newton: it solves 3 of 3 in" in text and "inside the engine" in text
     assert f"{max(line['relative'] for line in lines):.1e}" in (page / "summary.md").read_text()
+
+
+def test_record_without_a_selected_constraint_counts_the_steps_between(lavender, boxes, tmp_path):
+    """The only selected step is after the end; every other step has contact."""
+    code, _, err = lavender("record", boxes(), "--steps", 100, "--record-every", 1000, "--out", tmp_path / "r")
+    assert code == 2 and "100 of the 100 steps had one: record every step (--record-every is 1000)" in err

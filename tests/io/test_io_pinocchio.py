@@ -277,3 +277,53 @@ def test_data_of_another_constraint_are_not_written():
     big = chain(12)
     datas[2] = pin.JointLimitConstraintModel(big, list(range(1, 13))).createData()
     assert lv.io.from_pinocchio(model, model.createData(), models, datas, 0.01, q=q, v=v) == right
+
+
+def anchored_chain(kind):
+    """A chain of four hinges with its tip anchored, a velocity that keeps the anchor, and (dJ/dt) v by kinematics."""
+    model, parent = pin.Model(), 0
+    for i in range(4):
+        place = pin.SE3(np.eye(3), np.array([0.0, 0.0, -0.5 * (i > 0)]))
+        parent = model.addJoint(parent, pin.JointModelRY(), place, f"hinge {i}")
+        inertia = pin.Inertia(1.0 + i, np.array([0.0, 0.0, -0.25]), np.diag([0.02, 0.02, 0.01]))
+        model.appendBodyToJoint(parent, inertia, pin.SE3.Identity())
+    tip, data, rng = pin.SE3(np.eye(3), np.array([0.0, 0.0, -0.5])), model.createData(), np.random.default_rng(1)
+    q = rng.normal(size=4)
+    pin.forwardKinematics(model, data, q)
+    anchor = getattr(pin, f"{kind}AnchorConstraintModel")(model, 0, data.oMi[parent] * tip, parent, tip)
+    pin.computeJointJacobians(model, data, q)
+    turn = (data.oMi[parent] * tip).rotation
+    jac = (turn @ (tip.inverse().action @ pin.getJointJacobian(model, data, parent, pin.LOCAL))[:3])[[0, 2]]
+    jac = np.vstack([jac, np.ones((1, 4))]) if kind == "Frame" else jac  # The hinges turn about one axis.
+    kernel = np.linalg.svd(jac)[2][len(jac) :]
+    v = kernel.T @ rng.normal(size=len(kernel))
+    pin.forwardKinematics(model, data, q, v, np.zeros(4))
+    spatial, rate = tip.actInv(data.v[parent]), tip.actInv(data.a[parent])
+    drift = (turn @ (rate.linear + np.cross(spatial.angular, spatial.linear)))[[0, 2]]
+    return model, anchor, q, v, jac, np.append(drift, 0.0) if kind == "Frame" else drift
+
+
+@pytest.mark.parametrize("kind", ["Point", "Frame"])
+@pytest.mark.parametrize("dt", [1e-2, 1e-4])
+def test_from_pinocchio_acceleration_level_gives_the_constrained_acceleration(kind, dt):
+    model, anchor, q, v, jac, drift = anchored_chain(kind)
+    data = model.createData()
+    upper = np.triu(pin.crba(model, data, q))
+    mass, force = upper + np.triu(upper, 1).T, -pin.nle(model, data, q, v)
+    kkt = np.block([[mass, jac.T], [jac, np.zeros((len(jac), len(jac)))]])
+    exact = np.linalg.solve(kkt, np.concatenate([force, -drift]))[:4]
+
+    def accelerate(level):
+        problem = problem_of(model, [anchor], q, v, dt, level=level)
+        return (problem.velocity(lv.solve(problem, tol=1e-13).impulse) - v) / dt
+
+    np.testing.assert_allclose(accelerate("acceleration"), exact, atol=1e-8 * np.abs(exact).max())
+    assert np.abs(accelerate("velocity") - exact).max() > 1e-3 * np.abs(exact).max()  # Its error does not depend on dt.
+
+
+def test_from_pinocchio_acceleration_level_of_contacts_is_refused():
+    model, models, q, v = robot()
+    with pytest.raises(lv.CapabilityError, match="only anchors have an acceleration level"):
+        problem_of(model, models, q, v, level="acceleration")
+    with pytest.raises(lv.InputError, match="level"):
+        problem_of(model, models[:1], q, v, level="force")

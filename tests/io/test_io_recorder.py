@@ -7,6 +7,8 @@ import pytest
 
 import lavender as lv
 from lavender.io import recorder as module
+from lavender.report.records import Records
+from lavender.report.tables import read_engine_answers
 
 CONES = lv.Cones.contacts(0.5, tangents=1)
 
@@ -170,3 +172,18 @@ def test_arguments_and_folders_are_checked(tmp_path):
         lv.io.Recorder(tmp_path / "a", every=1)
     with lv.io.Recorder(tmp_path / "a", every=1, replace=True) as recorder:
         assert not list((tmp_path / "a").glob("*.npz"))
+
+
+def test_recorder_writes_json_without_nan(tmp_path):
+    """JSON has no NaN: a time that is not known is null, and readers take it as missing."""
+    with lv.io.Recorder(tmp_path / "all", every=1) as recorder:
+        recorder.add(step_of([0.0, 0.1]))
+
+    def reject(word):
+        raise AssertionError(word)
+
+    lines = (tmp_path / "all" / "engine.jsonl").read_text().splitlines()
+    entries = [json.loads(line, parse_constant=reject) for line in lines]
+    assert len(entries) == 2 and all(entry["seconds"] is None for entry in entries)
+    (answers,) = read_engine_answers([str(tmp_path / "all")], Records())
+    assert answers.lines["seconds"].isna().all() and len(answers.lines) == 2
