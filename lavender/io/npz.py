@@ -1,7 +1,6 @@
 """Read and write problems in NumPy archives (.npz).
 
-Three formats are read: our own, the plain box format, and the format of a benchmark generator. `docs/formats.md`
-describes each entry.
+Two formats are read: our own and the plain box format. `docs/formats.md` describes each entry.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ class Stored:
     ----------
     problem : Problem
     format : str
-        "lavender", "box", "generated", "fclib_local" or "fclib_global", the last two also with the suffix "_rolling".
+        "lavender", "box", "fclib_local" or "fclib_global", the last two also with the suffix "_rolling".
     impulse : (m,) N s, optional
         Stored solution.
     slack : (m,) m/s, optional
@@ -86,8 +85,6 @@ def read_npz(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Sto
     try:
         if "lavender_format" in archive:
             return _read_own_format(archive)
-        if {"kind", "J_data", "minv"} <= set(archive):
-            return _read_generated_format(archive)
         if {"b", "lo", "hi"} <= set(archive):
             return _read_box_format(archive)
     except InputError as error:
@@ -279,7 +276,7 @@ def _check_entries(archive: Archive, needed: Collection[str], optional: Collecti
         )
 
 
-# -- plain box format and format of a benchmark generator ------------------------------------------
+# -- plain box format --------------------------------------------------------------------------
 
 
 def _read_box_format(archive: Archive) -> Stored:
@@ -335,24 +332,6 @@ def _build_box_cones(archive: Archive, m: int) -> Cones:
         mu=friction,
         patch_radius=np.zeros(len(first)),
     )
-
-
-def _read_generated_format(archive: Archive) -> Stored:
-    """Read the layout of a benchmark generator: A, b, and `kind` lcp (l >= 0), free, or cone (3 rows per contact)."""
-    kind = archive.read_scalar("kind")
-    b = archive["b"]
-    name = Path(archive.path).stem
-    if b.ndim != 1:
-        raise InputError(f"b has shape {b.shape}; one dimension is needed")
-    if kind == "lcp":
-        problem = Problem.lcp(_read_matrix(archive), b, name=name)
-    elif kind == "free":
-        problem = Problem.linear(_read_matrix(archive), b, name=name)
-    elif kind == "cone":
-        problem = Problem.contact(_read_matrix(archive), b, archive["mu"], friction="cone", name=name)
-    else:
-        raise InputError(f"entry 'kind' is {kind!r}; 'lcp', 'free' or 'cone' is needed")
-    return Stored(problem, "generated")
 
 
 def _read_vector(archive: Archive, name: str, problem: Problem) -> FloatArray | None:

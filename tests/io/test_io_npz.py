@@ -383,20 +383,6 @@ def test_a_wrong_box_file_is_refused_by_name(tmp_path, changes, sign):
         lavender.io.load(box(tmp_path, **changes))
 
 
-def test_the_generators_layout_is_read(tmp_path):
-    a = sp.csr_array(np.diag([1.0, 2.0, 3.0]))
-    parts = {"A_data": a.data, "A_indices": a.indices, "A_indptr": a.indptr, "A_shape": np.array(a.shape)}
-    rest = {"J_data": np.zeros(1), "minv": np.ones(6), "b": np.ones(3), "mu": np.array([0.5])}
-    laws = {"lcp": "lcp", "free": "linear", "cone": "cone"}
-    for kind, law in laws.items():
-        stored = lavender.io.read(archive(tmp_path / "generated.npz", {"kind": kind} | rest | parts))
-        assert stored.problem.law == law
-        assert stored.format == "generated"
-        assert np.array_equal(stored.problem.dense(), a.toarray())
-    with pytest.raises(lv.InputError, match="'lcp', 'free' or 'cone'"):
-        lavender.io.load(archive(tmp_path / "generated.npz", {"kind": "magic"} | rest | parts))
-
-
 def test_the_documentation_lists_every_entry_of_our_format(tmp_path):
     text = (Path(__file__).resolve().parent.parent.parent / "docs" / "formats.md").read_text(encoding="utf-8")
     for _, problem in variants():
