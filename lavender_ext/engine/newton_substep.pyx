@@ -6,9 +6,8 @@ Native builds run its first phase only, WebAssembly all of it. After `prepare` a
     substep                 the first phase of `newton` (newton/warm_start.pxd), then its steps (newton/solve.pyx); the
                             judge decides when to stop
 
-Native builds and WebAssembly run the same code with the same bits. The augmented system, which needs another library, is
-omitted. If the residual stays above tol for that reason or after `MAX_SUBSTEP_FACTORISATIONS`, the best impulse is kept, and
-UNDECIDED is returned.
+Native builds and WebAssembly run the same code with the same bits. If the residual stays above tol after
+`MAX_SUBSTEP_FACTORISATIONS`, the best impulse is kept, and UNDECIDED is returned.
 """
 from libc.stdint cimport int32_t, int64_t, uint64_t
 

@@ -2,14 +2,12 @@
 
     law             state                     phase                                               next state if unsolved
     bounded rows    START_ACTIVE_SET          exchanges from a given start                        UNBOUNDED_ACTIVE_SET
-                    UNBOUNDED_ACTIVE_SET      refinement and exchanges from H z = g               ROWS_DAMPED_NEWTON
-                    ROWS_DAMPED_NEWTON        proximal damped Newton while it gains, over bodies  ROWS_INTERIOR_POINT
-                                              and for a sparse A without symmetry
-                    ROWS_INTERIOR_POINT       interior point, exchanges at each decade            AUGMENTED_INTERIOR_POINT
+                    UNBOUNDED_ACTIVE_SET      refinement and exchanges from H z = g               ROWS_INTERIOR_POINT
+                    ROWS_INTERIOR_POINT       interior point, exchanges at each decade            CONVEX_DAMPED_NEWTON
     cones           FIRST_CONE_WEIGHT         interior point, proximal weight 1e-8                SECOND_CONE_WEIGHT
-                    SECOND_CONE_WEIGHT        interior point, proximal weight 1e-10               AUGMENTED_INTERIOR_POINT
-    both            AUGMENTED_INTERIOR_POINT  interior point on the augmented system of bodies    CONVEX_DAMPED_NEWTON
-                    CONVEX_DAMPED_NEWTON      proximal damped Newton; its direction may prove     CONVEX_END
+                    SECOND_CONE_WEIGHT        interior point, proximal weight 1e-10               THIRD_CONE_WEIGHT
+                    THIRD_CONE_WEIGHT         interior point, proximal weight 1e-13               CONVEX_DAMPED_NEWTON
+    both            CONVEX_DAMPED_NEWTON      proximal damped Newton; its direction may prove     CONVEX_END
                                               that there is no solution
     Coulomb's       START_SHIFTED             shifted Newton, if the start solves the convex law  START_DAMPED_NEWTON
                     START_DAMPED_NEWTON       proximal damped Newton from the start               FIRST_DE_SAXCE
@@ -19,9 +17,7 @@
                                               if many contacts slide
                     FIRST_SHIFTED             shifted Newton from it, if few contacts slide       FIRST_PATH
                     FIRST_PATH                path of smoothed problems, unless joints are rigid  SECOND_DE_SAXCE
-                    SECOND_DE_SAXCE           De Saxce's interior point with 0.7 of it            AUGMENTED_DE_SAXCE
-                    AUGMENTED_DE_SAXCE        De Saxce's on the augmented system, if joints are   MORE_PATHS
-                                              rigid
+                    SECOND_DE_SAXCE           De Saxce's interior point with 0.7 of it            MORE_PATHS
                     MORE_PATHS                paths with other ratios of smoothing                COULOMB_DAMPED_NEWTON
                     COULOMB_DAMPED_NEWTON     proximal damped Newton from the best point          COULOMB_END
 
@@ -29,7 +25,6 @@ Every state ends the solve as soon as the best point is within tol or at the rou
 or the budget is spent. De Saxce's interior point has states of its own:
 
     DE_SAXCE_INTERIOR    interior point                              far from a solution: end;  else DE_SAXCE_FIRST_END
-                         on the augmented system                     the same with 0.95 of phi's derivative, then end
     DE_SAXCE_FIRST_END   damped Newton from its best point           DE_SAXCE_SECOND_END
     DE_SAXCE_SECOND_END  the same with a smaller proximal weight     end
 """
@@ -44,32 +39,30 @@ from lavender_ext.newton.cones cimport has_lower_bound, has_upper_bound
 from lavender_ext.newton.shifted cimport begin_shifted_newton, step_shifted_newton
 from lavender_ext.newton.path cimport N_PATHS, begin_path, step_path
 from lavender_ext.newton.active_set cimport begin_active_set, step_active_set
-from lavender_ext.newton.damped_newton cimport (STRETCH_FACTORISATIONS, begin_damped_newton, begin_damped_newton_stretches,
+from lavender_ext.newton.damped_newton cimport (begin_damped_newton, begin_damped_newton_stretches,
                                                 continue_damped_newton_stretches, push_damped_newton, step_damped_newton)
-from lavender_ext.newton.interior_phases cimport (augmented_shift, begin_interior_steps, begin_interior_with_newton,
-                                                  compute_sliding_fraction, step_augmented_newton, step_interior_point,
-                                                  step_interior_with_newton)
-from lavender_ext.newton.run cimport (ACTIVE_SET, AUGMENTED_NEWTON, DAMPED_NEWTON, DAMPED_STRETCHES, DE_SAXCE,
-                                      INTERIOR_POINT, INTERIOR_WITH_NEWTON, MAX_INNER_STEPS, N_COUNTED, N_REFINEMENTS, UNLIMITED,
+from lavender_ext.newton.interior_phases cimport (begin_interior_steps, begin_interior_with_newton, compute_sliding_fraction,
+                                                  step_interior_point, step_interior_with_newton)
+from lavender_ext.newton.run cimport (ACTIVE_SET, DAMPED_NEWTON, DAMPED_STRETCHES, DE_SAXCE, INTERIOR_POINT,
+                                      INTERIOR_WITH_NEWTON, MAX_INNER_STEPS, N_COUNTED, N_REFINEMENTS, UNLIMITED,
                                       PLAN_CONVEX, PLAN_COULOMB, SHIFTED_NEWTON, begin_separate_best, convex_residual,
                                       compute_slack, copy_vector, de_saxce_t, end_separate_best, is_at_roundoff,
                                       is_budget_spent, is_finished, is_over, newton_t, pop_phase, push_phase, restore_best_of_all,
                                       restore_best_before_phase, judge_and_keep_best_point, store_earlier_best, write_unknown)
 from lavender_ext.newton.steps cimport begin_interior_point, has_free_rows, compute_proximal_weight
-from lavender_ext.newton.system cimport (BARRIER, BODIES, SPARSE, factor_newton_system, multiply_system_matrix,
+from lavender_ext.newton.system cimport (BARRIER, BODIES, factor_newton_system, multiply_system_matrix,
                                          solve_newton_system)
 
 
 cdef enum:                      # states of PLAN_CONVEX
     START_ACTIVE_SET = 0
     UNBOUNDED_ACTIVE_SET = 1
-    ROWS_DAMPED_NEWTON = 2
-    ROWS_INTERIOR_POINT = 3
-    FIRST_CONE_WEIGHT = 4
-    SECOND_CONE_WEIGHT = 5
-    AUGMENTED_INTERIOR_POINT = 6
-    CONVEX_DAMPED_NEWTON = 7
-    CONVEX_END = 8
+    ROWS_INTERIOR_POINT = 2
+    FIRST_CONE_WEIGHT = 3
+    SECOND_CONE_WEIGHT = 4
+    THIRD_CONE_WEIGHT = 5
+    CONVEX_DAMPED_NEWTON = 6
+    CONVEX_END = 7
 
 cdef enum:                      # states of PLAN_COULOMB
     START_SHIFTED = 0
@@ -79,10 +72,9 @@ cdef enum:                      # states of PLAN_COULOMB
     FIRST_SHIFTED = 4
     FIRST_PATH = 5
     SECOND_DE_SAXCE = 6
-    AUGMENTED_DE_SAXCE = 7
-    MORE_PATHS = 8
-    COULOMB_DAMPED_NEWTON = 9
-    COULOMB_END = 10
+    MORE_PATHS = 7
+    COULOMB_DAMPED_NEWTON = 8
+    COULOMB_END = 9
 
 cdef enum:                      # states of DE_SAXCE
     DE_SAXCE_INTERIOR = 0
@@ -99,8 +91,8 @@ cdef enum:
     START_FACTORISATIONS = 8    # First stretch of damped Newton; a start near a solution gains within it.
     FIRST_END_INNER_STEPS = 10
     FIRST_END_FACTORISATIONS = 15   # Factorisations of the first damped Newton phase after De Saxce's interior point.
+    MAX_RIGID_ROWS = 10000      # With more rows, a path precedes the second De Saxce point: 0.65 of the time on 12,147 rows.
     SECOND_END_FACTORISATIONS = 12  # Factorisations and inner steps of the second damped Newton phase after it.
-    MAX_AUGMENTED_ROWS = 10000  # With more rows, one factorisation of the augmented system may exceed 0.2 s.
 
 
 cdef inline double first_derivative_fraction() noexcept nogil:
@@ -109,10 +101,7 @@ cdef inline double first_derivative_fraction() noexcept nogil:
 
 
 cdef inline double second_derivative_fraction() noexcept nogil:
-    """Return the part of phi's derivative after a failure of the first part.
-
-    On the augmented system this part comes first, since no damped Newton phase follows there.
-    """
+    """Return the part of phi's derivative after a failure of the first part."""
     return 0.7
 
 
@@ -149,6 +138,15 @@ cdef inline double first_cone_weight() noexcept nogil:
     redundant contacts, 1e-10 ends at a residual of 3e-8 and 1e-8 at 4e-10; 1e-6 takes one more step.
     """
     return 1e-8
+
+
+cdef inline double third_cone_weight() noexcept nogil:
+    """Return the third proximal weight on cones, for bodies whose masses differ by 1e5 and more.
+
+    Of six pyramids under the cone law (5 to 7 layers, mass ratios of 1e5 to 1e7), damped Newton solves five from its point
+    to 1e-8 and the sixth to its round-off limit. From the point of the second weight it solves none.
+    """
+    return 1e-13
 
 
 # -- first points of bounded rows --------------------------------------------------------------------------------------
@@ -227,7 +225,7 @@ cdef inline void enter_next_convex_state(newton_t* n) noexcept nogil:
     """Enter the next state of the convex laws."""
     cdef int32_t state = n.stage
     n.stage = state + 1
-    if state == UNBOUNDED_ACTIVE_SET and not n.is_cold or state == ROWS_DAMPED_NEWTON:
+    if state == UNBOUNDED_ACTIVE_SET and not n.is_cold or state == ROWS_INTERIOR_POINT:
         if not is_finished(n):
             restore_best_before_phase(n)
     if state != START_ACTIVE_SET and state != FIRST_CONE_WEIGHT and is_over(n):
@@ -239,28 +237,22 @@ cdef inline void enter_next_convex_state(newton_t* n) noexcept nogil:
         begin_unbounded_point(n)
         if not is_finished(n):
             begin_separate_active_set(n, n.ip.unbounded_z)
-    elif state == ROWS_DAMPED_NEWTON:
-        if n.s.form == BODIES or (n.s.form == SPARSE and not n.s.symmetric):
-            begin_damped_newton(n, n.best_z, CONE, 1e-3, MAX_INNER_STEPS)
-            begin_damped_newton_stretches(n, STRETCH_FACTORISATIONS, 1.0 / 0.0)
     elif state == ROWS_INTERIOR_POINT:
         begin_interior_steps(n, True)
-        n.stage = AUGMENTED_INTERIOR_POINT
+        n.stage = CONVEX_DAMPED_NEWTON
     elif state == FIRST_CONE_WEIGHT:
         begin_interior_point(n, first_cone_weight(), 0.0)
         begin_interior_steps(n, False)
     elif state == SECOND_CONE_WEIGHT:
         begin_interior_point(n, compute_proximal_weight(), 0.0)
         begin_interior_steps(n, False)
-    elif state == AUGMENTED_INTERIOR_POINT:
-        restore_best_of_all(n)
-        if n.best < 1e-3 and n.has_augmented:           # Nearly dependent rows may prevent further progress.
-            n.s.augmented = 1
-            begin_interior_point(n, augmented_shift(), 0.0)
-            n.s.augmented = 0
-            begin_interior_with_newton(n, CONE, 1)
+    elif state == THIRD_CONE_WEIGHT:
+        begin_interior_point(n, third_cone_weight(), 0.0)
+        begin_interior_steps(n, False)
     elif state == CONVEX_DAMPED_NEWTON:
-        begin_damped_newton(n, n.best_z, CONE, 1e-3, MAX_INNER_STEPS)
+        restore_best_of_all(n)
+        # Of cones, the last interior point is nearer to a solution than the point with the lowest residual.
+        begin_damped_newton(n, n.best_z if n.s.bt == NULL else n.progress.best_z, CONE, 1e-3, MAX_INNER_STEPS)
         push_damped_newton(n, UNLIMITED)
     else:
         restore_best_of_all(n)
@@ -272,13 +264,7 @@ cdef inline void enter_next_convex_state(newton_t* n) noexcept nogil:
 
 cdef inline void begin_de_saxce(newton_t* n, double derivative_fraction, double max_residual) noexcept nogil:
     """Begin De Saxce's interior point; damped Newton ends it if its residual is at most `max_residual`."""
-    n.de_saxce = de_saxce_t(derivative_fraction, 0.0, max_residual, DE_SAXCE_INTERIOR, False)
-    push_phase(n, DE_SAXCE)
-
-
-cdef inline void begin_augmented_de_saxce(newton_t* n) noexcept nogil:
-    """Begin De Saxce's interior point on the augmented system, with two fractions of phi's derivative in turn."""
-    n.de_saxce = de_saxce_t(second_derivative_fraction(), first_derivative_fraction(), 0.0, DE_SAXCE_INTERIOR, True)
+    n.de_saxce = de_saxce_t(derivative_fraction, max_residual, DE_SAXCE_INTERIOR)
     push_phase(n, DE_SAXCE)
 
 
@@ -297,17 +283,12 @@ cdef inline void enter_next_de_saxce_state(newton_t* n) noexcept nogil:
     cdef double best
     x.stage = state + 1
     if state == DE_SAXCE_INTERIOR:
-        n.s.augmented = x.augmented
-        begin_interior_point(n, augmented_shift() if x.augmented else compute_proximal_weight(), x.derivative_fraction)
-        n.s.augmented = 0
-        begin_interior_with_newton(n, COULOMB, x.augmented)
+        begin_interior_point(n, compute_proximal_weight(), x.derivative_fraction)
+        begin_interior_with_newton(n)
         return
     best = n.progress.lowest if state == DE_SAXCE_FIRST_END else end_separate_best(n, n.progress.best_z)
     if is_over(n) or state == DE_SAXCE_ENDED:
         pop_phase(n)
-    elif x.next_fraction > 0.0:
-        x.derivative_fraction, x.next_fraction = x.next_fraction, 0.0
-        x.stage = DE_SAXCE_INTERIOR
     elif state == DE_SAXCE_FIRST_END and best > x.max_residual:
         pop_phase(n)
     elif state == DE_SAXCE_FIRST_END:
@@ -329,9 +310,8 @@ cdef inline bint slides_mostly(newton_t* n, const double* z) noexcept nogil:
 cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
     """Enter the next state of Coulomb's law."""
     cdef int32_t state = n.stage
-    # Loops of rigid joints have nearly dependent rows. Whether the caller can factor the augmented system must not change the
-    # result.
-    cdef bint has_rigid_joints = n.s.form == BODIES and n.s.e.m <= MAX_AUGMENTED_ROWS and has_free_rows(n)
+    # Loops of rigid joints have nearly dependent rows.
+    cdef bint has_rigid_joints = n.s.form == BODIES and n.s.e.m <= MAX_RIGID_ROWS and has_free_rows(n)
     n.stage = state + 1
     if state != START_SHIFTED and is_over(n):
         state = COULOMB_END
@@ -365,9 +345,6 @@ cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
             begin_path(n)
     elif state == SECOND_DE_SAXCE:
         begin_de_saxce(n, second_derivative_fraction(), 1.0 / 0.0)
-    elif state == AUGMENTED_DE_SAXCE:
-        if n.has_augmented and has_rigid_joints:
-            begin_augmented_de_saxce(n)
     elif state == MORE_PATHS:
         if n.path.paths < N_PATHS:
             n.stage = MORE_PATHS
@@ -397,8 +374,6 @@ cdef inline void step_phase(newton_t* n) noexcept nogil:
         step_interior_point(n)
     elif phase == INTERIOR_WITH_NEWTON:
         step_interior_with_newton(n)
-    elif phase == AUGMENTED_NEWTON:
-        step_augmented_newton(n)
     elif phase == DAMPED_NEWTON:
         step_damped_newton(n)
     elif phase == SHIFTED_NEWTON:
@@ -415,13 +390,12 @@ cdef inline void start_newton_solve(newton_t* n, const double* lam) noexcept nog
     cdef bint has_cones = n.s.e.n < n.s.e.m
     n.stop = n.needs_check = n.proven = n.has_saved_best = n.depth = n.path.paths = 0
     n.has_convex_start = n.mostly_slides = 0
-    n.s.augmented = n.s.factorisations = 0
+    n.s.factorisations = 0
     for i in range(N_COUNTED):
         n.counts[i] = 0
     n.best = 1.0 / 0.0
     n.above_floor = 1.0 / 0.0
     n.island_best.seen = 0
-    n.has_augmented = n.s.form == BODIES and n.s.others != NULL and n.s.e.m <= MAX_AUGMENTED_ROWS
     n.is_cold = is_zero_impulse(&n.problem.p, lam)
     n.stage = FIRST_CONE_WEIGHT if has_cones and n.problem.p.law != COULOMB else 0
     write_unknown(n, lam, n.trial)

@@ -105,6 +105,13 @@ def test_faces_under_the_cone_law_where_the_first_interior_point_stops_short():
     assert solution.work["factorisations"] <= 300, solution
 
 
+@pytest.mark.parametrize(("layers", "ratio"), [(5, 1e6), (7, 1e6), (6, 1e5), (6, 1e7)])
+def test_sliding_pyramid_under_cone_law_needs_third_proximal_weight(layers, ratio):
+    pyramid = suite.pyramid(k=layers, mass_ratio=ratio, friction="coulomb", sliding=0.5).problem
+    solution = lv.solve(pyramid.relaxed("cone"), "newton", tol=1e-8, max_iter=300)
+    assert good(solution, 1e-8), solution
+
+
 SLIDING_PILE = "granularF(n=4, sliding=2, seed=10)"  # Four of its 293 contacts slide.
 
 
