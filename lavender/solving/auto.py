@@ -21,7 +21,7 @@
                      a quarter more
     certificate      a search for a proof that no solution exists: for J and M from the smallest violation of the
                      constraints, for other problems under Coulomb's law by a linear program
-    alternation      the factorising solvers, `admm`, `nncg` and sweeps, each continued where it stopped, with doubled
+    alternation      the factorising solvers, `admm` and sweeps, each continued where it stopped, with doubled
                      work in each round, until no solver improves the residual in two rounds or the total cost exceeds
                      `total_ratio` times the cost of the cheapest. On large problems with friction, a round begins with
                      a tenth of a turn of `admm`, which continues while one more is predicted to solve the problem
@@ -120,7 +120,6 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "newton": ("newton", {}),
     "newton over rows": ("newton", {"form": "impulse"}),
     "direct": ("direct", {}),
-    "nncg": ("nncg", {"order": "symmetric", "restart": "against"}),
     "admm": ("admm", {}),
     # On large piles, `admm` needs fewer iterations from zero than from an iterate of sweeps.
     "admm from zero": ("admm", {}),
@@ -684,7 +683,7 @@ class DecisionTree:
         times *= DECISIONS.budget_ratio
         p, cost, setup = self.problem, times * self.unit, 0.0
         why = f"in turn, {times:g} times the cheapest factorising solver's cost"
-        n = 0.5 * cost / self.sweep  # An iteration of `admm` and `nncg` costs as much as two sweeps.
+        n = 0.5 * cost / self.sweep  # An iteration of `admm` costs as much as two sweeps.
         if p.generalized is not None:
             # `admm` forms and factors A of J and M. Its set-up cost does not depend on cached data.
             setup = estimate_formation_cost(p, "newton over rows" in self.states)
@@ -695,7 +694,6 @@ class DecisionTree:
         yield from (self.factorisation(name, cost, why) for name in self.solver_costs)
         if setup <= cost:
             yield from self.repeat_while_converging(Stage("admm", n, cost, why))
-        yield Stage("nncg", n, cost, why)
         if not self.sweeps_failed and not p.cones.has_round:
             before = self.best
             yield self.sweeps(cost, why)
@@ -783,8 +781,6 @@ class Auto(Solver):
                 if result is not None and result.relative <= tol:
                     claim = AUTO.make_claim(problem, counts, impulse, result.relative)
                     if claim.iterations <= max_iter:
-                        if recorder is not None:
-                            recorder.record_compiled_call(impulse, tol, claim)
                         impulse[:] = result.impulse
                         return replace(claim, judged=result)
         failed = AUTO.list_claims_of_failed_call(problem, counts)
@@ -877,13 +873,13 @@ def solve_unsolved_islands(log: SolveLog, first_stage: int) -> bool:
 
 
 def sweep_until_deadline(log: SolveLog, tree: DecisionTree, steps: dict[str, Step]) -> None:
-    """Use the remaining time for sweeps, and for `nncg` if they end: no factorising solver would end in time.
+    """Use the remaining time for sweeps: no factorising solver would end in time.
 
     On large problems with friction, `admm`, which needs no factor there, gets half of the time after the first half.
     """
     log.timed_out = True
     shared = ("anderson", "admm from zero") if starts_relaxed(log.problem) else ()
-    for k, name in enumerate((*shared, "anderson", "nncg")):
+    for k, name in enumerate((*shared, "anderson")):
         step = steps[name] = steps.get(name) or create_solver_step(name, log, tree)
         setup = 0.0 if step.state is not None else estimate_cost(name, log.problem).setup
         if not step.over and (name == "anderson" or log.deadline.fits(setup)):

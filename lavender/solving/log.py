@@ -23,12 +23,10 @@ from lavender.judge.residuals import (
 )
 from lavender.judge.solution import Claim, SolverStage, Status, sum_work_counts
 from lavender.problem import Problem
-from lavender.solvers.small import AUTO, NO_TIME_MESSAGE, NO_WORK_MESSAGES, describe_stages
+from lavender.solvers.small import NO_TIME_MESSAGE, NO_WORK_MESSAGES, describe_stages
 from lavender.solving.loop import Loop, Record
 from lavender_ext.judge.measure import residuals_by_island
 
-MIN_SAMPLED_COST = 100.0  # [ns] Smallest limit of the counted cost in repeated compiled calls.
-SAMPLED_COST_RATIO = 1.25  # [-] Ratio of consecutive limits of the counted cost.
 # Key in `Derived.cache` of the problem's convex relaxation.
 RELAXATION_KEY = "lavender.solving.log: relaxation"
 
@@ -211,9 +209,8 @@ class Recorder:
     """Writes the history of one solve: the residual after each recorded iteration of each stage.
 
     A stage of sweeps or of another resumable solver is recorded after 1, 2, ..., 16 iterations of the stage, and then
-    each time after an eighth more. Newton's method and `direct` are recorded at the end of their stage. The compiled
-    call is repeated with smaller limits of its estimated cost, since it returns the iterate at the limit. `solve` is
-    the loop of the solve, which holds the records. Recording does not change the result.
+    each time after an eighth more. Newton's method, `direct` and the compiled call are recorded at their end. `solve`
+    is the loop of the solve, which holds the records. Recording does not change the result.
     """
 
     solve: Loop
@@ -237,11 +234,9 @@ class Recorder:
                 self.records.append(record)
                 self.solve.record_solvers.append(solver)
 
-    def record_impulse(
-        self, solver: str, iterations: int, impulse: FloatArray, time: float | None = None
-    ) -> None:
+    def record_impulse(self, solver: str, iterations: int, impulse: FloatArray) -> None:
         """Record an impulse (m,) [N s] after this number of iterations of all stages."""
-        time, watch = self.time if time is None else time, Stopwatch()
+        time, watch = self.time, Stopwatch()
         r = residual(self.solve.problem, impulse, "float64")
         self.append_later_records(solver, [(iterations, time, r.relative, r.energy, r.velocity)])
         self.solve.recording_time += watch.elapsed_seconds
@@ -251,22 +246,3 @@ class Recorder:
         self.solve.recording_time += loop.recording_time
         records = loop.records or ()
         self.append_later_records(solver, [(iterations + r[0], time + r[1], *r[2:]) for r in records])
-
-    def record_compiled_call(self, start: FloatArray, tol: float, claim: Claim) -> None:
-        """Record the compiled call from `start` (m,) [N s], which is repeated with smaller limits of its cost."""
-        call_end = self.time  # A repetition that the system interrupts may take longer than the call itself.
-        problem, excluded, cost = self.solve.problem, Stopwatch(), MIN_SAMPLED_COST
-        before = self.solve.recording_time
-        while claim.iterations > self.records[-1][0]:
-            watch = Stopwatch()
-            result, counts = AUTO.solve_and_judge(problem, start, tol, cost)
-            seconds = min(max(watch.elapsed_seconds, self.records[-1][1]), call_end)
-            if result is not None:
-                part = AUTO.make_claim(problem, counts, start, result.relative)
-                if part.iterations <= claim.iterations:
-                    name = part.stages[-1].solver if part.stages else "auto"
-                    self.record_impulse(name, part.iterations, result.impulse, seconds)
-                if result.relative <= tol:
-                    break
-            cost *= SAMPLED_COST_RATIO
-        self.solve.recording_time = before + excluded.elapsed_seconds

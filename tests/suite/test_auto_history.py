@@ -14,7 +14,7 @@ CASES = {
     "granularF(n=3, sliding=0.5)": {"start", "anderson", "newton"},
     "anisotropic(ratio=100, speed=3)": {"start", "anderson"},
     "hang(n=33)": {"start", "direct"},
-    "wedge(angle=1e-8)": {"start", "anderson", "newton", "admm", "nncg", "linear program"},
+    "wedge(angle=1e-8)": {"start", "anderson", "newton", "admm", "linear program"},
 }
 
 
@@ -33,10 +33,9 @@ def test_the_history_has_all_stages_and_changes_no_bit(name):
     assert history.relative[-1] == recorded.residual.relative
 
 
-def test_sweeps_within_the_compiled_call_are_recorded():
-    history = lv.solve(lv.suite.case("ramp(angle=30)").problem, history=True).history
-    assert len(history.iterations) > 2
-    assert np.all(np.diff(history.relative) < 0.0)
+def test_history_of_compiled_call_has_its_start_and_its_end():
+    solution = lv.solve(lv.suite.case("ramp(angle=30)").problem, history=True)
+    assert solution.history.iterations.tolist() == [0, solution.iterations]
 
 
 def test_a_start_that_is_a_solution_has_one_record():
