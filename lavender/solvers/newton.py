@@ -17,12 +17,12 @@
 
 Problems in generalised coordinates are first solved over their velocities (`newton_systems/general.py`), without
 forming A. Unless rows far outnumber velocities, this kernel runs method 4 over a dense A under Coulomb's law, and
-methods 1 and 2 if bounded rows with a compliance below 0.005 d have two bounds. Under Coulomb's law, a sparse A is
-formed if its factor is estimated to cost less. Methods 1 to 4 over the rows of A are also used if they are estimated to
-cost less than a tenth (few rows of a soft body), and afterwards if the method over velocities fails, unless
-form="velocity". If the velocities belong to free rigid bodies and every block couples at most two of these, methods 1
-to 4 run over the bodies and not over A; under Coulomb's law, and if many contacts are rigid, they then replace the
-method over velocities (`SmallCall.cost_limit`).
+methods 1 and 2 if bounded rows with a compliance below 0.005 d have two bounds. A sparse A is formed if its factor is
+estimated to cost less, or a tenth if the law is not Coulomb's. Methods 1 to 4 over the rows of A are also used if they
+are estimated to cost less than a tenth (few rows of a soft body), and afterwards if the method over velocities fails,
+unless form="velocity". If the velocities belong to free rigid bodies and every block couples at most two of these,
+methods 1 to 4 run over the bodies and not over A; under Coulomb's law, and if many contacts are rigid, they then
+replace the method over velocities (`SmallCall.cost_limit`).
 
 Methods 1 to 4 are compiled and run one factorisation at a time; `lavender_ext/newton/plan.pxd` has the table of their
 states. Between factorisations, Python checks the clock, Ctrl-C and certificates. `newton_systems/` builds the linear
@@ -178,7 +178,7 @@ class Newton(Solver):
         return self._choose_form_and_build_state(problem, None)
 
     def _choose_form_and_build_state(self, problem: Problem, like: System | None) -> NewtonState:
-        """Choose the form and build the state; `like` is a system whose layout may be reused.
+        """Choose the form and build the state; the layout of the system `like` may be reused.
 
         Raises
         ------
@@ -283,6 +283,20 @@ class Newton(Solver):
             return Claim(Status.STALLED, claim.iterations, claim.work)
         return claim
 
+    def prepare_continuation(self, state: NewtonState) -> NewtonState | None:
+        """Build the state over bodies or over the rows of A that continues the method over velocities.
+
+        Return None if `form` is "velocity", or if A has more than `MAX_FORMED_ROWS` rows or round cones.
+        """
+        problem = state.problem
+        bodies = find_bodies(problem)
+        if bodies is None and (
+            self.form == "velocity" or problem.m > MAX_FORMED_ROWS or problem.cones.has_round
+        ):
+            return None
+        system = make_system(problem, "impulse" if bodies is None else "velocity", bodies=bodies)
+        return NewtonState(problem, system if system.solve.m else None)
+
     def _run_over_velocities(
         self, state: NewtonState, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None
     ) -> Claim:
@@ -296,10 +310,8 @@ class Newton(Solver):
         remaining = max_iter - claim.iterations
         if claim.status not in (Status.STALLED, Status.NUMERICAL_ERROR, Status.DIVERGED) or remaining <= 0:
             return claim
-        bodies = find_bodies(problem)
-        if bodies is None and (
-            self.form == "velocity" or problem.m > MAX_FORMED_ROWS or problem.cones.has_round
-        ):
+        continuation = self.prepare_continuation(state)
+        if continuation is None:
             return claim
         w, e = np.empty(problem.m), np.empty(problem.m)
         best, above = compute_stopping_residual(problem, impulse, w, e, True)
@@ -308,10 +320,9 @@ class Newton(Solver):
         before = impulse.copy()
         if not best <= WARM_START_MAX_RESIDUAL:
             impulse[:] = problem.start()
-        system = make_system(problem, "impulse" if bodies is None else "velocity", bodies=bodies)
         second = self._run_system(
             problem,
-            system if system.solve.m else None,
+            continuation.system,
             impulse,
             remaining,
             tol,
@@ -382,15 +393,17 @@ def _has_sparse_coulomb_rows(problem: Problem) -> bool:
 
 
 def _is_sparse_matrix_faster(problem: Problem, work: float) -> bool:
-    """Return whether a factor of a sparse A of J and M takes less than `work` multiply-adds, under Coulomb's law.
+    """Return whether Newton's method over a sparse A of J and M takes less time than over velocities.
 
-    Over rows, Coulomb's law takes a third to a tenth of the steps over velocities. The factor of A without fill takes
-    entries^2 / (3 m) multiply-adds, each `SPARSE_WORK_RATIO` times as long as in a dense factor.
+    Over velocities a factor takes `work` multiply-adds, and over A without fill entries^2 / (3 m), each
+    `SPARSE_WORK_RATIO` times as long. Under Coulomb's law, a solve over rows takes a third to a tenth of the steps.
+    Under the other laws, the estimate must be a tenth.
     """
-    if not _has_sparse_coulomb_rows(problem):
+    entries, m = float(problem.metric.entries_of_matrix), float(problem.m)
+    if problem.cones.has_round or uses_dense_rows(entries, m, problem.law == "cone"):
         return False
-    entries = float(problem.metric.entries_of_matrix)
-    return SPARSE_WORK_RATIO * entries**2 / (3.0 * problem.m) <= work
+    ratio = 1.0 if problem.law == "coulomb" else VELOCITY_MAX_COST_RATIO
+    return ratio * SPARSE_WORK_RATIO * entries**2 / (3.0 * m) <= work
 
 
 def _run_stages(

@@ -16,7 +16,7 @@
                         below `slip_ratio` times Coulomb's: contacts slip
     sweeps           `anderson`, unless the problem is linear or large: `first_sweeps` sweeps. Sweeping continues up to
                      the cost of the cheapest factorising solver, unless more sweeps are predicted to be needed
-    factorisations   `newton` over velocities, bodies or rows of A, and for bounded rows of a matrix `direct`, the
+    factorisations   `newton` (over velocities, bodies or rows of A), and for bounded rows of a matrix `direct`, the
                      cheapest first, each up to `budget_ratio` times its estimated cost, on large problems with friction
                      a quarter more
     certificate      a search for a proof that no solution exists: for J and M from the smallest violation of the
@@ -66,7 +66,6 @@ from lavender.solvers.costs import (
     estimate_first_factor_cost,
     estimate_first_sweep_cost,
     estimate_formation_cost,
-    estimate_matrix_setup_cost,
     get_loose_limit,
 )
 from lavender.solvers.decisions import DECISIONS, describe_numbers
@@ -118,7 +117,6 @@ FORMATION_COST_RATIO = 4.0
 METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "anderson": ("anderson", {}),
     "newton": ("newton", {}),
-    "newton over rows": ("newton", {"form": "impulse"}),
     "direct": ("direct", {}),
     "admm": ("admm", {}),
     # On large piles, `admm` needs fewer iterations from zero than from an iterate of sweeps.
@@ -213,19 +211,25 @@ class Newton(Step):
     """Newton's method with the state that the tree has analysed.
 
     It starts from the best impulse. If it stalls after a start that is not the zero impulse, it starts once more from
-    zero, unless the compiled call has started from zero.
+    zero, unless the compiled call has started from zero. If it stalls over velocities again, it continues from the best
+    impulse over bodies or over the rows of A.
     """
 
     started_from_zero = is_second_start = has_stalled = False
 
     def run(self, n: float) -> None:
-        """Run at most n iterations, with a second start from zero if the first one stalls."""
-        log, done = self.log, self.log.iterations
+        """Run at most n iterations, with a second start from zero and over rows of A if the method stalls."""
+        log, end = self.log, self.log.iterations + n
         super().run(n)
         if self.has_stalled and not self.started_from_zero and not log.done():
             self.started_from_zero = self.is_second_start = True
             self.over = self.state.begun = False
-            super().run(n - (log.iterations - done))
+            super().run(end - log.iterations)
+        if self.has_stalled and self.state.general is not None and not log.done():
+            continuation = self.solver.prepare_continuation(self.state)
+            if continuation is not None:
+                self.state, self.is_second_start, self.over = continuation, False, False
+                super().run(end - log.iterations)
 
     def advance(self, n: int) -> Claim:
         """Run about n iterations; choose the start at the first call."""
@@ -404,7 +408,7 @@ class Sweeps(Iterations):
 
 #: Class of the step of each solver; the other solvers have `Iterations`.
 STEP_CLASSES = {
-    "anderson": Sweeps, "direct": Step, "newton": Newton, "newton over rows": Newton,
+    "anderson": Sweeps, "direct": Step, "newton": Newton,
     "newton on the relaxation": RelaxedNewton,
 }  # fmt: skip
 
@@ -473,29 +477,6 @@ class DecisionTree:
             return {name: get("newton").load()(**METHODS[name][1]).prepare(self.problem)}
         except BREAKDOWN:
             return {}
-
-    @cached_property
-    def row_form_cost(self) -> float:
-        """Lower bound of the cost [ns] of Newton's method over A formed from J and M; inf if A cannot be formed."""
-        p, state = self.problem, self.states.get("newton")
-        if state is None or state.general is None or p.cones.has_round:
-            return inf
-        return estimate_cost("newton over rows", p).total
-
-    def analyse_row_form_if_cheaper(self, max_cost: float) -> bool:
-        """Add Newton's method over the rows of A = J M^-1 J^T to `states`, and return whether it was added.
-
-        It is added if it costs less than `max_cost` [ns] and can end before the deadline.
-        """
-        p, states = self.problem, self.states
-        if "newton over rows" in states or self.row_form_cost >= max_cost or self.is_late:
-            return False
-        if self.deadline.is_set and not self.deadline.fits(
-            estimate_matrix_setup_cost(p) + 3.0 * estimate_formation_cost(p)
-        ):
-            return False
-        self.states = states | self.prepare_newton("newton over rows")  # pyright: ignore[reportAttributeAccessIssue]
-        return len(self.states) > len(states)  # pyright: ignore[reportArgumentType]
 
     @property
     def solver_costs(self) -> dict[str, float]:
@@ -612,7 +593,6 @@ class DecisionTree:
             yield Stage("direct", n, ratio * self.direct, "a narrow band: before any analysis")
         elif not (relaxed or self.factorises_first):
             yield self.sweeps(first, "the first sweeps, before any analysis")
-        self.analyse_row_form_if_cheaper(ratio * self.newton if self.compiled_call_failed else self.newton)
         if not self.factorises_first and first < self.newton < inf:
             why = f"up to {format_seconds(1e-9 * self.newton)}, as much as {next(iter(self.solver_costs))} costs"
             yield self.sweeps(self.newton - first, why, self.newton)
@@ -625,7 +605,6 @@ class DecisionTree:
         for stage in self.iterate_factorising_stages(LARGE_BUDGET_FACTOR * ratio if relaxed else ratio):
             if not (pivots_first and stage.solver == "direct"):  # It has had this budget.
                 yield stage
-        self.analyse_row_form_if_cheaper(ratio * self.newton)
         if self.law == "coulomb" and p.generalized is None and ratio * self.unit >= RATES["linear program"]:
             yield Stage("certificate", 1.0, RATES["linear program"], "whether a linear program proves it")
         yield from self.iterate_alternating_stages()
@@ -674,8 +653,7 @@ class DecisionTree:
                 fraction = min(1.0, self.remaining_cost / stage.cost)
                 self.remaining_cost -= fraction * stage.cost
                 yield replace(stage, iterations=fraction * stage.iterations, cost=fraction * stage.cost)
-            no_gain = k > 0 and self.best >= before
-            if no_gain and not self.analyse_row_form_if_cheaper(DECISIONS.total_ratio * self.unit):
+            if k > 0 and self.best >= before:
                 return
 
     def iterate_one_round(self, times: float) -> Iterator[Stage]:
@@ -686,7 +664,7 @@ class DecisionTree:
         n = 0.5 * cost / self.sweep  # An iteration of `admm` costs as much as two sweeps.
         if p.generalized is not None:
             # `admm` forms and factors A of J and M. Its set-up cost does not depend on cached data.
-            setup = estimate_formation_cost(p, "newton over rows" in self.states)
+            setup = estimate_formation_cost(p, False)
             setup += estimate_first_factor_cost(p.m, float(p.metric.entries_of_matrix))
         if setup <= cost and starts_relaxed(p):
             fraction = EARLY_ADMM_FRACTION

@@ -199,7 +199,7 @@ cdef inline void step_damped_newton(newton_t* n) noexcept nogil:
 
 
 cdef inline void begin_damped_newton_stretches(newton_t* n, int32_t length, double residual) noexcept nogil:
-    """Begin a damped Newton phase whose first stretch of `length` factorisations must halve `residual`."""
+    """Begin a damped Newton phase; its first stretch of `length` factorisations must halve `residual`."""
     n.stretches.residual, n.stretches.length = residual, length
     n.stretches.is_running = n.stretches.stretches = 0
     push_phase(n, DAMPED_STRETCHES)

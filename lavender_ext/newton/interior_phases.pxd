@@ -1,6 +1,6 @@
 """Phases of interior points: of the convex law and of De Saxce's form.
 
-`steps.pxd` has the equations and takes each step, whose length `interior.pxd` limits. A phase repeats them and decides when
+`steps.pxd` has the equations and takes each step; `interior.pxd` limits its length. A phase repeats them and decides when
 to stop or to try to finish by another method:
 
     phase                  step              event                                               next
@@ -134,7 +134,7 @@ cdef inline void find_interior_certificate(newton_t* n) noexcept nogil:
 
         y <- y - (H + W)^-1 H y,   W z = u                                                                (1)
 
-    with W of the last step. Elements whose z does not exceed its dual u are fixed, and so are those whose bounds y leaves.
+    with W of the last step. Elements with a z that does not exceed its dual u are fixed, and so are those with bounds that y leaves.
     """
     cdef system_t* s = &n.s
     cdef const elements_t* e = s.e

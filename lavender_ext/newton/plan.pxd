@@ -141,7 +141,7 @@ cdef inline double first_cone_weight() noexcept nogil:
 
 
 cdef inline double third_cone_weight() noexcept nogil:
-    """Return the third proximal weight on cones, for bodies whose masses differ by 1e5 and more.
+    """Return the third proximal weight on cones, for masses that differ by factors of 1e5 and more.
 
     Of six pyramids under the cone law (5 to 7 layers, mass ratios of 1e5 to 1e7), damped Newton solves five from its point
     to 1e-8 and the sixth to its round-off limit. From the point of the second weight it solves none.
