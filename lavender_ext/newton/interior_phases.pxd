@@ -134,7 +134,8 @@ cdef inline void find_interior_certificate(newton_t* n) noexcept nogil:
 
         y <- y - (H + W)^-1 H y,   W z = u                                                                (1)
 
-    with W of the last step. Elements with a z that does not exceed its dual u are fixed, and so are those with bounds that y leaves.
+    with W of the last step. Elements with a z that does not exceed its dual u are fixed, and so are elements if y leaves their
+    bounds.
     """
     cdef system_t* s = &n.s
     cdef const elements_t* e = s.e

@@ -1,4 +1,8 @@
-/* A tower of boxes, stepped by an engine of one page: its contact list in, impulses out, judged in every step. */
+/* A tower of boxes, stepped by an engine of one page: its contact list in, impulses out, judged in every step.
+ *
+ *     lavender export c liblavender
+ *     cc -std=c11 -ffp-contract=off -I liblavender tower.c liblavender/lavender.c -lm -o tower
+ */
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
