@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
+from lavender.base.errors import InputError
 from lavender.external.convex import ScaledProgram
 from lavender.external.running import Answer, Call, Limits, classify_status, quiet
 from lavender.judge.solution import Status
@@ -206,7 +207,12 @@ def _call_through_qpsolvers(
         g, h = program.select_rows(np.zeros(0, int), 1.0, dense), np.ones(1)
         g.resize((1, n))
     problem = qpsolvers.Problem(program.get_hessian(dense), program.q, g, h, a, b, lb, ub)
-    solution = qpsolvers.solve_problem(problem, backend.name, initvals=x0, **settings)
+    try:
+        solution = qpsolvers.solve_problem(problem, backend.name, initvals=x0, **settings)
+    except TypeError as error:
+        if not extra:
+            raise
+        raise InputError(f"{backend.name} rejected the settings {', '.join(extra)}: {error}") from None
     # Collect the status, the iterate and the multipliers.
     extras = solution.extras or {}
     status, text = _get_status(solution, extras)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -181,6 +182,10 @@ class QPSolver(Solver):
         """Solve a quadratic program; return its best point with the judge's error, and the backend's claim."""
         program = get_program(qp)
         self._check_size(program)
+        if deadline.is_set:
+            begin = perf_counter()
+            self.start_workers(None, 0.0)
+            deadline.reserve_seconds(begin - perf_counter())
         judge = ProgramJudge(program, tol)
         return judge, self._call(program, judge, max_iter, tol, deadline, start)
 
@@ -242,7 +247,7 @@ class QPSolver(Solver):
             status, result.iterations, result.work, result.message, form.name, dual=dual, certificate=certificate
         )  # fmt: skip
 
-    def start_workers(self, state: Form, time_limit: float) -> None:
+    def start_workers(self, state: Form | None, time_limit: float) -> None:
         """Import the backend's code, in the process that runs it, before the clock of a time limit starts."""
         if self.isolate:
             start_process(self.backend)

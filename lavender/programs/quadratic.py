@@ -20,6 +20,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray, check_float, mark_read_only
 from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError
+from lavender.base.lazy_import import sparse as sp
 from lavender.external.forms import get_program
 from lavender.external.proofs import find_infeasibility_proof, find_ray
 from lavender.external.qp_solver import ProgramJudge, QPSolver, get_false_claim_error
@@ -131,8 +132,11 @@ def solve_qp(
             solver, q = q, None
         problem = _update_program(P, q, h, b, (G, A, lb, ub))
     else:
-        hessian = np.zeros((np.size(q), np.size(q))) if P is None else P
-        problem = Problem.from_qp(hessian, q, G, h, A, b, lb, ub)
+        if P is None:
+            if q is None:
+                raise InputError("P and q are missing; q is needed, and P unless the program is linear")
+            P = sp.csr_array((np.size(q), np.size(q)))
+        problem = Problem.from_qp(P, q, G, h, A, b, lb, ub)
     tol = check_float("tol", tol, low=0.0)
     limit = check_time_limit(time_limit)
     deadline = Deadline(None if limit == math.inf else limit)
@@ -345,7 +349,7 @@ class _Task:
             message = "the objective decreases without limit along the ray"
         elif last.status is INFEASIBLE and not is_found:
             message = f"{message}; not proven: no certificate was found"
-        if self.judge.has_step:
+        elif self.judge.has_step and is_found:
             message = f"{message}; with one Newton step on the active rows".removeprefix("; ")
         stages: tuple[SolverStage, ...] = ()
         if self.spec.delegates:
