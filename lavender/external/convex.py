@@ -28,7 +28,7 @@ from lavender.base.lazy_import import import_module_under_lock
 from lavender.base.lazy_import import sparse as sp
 from lavender.problem.derived import cached_property
 from lavender.problem.generalized import Compressed
-from lavender_ext.judge.program import equilibrate_program, judge_program
+from lavender_ext.judge.program import equilibrate_program, judge_program, scale_rows
 
 IntArray = npt.NDArray[np.int32]
 MAX_BACKEND_NUMBER = 1e20  # Backends treat larger numbers as infinite, or fail.
@@ -40,6 +40,7 @@ MAX_SINGULAR_PIVOT = 1e-13
 # [-] Multiples of the largest diagonal entry that are added to a singular P for backends that need a definite one, in
 # the first and in the second call. The Newton step removes their effect.
 DEFINITE_SHIFTS = 1e-7, 1e-5
+MAX_STORED_ENTRIES = 10**5  # A J of at most this many dense entries is stored as a dense matrix.
 # Variables and active rows up to which the matrix of the Newton step is dense, and up to which the step is done.
 MAX_DENSE_STEP_SIZE, MAX_STEP_SIZE = 1000, 20_000
 # [-] Shift of the diagonal of a sparse matrix of the step, which may be singular; each refinement reduces its effect.
@@ -89,12 +90,7 @@ class ConvexProgram:
     def scaled(self) -> ScaledProgram:
         """The program in scaled variables."""
         d, e, sigma, c = self.scales
-        weight = c * sigma * sigma
-        # Copies of the indices, because SciPy sorts them in place.
-        ptr, idx, value = self.P
-        hessian = ptr.copy(), idx.copy(), value * np.repeat(weight * d, np.diff(ptr)) * d[idx]
-        ptr, idx, value = self.J
-        jac = ptr.copy(), idx.copy(), value * np.repeat(e, np.diff(ptr)) * d[idx]
+        hessian, jac = scale_rows(self.P, c * sigma * sigma * d, d), scale_rows(self.J, e, d)
         return ScaledProgram(
             P=hessian, q=c * sigma * d * self.q, J=jac, t=e * self.t / sigma, free=self.free,
             variable=self.variable, cones=self.cones,
@@ -204,7 +200,7 @@ class ScaledProgram(ConvexProgram):
     @cached_property
     def is_definite(self) -> bool:
         """Whether P has a Cholesky factor without negligible pivots."""
-        P = self._dense[0]
+        P = self._dense_hessian
         try:
             pivots = np.square(np.linalg.cholesky(P).diagonal())
         except np.linalg.LinAlgError:
@@ -248,9 +244,14 @@ class ScaledProgram(ConvexProgram):
         return lb, ub
 
     @cached_property
-    def _dense(self) -> tuple[FloatArray, FloatArray]:
-        """P and J as dense matrices."""
-        return to_dense(self.P, self.n), to_dense(self.J, self.n)
+    def _dense_jacobian(self) -> FloatArray:
+        """J as a dense matrix."""
+        return to_dense(self.J, self.n)
+
+    @cached_property
+    def _dense_hessian(self) -> FloatArray:
+        """P as a dense matrix."""
+        return to_dense(self.P, self.n)
 
     @cached_property
     def _sparse(self) -> dict[Any, Any]:
@@ -260,7 +261,8 @@ class ScaledProgram(ConvexProgram):
     def select_rows(self, rows: Any, sign: float, dense: bool) -> Any:
         """Return sign J of these rows, dense or as `csc_matrix`."""
         if dense:
-            return sign * self._dense[1][rows]
+            is_small = self.n * len(self.t) <= MAX_STORED_ENTRIES
+            return sign * (self._dense_jacobian[rows] if is_small else to_dense(self.J, self.n, rows))
         if not len(rows):
             return sp.csc_matrix((0, self.n))
         first, last, (ptr, idx, value) = rows[0], rows[-1] + 1, self.J
@@ -277,7 +279,7 @@ class ScaledProgram(ConvexProgram):
     def get_hessian(self, dense: bool) -> Any:
         """Return a copy of the dense P, or P as `csc_matrix` with sorted indices."""
         if dense:
-            return self._dense[0].copy()
+            return self._dense_hessian.copy()
         if "P" not in self._sparse:
             ptr, idx, value = self.P  # P is symmetric: its compressed rows are its compressed columns.
             matrix = sp.csc_matrix((value, idx, ptr), (self.n, self.n))
@@ -315,11 +317,19 @@ class ScaledProgram(ConvexProgram):
         return -lam[a], lam[g], box
 
 
-def to_dense(rows: Compressed, n: int) -> FloatArray:
-    """Return a dense matrix of n columns from compressed rows."""
-    ptr, idx, value = rows
-    out = np.zeros((len(ptr) - 1, n))
-    out[np.repeat(np.arange(len(ptr) - 1), np.diff(ptr)), idx] = value
+def to_dense(matrix: Compressed, n: int, rows: Any = None) -> FloatArray:
+    """Return a dense matrix of n columns from compressed rows; `rows`: the rows to return, default all."""
+    ptr, idx, value = matrix
+    if rows is None:
+        rows = np.arange(len(ptr) - 1)
+    first, size = ptr[rows], ptr[1:][rows] - ptr[:-1][rows]
+    if len(rows) and (size == n).all() and rows[-1] - rows[0] + 1 == len(rows):  # Consecutive full rows.
+        at = slice(int(first[0]), int(first[0]) + n * len(rows))
+        if (idx[at].reshape(-1, n) == np.arange(n)).all():
+            return value[at].reshape(-1, n).copy()
+    out = np.zeros((len(rows), n))
+    entries = np.arange(size.sum()) + np.repeat(first - np.cumsum(size) + size, size)
+    out[np.repeat(np.arange(len(rows)), size), idx[entries]] = value[entries]
     return out
 
 

@@ -84,13 +84,21 @@ cdef void compute_scales(const csr_t* a, scales_t* s) noexcept nogil:
     """Compute c and tau from the sizes of the variables, without the strict scales |q_j| and |t_i|."""
     cdef Py_ssize_t i, j, k
     cdef double v, term
+    cdef bint has_zero = False
+    for j in range(a.n):
+        s.c[j] = max(fabs(s.q[j]), s.p_terms[j])
+        has_zero |= s.q[j] == 0.0
+    for i in range(a.m):
+        s.tau[i] = s.own[i]
+        has_zero |= s.t[i] == 0.0
+    if not has_zero:                                    # The sizes have no effect.
+        return
     for j in range(a.n):
         s.f[j] = max(fabs(s.q[j]), s.diagonal[j] * s.size[j])
-        s.c[j] = max(fabs(s.q[j]), s.p_terms[j])
         if s.q[j] == 0.0:
             s.c[j] = max(s.c[j], FLOOR * s.diagonal[j] * s.size[j])
     for i in range(a.m):
-        v, s.y[i], s.tau[i] = 0.0, INFINITY, s.own[i]
+        v, s.y[i] = 0.0, INFINITY
         for k in range(a.ptr[i], a.ptr[i + 1]):
             term = fabs(a.val[k])
             v = max(v, term * s.size[a.idx[k]])
@@ -270,6 +278,20 @@ def judge_program(hessian, q_, jac, t_, lam_, x_, int32_t free):
     if not (v == v and total == total):
         v = raw = INFINITY
     return v, raw, row_error, column_error, active_, complementary, primal, dual, fabs(total)
+
+
+def scale_rows(rows, row_scale_, column_scale_):
+    """Return compressed rows with new arrays, entry (i, j) multiplied by row_scale_[i] column_scale_[j]."""
+    cdef Py_ssize_t i, k, m = len(row_scale_)
+    cdef csr_t a = read_csr(rows, m, len(column_scale_))
+    cdef const double* e = as_double_pointer(row_scale_, m)
+    cdef const double* d = as_double_pointer(column_scale_, len(column_scale_))
+    value_ = np.empty(len(rows[2]))
+    cdef double* value = as_double_pointer(value_, len(value_))
+    for i in range(m):
+        for k in range(a.ptr[i], a.ptr[i + 1]):
+            value[k] = a.val[k] * e[i] * d[a.idx[k]]
+    return np.array(rows[0]), np.array(rows[1]), value_     # Copies, because SciPy sorts indices in place.
 
 
 cdef inline double power_of_two(double x) noexcept nogil:
