@@ -394,11 +394,14 @@ class Audit:
         columns: dict[str, Any] = {
             "quantile": [*(f"{100.0 * q:g} %" for q in QUANTILES[:-1]), "largest error"]
         }
-        for prefix, selected in (("", self.is_judged), ("unconverged: ", self.is_unconverged)):
-            for name, unit, x in (("velocity", "m/s", self.numbers[0]), ("impulse", "N s", self.numbers[1])):
-                known = x[selected & np.isfinite(x)]
-                if len(known):
-                    columns[f"{prefix}{name} [{unit}]"] = np.quantile(known, QUANTILES, method="higher")
+        for name, selected, x in (
+            ("velocity [m/s]", self.is_judged, self.numbers[0]),
+            ("impulse [N s]", self.is_judged, self.numbers[1]),
+            ("velocity, unconverged [m/s]", self.is_unconverged, self.numbers[0]),
+        ):
+            known = x[selected & np.isfinite(x)]
+            if len(known):
+                columns[name] = np.quantile(known, QUANTILES, method="higher")
         return _make_frame(columns if len(columns) > 1 else {})
 
     @property

@@ -55,7 +55,7 @@ NUMBER_CELL = re.compile(r"|–|[-+]?(?:\d[\d.]*(?:e[-+]?\d+)?|inf|nan)(?: %| ti
 #: Matches texts that are not broken across lines: a number with exponent or unit, a unit in brackets, or an option.
 NUMBER = re.compile(
     r"(?<![\w.])\d[\d.]*(?:e-?\d+(?:\s(?:m/s|N\ss|√J))?|\s(?:µs|ms|s|m/s|rad/s|N\ss|√J|%|times|iterations?|sweeps?))"
-    r"(?!\w)|(?<![\w-])--[a-z][a-z-]*|\[[^\]]{1,24}\]"
+    r"(?!\w)|(?<![\w-])--[a-z][a-z-]*|\[[^\]]{1,24}\]|(?<![\w-])[a-z_]{2,}=[\w.+-]+"
 )
 
 

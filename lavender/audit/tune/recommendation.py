@@ -300,12 +300,16 @@ class Tuning:
 
         now = self.present_result.mean_step_time
         rows = [
-            (m.setting.short_name, f"{m.mean_step_time / now:.2f}", m.worst_error, float(m.error.max()),
-             m.mean_step_time, m.worst_motion)
+            (
+                m.setting.short_name,
+                f"{m.mean_step_time / now:.2f}",
+                m.worst_error,
+                float(m.error.max()),
+                m.worst_motion,
+            )
             for m in settings
-        ]  # fmt: skip
-        motion = f"motion after {self.horizon} steps [m]"
-        heads = ["setting", "relative time", "error 99 % [m/s]", "largest error [m/s]", "a step [s]", motion]
+        ]
+        heads = ["setting", "relative time", "error 99 % [m/s]", "largest error [m/s]", "motion [m]"]
         return pd.DataFrame(rows, columns=heads)
 
     @property
@@ -374,7 +378,7 @@ class Tuning:
                 Section("Rows and contacts", sizes, short=2,
                         note="Rows and contacts of the steps with the model's own setting."),
                 Section("Fastest settings by error", [self._tabulate_settings(shown)], figures=figures,
-                        short_frame=short),
+                        note=f"Motion: distance after {self.horizon} steps from a converged run.", short_frame=short),
                 Section("Other problems", [self._tabulate_settings(other)], short=2,
                         note="Settings that change the problem: the error is that of its own problem."),
                 Section("Every setting", [self._tabulate_settings(every)],
