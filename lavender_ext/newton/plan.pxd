@@ -21,6 +21,11 @@
                     MORE_PATHS                paths with other ratios of smoothing                COULOMB_DAMPED_NEWTON
                     COULOMB_DAMPED_NEWTON     proximal damped Newton from the best point          COULOMB_END
 
+Problems that need a state, which are tests of tests/suite/test_newton_on_suite.py:
+
+    SECOND_CONE_WEIGHT   pyramid(k=30, friction="coulomb") under the cone law, to 1e-9
+    THIRD_CONE_WEIGHT    pyramid(k=6, mass_ratio=1e6, friction="coulomb", sliding=0.5) under the cone law, to 1e-8
+
 Every state ends the solve as soon as the best point is within tol or at the round-off limit, a certificate is proven,
 or the budget is spent. De Saxce's interior point has states of its own:
 
