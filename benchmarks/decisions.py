@@ -82,7 +82,7 @@ def count_work(name: str, factor: float) -> dict[str, float]:
         get_zero_impulse_reference(problem)
         solution = lv.solve(problem)
         tree, work = DecisionTree(problem), solution.work
-        factorisation = next((s.cost / s.steps for s in tree.states.values()), 0.0)
+        factorisation = tree.newton_state.cost / tree.newton_state.steps if tree.newton_state else 0.0
         sweeps = work.get("sweeps", 0) + 2 * work.get("solves", 0)
         counted[label] = sweeps * tree.sweep + work.get("factorisations", 0) * factorisation
         limited = DecisionTree(problem, Deadline(1e9))

@@ -463,29 +463,26 @@ class DecisionTree:
         return estimate_cost("anderson", get_relaxation(self.problem)).iteration
 
     @cached_property
-    def states(self) -> dict[str, NewtonState]:
-        """States of Newton's method after the analysis of its matrix, by form.
+    def newton_state(self) -> NewtonState | None:
+        """State of Newton's method after the analysis of its matrix.
 
-        It is empty if Newton's method refuses the problem, or if it would end after the deadline.
+        None if Newton's method refuses the problem, if the analysis fails, or if it would end after the deadline.
         """
-        is_possible = get("newton").refuses(self.problem) is None and not self.is_late
-        return self.prepare_newton("newton") if is_possible else {}
-
-    def prepare_newton(self, name: str) -> dict[str, NewtonState]:
-        """Analyse the matrix of Newton's method in the form `name`; return {name: state}, or {} if that fails."""
+        if get("newton").refuses(self.problem) is not None or self.is_late:
+            return None
         try:
-            return {name: get("newton").load()(**METHODS[name][1]).prepare(self.problem)}
+            state: NewtonState = get("newton").load()().prepare(self.problem)
         except BREAKDOWN:
-            return {}
+            return None
+        return state
 
     @property
     def solver_costs(self) -> dict[str, float]:
-        """Estimated costs [ns] of the factorising solvers, the cheapest first; a failed form comes last."""
-        # `state.cost` is the cost that `Newton.cost` returns with this state.
-        found = {name: state.cost for name, state in self.states.items()}
+        """Estimated costs [ns] of the factorising solvers, the cheapest first; a failed `newton` comes last."""
+        found = {} if self.newton_state is None else {"newton": self.newton_state.cost}
         if self.can_pivot:
             found["direct"] = self.direct
-        failed = "newton" if self.compiled_call_failed and self.states.get("newton", None) else ""
+        failed = "newton" if self.compiled_call_failed else ""
         return dict(sorted(found.items(), key=lambda item: (item[0] == failed, item[1])))
 
     @cached_property
@@ -536,7 +533,7 @@ class DecisionTree:
         if not self.deadline.is_set:
             return True
         needed = before + cost
-        if name == "newton" and "states" in vars(self):
+        if name == "newton" and "newton_state" in vars(self):
             return self.deadline.fits(needed)
         return self.deadline.fits(get_loose_limit(self.problem) + needed) or self.deadline.fits(
             estimate_cost(name, self.problem).setup + needed
@@ -544,19 +541,19 @@ class DecisionTree:
 
     def has_time_to_factorise_after(self, steps: dict[str, Step], cost: float) -> bool:
         """Return whether work of this cost [ns] leaves time for a factorising solver, or all of them have ended."""
-        if "states" not in vars(self):
+        if "newton_state" not in vars(self):
             return self.has_time_for_newton(cost)
-        unfinished = [name for name in self.states if name not in steps or not steps[name].over]
-        if self.states and not unfinished and not any(steps[name].late for name in self.states):
-            return True
-        return bool(unfinished) and self.has_time("newton", self.newton, cost)
+        step = steps.get("newton")
+        if self.newton_state is None or step is None or not step.over:
+            return self.newton_state is not None and self.has_time("newton", self.newton, cost)
+        return not step.late
 
     def leaves_time(self, stage: Stage, step: Step) -> bool:
         """Return whether a stage of any solver but sweeps can end before the deadline."""
         if isinstance(step, RelaxedNewton):
             return self.has_time("newton", stage.cost)
         if isinstance(step, Newton):
-            return self.has_time("newton", self.states[stage.solver].cost)
+            return self.newton_state is not None and self.has_time("newton", self.newton_state.cost)
         if step.name == "direct":
             return self.has_time("direct", self.direct if self.can_pivot else stage.cost)
         if step.state is not None:
@@ -599,8 +596,7 @@ class DecisionTree:
         if p.generalized is not None and not np.all(p.compliance):
             yield from islice(self.iterate_factorising_stages(0.25 * ratio), 1)
             # The certificate's smallest violation is computed over velocities.
-            state = self.states.get("newton")
-            cost = self.newton if state is None else state.cost
+            cost = self.newton if self.newton_state is None else self.newton_state.cost
             yield Stage("certificate", 1.0, cost, "whether the least violation proves that there is none")
         for stage in self.iterate_factorising_stages(LARGE_BUDGET_FACTOR * ratio if relaxed else ratio):
             if not (pivots_first and stage.solver == "direct"):  # It has had this budget.
@@ -615,9 +611,9 @@ class DecisionTree:
             cost = self.min_newton_cost
             least = cost / self.relaxed_sweep
             yield Stage("anderson", inf, cost, "before any analysis", least=least, position=1)
-        if "newton" not in self.states:
+        state = self.newton_state
+        if state is None:
             return
-        state = self.states["newton"]
         cost = ADMM_FRACTION * state.cost
         iterations = min(cost / (SWEEPS_PER_ADMM_ITERATION * self.relaxed_sweep), MAX_ADMM_ITERATIONS)
         runs_admm = iterations >= MIN_ADMM_ITERATIONS
@@ -689,7 +685,9 @@ class DecisionTree:
 
     def factorisation(self, name: str, cost: float, why: str) -> Stage:
         """Return the stage of a factorising solver with the budget `cost` [ns]."""
-        steps = self.states[name].steps if name in self.states else DECISIONS.pivot_factorisations
+        steps = DECISIONS.pivot_factorisations
+        if name == "newton" and self.newton_state is not None:
+            steps = self.newton_state.steps
         return Stage(name, cost / self.solver_costs[name] * steps, cost, why)
 
     def sweeps(self, cost: float, why: str, max_remaining: float = inf) -> Stage:
@@ -872,10 +870,9 @@ def create_solver_step(name: str, log: SolveLog, tree: DecisionTree) -> Step:
     """Create the step of the solver `name`; Newton's method gets the state that the tree has analysed."""
     step = STEP_CLASSES.get(name, Iterations)(name, log)
     if isinstance(step, RelaxedNewton):
-        step.like = tree.states["newton"]
+        step.like = tree.newton_state
     if isinstance(step, Newton):
-        step.state = tree.states[name]
-        step.started_from_zero = name == "newton" and tree.started_from_zero
+        step.state, step.started_from_zero = tree.newton_state, tree.started_from_zero
     return step
 
 

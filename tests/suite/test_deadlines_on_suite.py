@@ -47,7 +47,7 @@ def play(monkeypatch, clock, pace, problem):
         def played(self, n):
             claim = turn(self, n)
             quiet.append(1)
-            each = DecisionTree(problem).newton / DecisionTree(problem).states["newton"].steps
+            each = DecisionTree(problem).newton / DecisionTree(problem).newton_state.steps
             quiet.clear()
             clock.now += 1e-9 * pace * max(claim.iterations, 1) * each
             return claim
