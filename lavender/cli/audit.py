@@ -18,7 +18,7 @@ from lavender.cli.options import (
     limit_to_one_thread,
     precision_option,
     print_escaped,
-    reject_unused_options,
+    reject_options_without_effect,
     threshold_option,
 )
 from lavender.io.stored import lock_output
@@ -83,8 +83,7 @@ def audit(
     limit, engine = options["max_velocity_error"], options["engine"]
     if limit is not None and not limit >= 0.0:
         raise InputError(f"--max-velocity-error is {limit}; a velocity error in m/s is needed")
-    if engine != "mujoco":
-        reject_unused_options(context, ["workers", "backend", "precision"], f"with --engine {engine}")
+    reject_options_without_effect(context, other_engine=engine != "mujoco")
     context.with_resource(lock_output(out, folder=True))
     limit_to_one_thread()
     with explain_early_interrupt("the first step"), show_progress() as watch:

@@ -177,51 +177,35 @@ def add_worlds_options(worlds: int | None, steps: int) -> Callable[[Callable[...
     return add_options(options, show_default=True)
 
 
-def reject_unused_recording_options(context: click.Context, recorded: bool) -> None:
-    """Raise InputError if options of a recording are set although no MuJoCo model is recorded (`recorded` is false)."""
-    if not recorded:
-        reject_unused_options(context, RECORDING_NAMES, "without a MODEL.xml")
-    elif context.params["control"] != "random":
-        reject_unused_options(context, ["seed"], "without --controls random")
+def reject_options_without_effect(context: click.Context, **conditions: Any) -> None:
+    """Raise InputError if an option is set that has no effect under one of the `conditions` that are true.
 
-
-def reject_unused_options(context: click.Context, names: Sequence[str], condition: str) -> None:
-    """Raise InputError if one of these options is set, which would be ignored.
-
-    Parameters
-    ----------
-    context : context of the command
-    names : names of the options' parameters
-    condition : why the options have no effect, such as "without --records"
+    The conditions are keys of `OPTIONS_WITHOUT_EFFECT`.
     """
-    options = {p.name: p.opts[0] for p in context.command.params}
-    for name in names:
-        if is_option_set(context, name):
-            raise InputError(f"{options[name]} has no effect {condition}: leave it out")
+    for name, (words, names) in OPTIONS_WITHOUT_EFFECT.items():
+        for parameter in context.command.params if conditions.get(name) else ():
+            is_listed = parameter.name in names if names[0] != "all but" else parameter.name not in names
+            if parameter.name and is_listed and is_option_set(context, parameter.name):
+                raise InputError(f"{parameter.opts[0]} has no effect {words}: leave it out")
 
 
-def reject_options_without_effect(context: click.Context, solvers: Sequence[str] | None) -> None:
-    """Raise InputError for options of a plan that none of the named solvers uses.
+def describe_solvers(solvers: Sequence[str] | None) -> dict[str, bool]:
+    """Return the conditions of `OPTIONS_WITHOUT_EFFECT` that depend on the named solvers.
 
     Raises
     ------
-    InputError
-        An option has no effect.
     UnknownName
         A solver does not exist.
     """
     from lavender.report.runner import is_third_party_solver
     from lavender.solvers import registry
 
-    if not solvers:
-        return
-    specs = [registry.get(name) for name in solvers]
-    if not any(s.resumable and not s.exact for s in specs):
-        reject_unused_options(context, ["budgets"], "on solvers that cannot stop after any iteration")
-    if not any(s.order and not s.exact for s in specs):
-        reject_unused_options(context, ["orders"], "on solvers that take no order")
-    if not any(map(is_third_party_solver, specs)):
-        reject_unused_options(context, ["memory"], "if no solver of another package runs")
+    specs = [registry.get(name) for name in solvers or ()]
+    return {
+        "without_budgets": bool(specs) and not any(s.resumable and not s.exact for s in specs),
+        "without_orders": bool(specs) and not any(s.order and not s.exact for s in specs),
+        "without_processes": bool(specs) and not any(map(is_third_party_solver, specs)),
+    }
 
 
 #: Option of commands that judge solutions of an engine.
@@ -249,6 +233,21 @@ RECORDING_OPTIONS: tuple[Option, ...] = (
 # Parameters of RECORDING_OPTIONS.
 RECORDING_NAMES = ("steps", "every", "control", "seed", "states", "threshold")
 recording_options = add_options([THRESHOLD, *RECORDING_OPTIONS], show_default=True)
+#: Conditions under which options have no effect: the words of the message, and the options' parameters.
+OPTIONS_WITHOUT_EFFECT: dict[str, tuple[str, tuple[str, ...]]] = {
+    "is_list": ("with --list", ("all but", "listed")),
+    "shows_records": ("if records are shown again, since nothing is solved",
+                      ("all but", "files", "out", "compare", "time_budgets", "tables", "no_figures", "solvers")),
+    "is_campaign": ("with --workers, which measures no times and ends by iterations",
+                    ("repeats", "time_limit", "sequence_time_limit", "time_budgets", "sequence")),
+    "without_model": ("without a MODEL.xml", RECORDING_NAMES),
+    "without_random": ("without --controls random", ("seed",)),
+    "without_record": ("without --record", ("replace",)),
+    "without_budgets": ("on solvers that cannot stop after any iteration", ("budgets",)),
+    "without_orders": ("on solvers that take no order", ("orders",)),
+    "without_processes": ("if no solver of another package runs", ("memory",)),
+    "other_engine": ("with another --engine than mujoco", ("workers", "backend", "precision")),
+}  # fmt: skip
 
 #: Options of the commands that measure, as fields of `lavender.report.Plan`.
 PLAN_OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (

@@ -20,14 +20,13 @@ from lavender.cli.options import (
     RECORDING_NAMES,
     ListType,
     MultiValueCommand,
+    describe_solvers,
     exit_after_interrupt,
     make_console,
     plan_options,
     print_escaped,
     recording_options,
     reject_options_without_effect,
-    reject_unused_options,
-    reject_unused_recording_options,
 )
 from lavender.io.start_states import MODEL_SUFFIXES
 from lavender.io.stored import lock_output, write_text
@@ -83,9 +82,8 @@ def report(
     Exit code 1: a file in a folder cannot be read, a step could not be recorded, or nothing was measured. Exit code 2:
     a named file cannot be read, or another report is writing to the folder.
     """
+    reject_options_without_effect(context, is_list=listed)
     if listed:
-        given = [p.name for p in context.command.params if p.name and p.name != "listed"]
-        reject_unused_options(context, given, "with --list")
         _list_suite()
         return
     from lavender.report.store import read
@@ -168,19 +166,13 @@ def _reject_unused_options(
     context: click.Context, files: tuple[str, ...], solvers: tuple[str, ...] | None
 ) -> None:
     """Raise InputError for each option that would be ignored."""
-    if any(f.endswith(".jsonl") for f in files):
-        used = {"files", "out", "compare", "time_budgets", "tables", "no_figures", "solvers"}
-        unused = [p.name for p in context.command.params if p.name and p.name not in used]
-        reject_unused_options(context, unused, "if records are shown again, since nothing is solved")
-    elif is_campaign(context):
-        timing_options = ["repeats", "time_limit", "sequence_time_limit", "time_budgets", "sequence"]
-        reject_unused_options(
-            context, timing_options, "with --workers, which measures no times and ends by iterations"
-        )
-    reject_unused_recording_options(context, any(Path(f).suffix.lower() in MODEL_SUFFIXES for f in files))
-    # Records may contain solvers that are not installed here.
-    if not any(f.endswith(".jsonl") for f in files):
-        reject_options_without_effect(context, solvers)
+    shows_records = any(f.endswith(".jsonl") for f in files)
+    has_model = any(Path(f).suffix.lower() in MODEL_SUFFIXES for f in files)
+    reject_options_without_effect(
+        context, shows_records=shows_records, is_campaign=not shows_records and is_campaign(context),
+        without_model=not has_model, without_random=has_model and context.params["control"] != "random",
+        **describe_solvers(None if shows_records else solvers),  # Records may contain solvers that are not installed.
+    )  # fmt: skip
 
 
 def _record_model(

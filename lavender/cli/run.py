@@ -18,7 +18,7 @@ from lavender.cli.options import (
     exit_after_interrupt,
     parse_parameters,
     print_escaped,
-    reject_unused_options,
+    reject_options_without_effect,
 )
 from lavender.io.stored import check_figure_path, check_writable, resolve_destination
 
@@ -81,8 +81,7 @@ def run(
     from lavender.sim.engine.run import format_step
     from lavender.sim.scene import Scene
 
-    if record is None:
-        reject_unused_options(context, ["replace"], "without --record")
+    reject_options_without_effect(context, without_record=record is None)
     if plot is not None:
         plot = check_figure_path(plot)
     files = {

@@ -22,7 +22,7 @@ from lavender.cli.options import (
     precision_option,
     print_escaped,
     recording_options,
-    reject_unused_recording_options,
+    reject_options_without_effect,
 )
 from lavender.io.stored import lock_output
 
@@ -76,7 +76,7 @@ def record(
     """
     from lavender.io.recording import record_file
 
-    reject_unused_recording_options(context, True)
+    reject_options_without_effect(context, without_random=context.params["control"] != "random")
     recorded = record_file(model, out, steps, precision=precision or "float64", **options)
     print_escaped(str(recorded))
     if recorded.is_interrupted:

@@ -138,7 +138,7 @@ def test_states_that_an_audit_saves_are_read_by_the_other_commands(lavender, box
 @pytest.mark.parametrize("option", [("--workers", 3), ("--precision", "float32")])
 def test_an_audit_of_claims_rejects_options_that_it_does_not_use(lavender, boxes, option):
     code, _, err = lavender("audit", boxes(), "--engine", "kamino", *option)
-    assert code == 2 and f"{option[0]} has no effect with --engine kamino" in err
+    assert code == 2 and f"{option[0]} has no effect with another --engine than mujoco" in err
 
 
 @pytest.mark.parametrize(
