@@ -16,7 +16,7 @@ import contextlib
 import heapq
 import os
 import zipfile
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -50,11 +50,6 @@ def describe_answer(problem: Problem, impulse: Any, threshold: float) -> dict[st
         "floor": judged.roundoff_floor, "verdict": judged.verdict, "precision": problem.precision,
         "threshold": threshold,
     }  # fmt: skip
-
-
-def write_lines(folder: Path, lines: Iterable[Mapping[str, Any]]) -> None:
-    """Write the lines of `engine.jsonl`."""
-    write_text(folder / ENGINE, "".join(f"{format_json(line)}\n" for line in lines))
 
 
 @dataclass(frozen=True)
@@ -138,7 +133,7 @@ class Recorder:
         self.when, self.solver, self.n_steps = when, solver, 0
         self._stack = contextlib.ExitStack()
         self.folder = self._stack.enter_context(lock_step_folder(folder, check_bool("replace", replace)))
-        self._lines: dict[str, dict[str, Any]] = {}
+        self.lines: dict[str, dict[str, Any]] = {}  # Lines of `engine.jsonl` by file.
         # Heap of (velocity error, file) with the smallest error first.
         self._worst: list[tuple[float, str]] = []
         self._unjudged: set[int] = set()  # Worlds with a line about their first step that cannot be judged.
@@ -162,7 +157,7 @@ class Recorder:
     @property
     def files(self) -> tuple[str, ...]:
         """Names of the problem files."""
-        return tuple(name for name, line in self._lines.items() if "left_out" not in line)
+        return tuple(name for name, line in self.lines.items() if "left_out" not in line)
 
     def add(
         self,
@@ -216,15 +211,36 @@ class Recorder:
             changed |= self._record_selected_world(
                 verdict, problems, impulse, claims, states, reasons.get(verdict.world, "")
             )
-        if changed:
-            write_lines(self.folder, self._lines.values())
-        # If the process is killed before, files have no line, which no reader needs.
-        for name in self._removed:
-            for path in (self.folder / name, self.folder / STATES_FOLDER / name):
-                Path(path).unlink(missing_ok=True)
-        self._removed.clear()
+        if changed or self._removed:
+            self.write_lines()
         self.n_steps += 1
         return verdicts
+
+    def write_step(
+        self, line: dict[str, Any], problem: Problem, impulse: Any, state: Mapping[str, Any] | None = None
+    ) -> None:
+        """Write the files of a step, and add its line; Ctrl-C leaves no file without a line."""
+        path = self.folder / line["file"]
+        if state is not None:
+            write_arrays(make_folder(self.folder / STATES_FOLDER) / path.name, state)
+        try:
+            write_npz(problem, path, impulse=impulse)
+            self.lines[path.name] = line
+        finally:
+            if path.name not in self.lines:
+                path.unlink(missing_ok=True)
+
+    def leave_out(self, line: dict[str, Any], reason: object) -> None:
+        """Add the line of a step without a file, with the reason."""
+        self.lines[line["file"]] = {**line, "left_out": str(reason)}
+
+    def write_lines(self) -> None:
+        """Write `engine.jsonl`, then delete the files that no longer have a line."""
+        write_text(self.folder / ENGINE, "".join(f"{format_json(line)}\n" for line in self.lines.values()))
+        for name in self._removed:
+            for path in (self.folder / name, self.folder / STATES_FOLDER / name):
+                path.unlink(missing_ok=True)
+        self._removed.clear()
 
     def _judge_worlds(
         self, problems: Any, impulse: Any, claims: Claims | None
@@ -292,11 +308,12 @@ class Recorder:
         is_selected = self.every is not None and verdict.step % self.every == 0
         is_selected = bool(self.when is not None and self.when(verdict)) or is_selected
         name = f"step_{verdict.step:06d}_world_{i:04d}.npz"
+        line: dict[str, Any] = {"file": name, "step": verdict.step, "world": i}
         if reason:
             if not is_selected and i in self._unjudged:
                 return False
             self._unjudged.add(i)
-            self._lines[name] = {"file": name, "step": verdict.step, "world": i, "left_out": reason}
+            self.leave_out(line, reason)
             return True
         is_worst = self.keep_worst > 0 and verdict.rows > 0 and (
             len(self._worst) < self.keep_worst or error > self._worst[0][0]
@@ -308,24 +325,19 @@ class Recorder:
         lam = to_numpy("impulse", impulse)
         own = lam if is_single else lam.reshape(-1)[problems.rows_of(i)]
         try:
-            line: dict[str, Any] = {
-                "file": name, "step": verdict.step, "world": i, "solver": self.solver, "seconds": float("nan"),
-                **describe_answer(problem, own, self.threshold),
-            }  # fmt: skip
-            if states is not None:
-                write_arrays(make_folder(self.folder / STATES_FOLDER) / name, states(i))
-            write_npz(problem, self.folder / name, impulse=own)
+            facts: dict[str, Any] = {"solver": self.solver, "seconds": float("nan")}
+            facts |= describe_answer(problem, own, self.threshold)
+            if claims is not None:
+                facts["claimed"], facts["iterations"] = bool(claims.converged[i]), int(claims.iterations[i])
+                facts["claimed_residuals"] = {key: float(x[i]) for key, x in claims.residuals.items()}
+            if is_selected:
+                facts["selected"] = True
+            self.write_step(line | facts, problem, own, None if states is None else states(i))
         except LavenderError as failure:
-            self._lines[name] = {"file": name, "step": verdict.step, "world": i, "left_out": str(failure)}
+            self.leave_out(line, failure)
             return True
-        if claims is not None:
-            line["claimed"], line["iterations"] = bool(claims.converged[i]), int(claims.iterations[i])
-            line["claimed_residuals"] = {key: float(x[i]) for key, x in claims.residuals.items()}
-        self._lines[name] = line
         if is_worst:
             self._add_to_worst_files(error, name)
-        if is_selected:
-            line["selected"] = True
         return True
 
     def _add_to_worst_files(self, error: float, name: str) -> None:
@@ -334,8 +346,8 @@ class Recorder:
             heapq.heappush(self._worst, (error, name))
             return
         _, removed = heapq.heapreplace(self._worst, (error, name))
-        if not self._lines[removed].get("selected"):
-            del self._lines[removed]
+        if not self.lines[removed].get("selected"):
+            del self.lines[removed]
             self._removed.append(removed)
 
 

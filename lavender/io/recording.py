@@ -16,10 +16,8 @@ from lavender.base.arrays import FloatArray, check_choice, check_float, check_in
 from lavender.base.errors import InputError, LavenderError
 from lavender.io import mujoco as adapter
 from lavender.io.mujoco_memory import read_step
-from lavender.io.npz import write_npz
-from lavender.io.recorder import describe_answer, write_lines
+from lavender.io.recorder import Recorder, describe_answer
 from lavender.io.start_states import Control, load_controls, load_model, make_controller, read_states
-from lavender.io.stored import lock_step_folder
 from lavender.judge.residuals import AT_FLOOR, DEFAULT_THRESHOLD, UNCONVERGED, WRONG
 from lavender.problem import PRECISIONS, Problem
 
@@ -143,33 +141,29 @@ def record(
     threshold = check_float("threshold", threshold, low=0.0)
     control_at = make_controller(model, control, seed)
     starts = None if states is None else read_states(mj, model, states).select_evenly(steps)
-    records: list[dict[str, Any]] = []
-    left_out: list[dict[str, Any]] = []
-    without, is_interrupted = 0, False
-    width, file = len(str(steps)), Path()
-    with lock_step_folder(folder, replace) as folder:
+    without, is_interrupted, width = 0, False, len(str(steps))
+    with Recorder(folder, every=1, threshold=threshold, replace=replace) as recorder:
         try:
             for step, start in iterate_steps(mj, model, data, steps, every, control_at, starts):
-                file = folder / f"step_{step:0{width}d}.npz"
-                line = {"file": file.name, "step": step} | ({} if starts is None else {"start": start})
+                line = {"file": f"step_{step:0{width}d}.npz", "step": step}
+                line |= {} if starts is None else {"start": start}
                 try:
                     result = _solve_step(mj, model, data, f"step {step}", precision, threshold)
                 except LavenderError as error:
-                    left_out.append({**line, "left_out": str(error)})
+                    recorder.leave_out(line, error)
                     continue
                 if result is None:
                     without += 1
                     continue
                 problem, impulse, facts = result
-                write_npz(problem, file, impulse=impulse)
-                records.append({**line, **facts})
+                recorder.write_step(line | facts, problem, impulse)
         except KeyboardInterrupt:
-            if not records:
+            if not recorder.files:
                 raise
             is_interrupted = True
-            if records[-1]["file"] != file.name:
-                file.unlink(missing_ok=True)  # A file without a line would belong to another recording.
-        write_lines(folder, (*records, *left_out))
+        recorder.write_lines()
+    records = [recorder.lines[file] for file in recorder.files]
+    left_out = [line for line in recorder.lines.values() if "left_out" in line]
     above_threshold = [line for line in records if line["verdict"] in (UNCONVERGED, WRONG)]
     worst = max(above_threshold, key=lambda line: float(line["velocity"]), default=None)
     short = ""
@@ -177,8 +171,8 @@ def record(
         verdict = "it " + (UNCONVERGED if worst["verdict"] == UNCONVERGED else f"is {WRONG}")
         short = f"{worst['velocity']:.2g} m/s off at {worst['worst']}, step {worst['step']}: {verdict}"
     return Recording(
-        folder=folder,
-        files=tuple(line["file"] for line in records),
+        folder=recorder.folder,
+        files=recorder.files,
         without=without,
         left_out=tuple(f"step {line['step']}: {line['left_out']}" for line in left_out),
         above_floor=sum(line["verdict"] != AT_FLOOR for line in records),

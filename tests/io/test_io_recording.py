@@ -7,7 +7,7 @@ import pytest
 from mujoco_scene import mj, scene, state
 
 import lavender as lv
-from lavender.io import recording
+from lavender.io import recorder, recording
 
 PGS = 1e-6  # as in test_io_mujoco.py
 
@@ -56,14 +56,14 @@ def test_record_ctrl_c_keeps_the_steps_until_then(tmp_path):
 
 
 def test_record_ctrl_c_while_a_file_is_written_leaves_no_file_without_a_line(tmp_path, monkeypatch):
-    write = recording.write_npz
+    write = recorder.write_npz
 
     def interrupt(problem, path, impulse):
         write(problem, path, impulse=impulse)
         if path.name == "step_03.npz":
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(recording, "write_npz", interrupt)
+    monkeypatch.setattr(recorder, "write_npz", interrupt)
     assert lv.io.record(*state(steps=1), tmp_path, 20).files == ("step_01.npz", "step_02.npz")
     assert len(list(tmp_path.glob("*.npz"))) == 2
 
