@@ -353,8 +353,7 @@ cdef object recover_joint_velocity(const step_t* p, double alike):
 def find_velocity_before(Step step, double tolerance, double alike):
     """Return the velocity (nv,) of the last forward pass; None if it is qvel.
 
-    After a step it is recovered from the velocities of bodies, which MuJoCo computes before the step. The result is -1 if
-    the body tree is invalid, and -2 if the velocities cannot be recovered.
+    After a step it is recovered from the velocities of bodies before the step; -2 if that fails, -1 if their tree is invalid.
     """
     cdef const step_t* p = &step.at
     cdef int64_t i
@@ -362,8 +361,7 @@ def find_velocity_before(Step step, double tolerance, double alike):
     cdef int32_t agrees = compare_spatial_velocities(p, p.qvel, tolerance)
     if agrees:
         return None if agrees > 0 else -1
-    # In a copy of the data, cvel may be unset; qvel then agrees with rows that do not move.
-    for i in range(6 * p.bodies):
+    for i in range(6 * p.bodies):                       # In a copy of the data, cvel may be unset.
         is_set |= p.cvel[i] != 0.0
     for i in range(0 if is_set else p.m):
         if p.efc_vel[i] != 0.0:
@@ -381,10 +379,9 @@ def compute_problem_numbers(Step step, Blocks blocks, tuple jac, v_, double tole
 
         b = dt (aref - J a0),   v* = v + dt a0,   a0 = qacc_smooth
 
-    `is_regular` states that all numbers are valid, no gap exceeds its tolerance, and compliances are at most `usual`. The gaps
-    are relative errors of J v = efc_vel with v before the step (None: qvel), J a0 - aref = efc_b and J^T efc_force =
-    qfrc_constraint, divided by the sizes |J_i|_1 |x|_max, or max |J|^T |f|, of the terms. A gap is 0 if the stored vector is all
-    zeros, as in a copy that does not fill it. The fourth gap is NaN if an acceleration is not finite.
+    `is_regular`: all numbers are valid, no gap exceeds its tolerance, and compliances are at most `usual`. The gaps are errors of
+    J v = efc_vel with v before the step (None: qvel), J a0 - aref = efc_b and J^T efc_force = qfrc_constraint, divided by the
+    sizes of the terms. They are 0 if the stored vector is 0, as in a copy. The fourth gap is NaN if an acceleration is not finite.
     """
     cdef const step_t* p = &step.at
     cdef int32_t i, j, q, m = p.m, n = p.n

@@ -11,7 +11,7 @@ HAS_ALL_NAMES = {
     "check --solvers": ("nn", {"nncg"}),
     "run": ("four_b", {"four_bar"}),
     "run stack --solver": ("ad", {"admm"}),
-    "tune model.xml --engine": ("mujo", {"mujoco", "mujoco_warp"}),
+    "audit model.xml --engine": ("mujo", {"mujoco", "mujoco_warp"}),
 }
 
 
