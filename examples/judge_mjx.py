@@ -6,16 +6,17 @@ In MJX all worlds have the same contacts.
 
 import sys
 
-import jax
-import mujoco
 import numpy as np
-from mujoco import mjx
 
 import lavender as lv
 
 
 def judge(model, datas):
     """Return the residuals of MJX's impulses in the worlds of `datas`, a list of `MjData`."""
+    import jax
+    import mujoco
+    from mujoco import mjx
+
     model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     m = mjx.put_model(model)
     names = ("qpos", "qvel", "ctrl", "qacc_warmstart")
@@ -33,6 +34,8 @@ def judge(model, datas):
 
 def main(path):
     """Judge 64 worlds with random velocities."""
+    import mujoco
+
     model = mujoco.MjModel.from_xml_path(path)
     datas = [mujoco.MjData(model) for _ in range(64)]
     for i, data in enumerate(datas):

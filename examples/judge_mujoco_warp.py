@@ -5,8 +5,6 @@ python examples/judge_mujoco_warp.py MODEL.xml
 
 import sys
 
-import mujoco
-import mujoco_warp as mjw
 import numpy as np
 
 import lavender as lv
@@ -14,6 +12,9 @@ import lavender as lv
 
 def judge(model, datas):
     """Return the residuals of MuJoCo Warp's impulses in the worlds of `datas`, a list of `MjData`."""
+    import mujoco
+    import mujoco_warp as mjw
+
     m = mjw.put_model(model)
     d = mjw.put_data(model, mujoco.MjData(model), nworld=len(datas), njmax=256)
     for name in ("qpos", "qvel", "ctrl", "qacc_warmstart"):
@@ -34,6 +35,8 @@ def judge(model, datas):
 
 def main(path):
     """Judge 64 worlds with random velocities."""
+    import mujoco
+
     model = mujoco.MjModel.from_xml_path(path)
     datas = [mujoco.MjData(model) for _ in range(64)]
     for i, data in enumerate(datas):
