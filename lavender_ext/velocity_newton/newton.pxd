@@ -9,10 +9,11 @@ With the whitened unknown y = D^1/2 L (v - v*), s = Y y - b, and the impulses la
 Convex laws. G is the gradient of a convex function with kinks in its second derivative, N is symmetric, and t is the
 zero of the derivative along p (Todorov 2014; Castro et al. 2022), which takes a few evaluations.
 
-Proximal term. rho in (2) is 0 if the problem's own theta is at least 1e-6 d, or 1e-3 d on contacts, where kinks are
-sharper. Below that, and between tangents with different theta, rho is a proximal term about the centre c. The centre
-follows lambda (Rockafellar 1976), and the limit solves the given problem. rho starts at 1e-4 d without friction, at
-3e-3 d under the cone law and at 3e-2 d under Coulomb's law: the less reliable the steps, the larger it is.
+Proximal term. rho in (2) is 0 if the problem's own theta is at least 1e-6 d, or on contacts, where kinks are sharper,
+1e-4 d under the cone law and 1e-3 d under Coulomb's law. Below that, and between tangents with different theta, rho
+is a proximal term about the centre c. The centre follows lambda (Rockafellar 1976), and the limit solves the given
+problem. rho starts at 1e-4 d without friction, at 3e-3 d under the cone law and at 3e-2 d under Coulomb's law: the
+less reliable the steps, the larger it is.
 
 Coulomb's law has no such function. A round has two stages:
 
@@ -184,7 +185,7 @@ cdef inline void set_proximal_terms(flow_t* f, int32_t island, double softness) 
             j = f.p.ptr[i]
             # All blocks of a run of bounded rows have the same limit.
             end = f.p.ptr[last] if f.bounded_rows_only else f.p.ptr[i + 1]
-            low = min_relative_compliance(&f.p, i)
+            low = min_relative_compliance(&f.p, f.law, i)
             if softness < low:
                 low = softness
             for k in range(j, end):
