@@ -17,6 +17,7 @@ NAMES = (
     "kernels",
     "limit_overhead",
     "limits",
+    "mujoco_newton",
     "page",
     "peers",
     "programs",
