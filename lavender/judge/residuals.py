@@ -548,26 +548,7 @@ def refine_residual(problem: Problem, judged: measure.Judged, tol: float) -> Res
 
 def make_residual(problem: Problem, judgement: measure.Judged) -> Residual:
     """Build a `Residual` from a raw judge pass."""
-    data = judgement.data
-    fields = {
-        "relative": judgement.relative,
-        "energy": judgement.energy,
-        "velocity": judgement.velocity,
-        "roundoff_floor": judgement.roundoff_floor,
-        "above_floor": judgement.above_floor,
-        "worst_island": judgement.island,
-        "floor_energy": judgement.floor_energy,
-        "worst_row": judgement.worst,
-        "energy_at_zero": data.reference_energy,
-        "velocity_at_zero": data.reference_velocity,
-        "_problem": problem,
-        "_impulse": judgement.impulse,
-        "precision": "float64",
-        "rounding": None,
-        "_float64_relative": judgement.float64_relative,
-        "_rest": (_read_rows, (judgement,)),
-    }
-    return make_instance(Residual, fields)
+    return make_instance(Residual, measure.list_residual_fields(judgement, problem, _read_rows))
 
 
 def _read_rows(judgement: measure.Judged) -> dict[str, FloatArray]:

@@ -313,17 +313,15 @@ class Solution:
         tol: float,
         solve_time: float,
         rest: tuple[Callable[..., dict[str, Any]], tuple[Any, ...]],
-        late_residual: tuple[Callable[..., Residual], tuple[Any, ...]] | None = None,
         setup_time: float = 0.0,
     ) -> Solution:
         """Build a solution from the fields that are known; `rest` computes the other fields at the first access to one.
 
-        `rest` is a function and its arguments; the function returns the fields by name. `late_residual` computes the
-        residual alone.
+        `rest` is a function and its arguments; the function returns the fields by name.
         """
         solution: Solution = make_instance(cls, {
             "impulse": impulse, "status": status, "tol": tol, "setup_time": setup_time, "solve_time": solve_time,
-            "_rest": rest, "_late_residual": late_residual,
+            "_rest": rest,
         })  # fmt: skip
         return solution
 

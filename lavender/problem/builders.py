@@ -486,8 +486,7 @@ class Builders(Operators):
             nor target with a new J or v*.
         """
         general = self.generalized
-        new = (J, M, v_free, target)
-        if general is None and any(x is not None for x in new):
+        if general is None and not (J is None and M is None and v_free is None and target is None):
             raise InputError(
                 "J, M, v_free and target can be changed only in a problem in generalised coordinates, and "
                 f"this problem is given by {self.operator}: give b"
@@ -502,7 +501,7 @@ class Builders(Operators):
                 "J or v_free is given without target and without b; the right-hand side target - J v_free "
                 "depends on them: give target or b, too"
             )
-        if general is not None and any(x is not None for x in (J, M, v_free)):
+        if general is not None and not (J is None and M is None and v_free is None):
             if M is None:
                 general = general.with_jacobian(J, v_free)
             else:
@@ -517,6 +516,9 @@ class Builders(Operators):
         # Copy arrays here, so that the new problem can use them with copy=False.
         rhs = self.b if b is None else as_array("b", b, (self.m,), unit="m/s")
         start = None if guess is None else as_array("guess", guess, (self.m,), unit="N s")
+        if J is None and M is None and not self.has_singular_program:
+            problem: ProblemT = self._with_rhs(rhs, general, start)
+            return problem
         qp = self.qp.with_bias(rhs) if self.has_singular_program else None
         return replace(self, generalized=general, b=rhs, guess=start, qp=qp, copy=False)
 

@@ -118,7 +118,7 @@ class ProblemData:
         m, k = self.cones.n_rows, self.cones.n_blocks
         put(self, "derived", Derived())
         put(self, "b", as_array("b", self.b, (m,), unit="m/s", copy=self.copy))
-        _check_rhs(self.b)
+        check_rhs(self.b)
         if (self.matrix is None) + (self.rows is None) + (self.generalized is None) != 2:
             raise InputError(
                 f"{sum(x is not None for x in (self.matrix, self.rows, self.generalized))} of matrix=, "
@@ -182,7 +182,7 @@ class ProblemData:
         self.b.setflags(write=True)
         self.b[:] = b
         as_array("b", self.b, (self.m,), unit="m/s", copy=False)
-        _check_rhs(self.b)
+        check_rhs(self.b)
 
     def _check_rows(self, rows: Rows, m: int, k: int) -> None:
         """Raise InputError if the rows do not fit the cones of k blocks with m rows, or the compliance is invalid."""
@@ -213,8 +213,17 @@ class ProblemData:
         if generalized.m != m:
             raise InputError(f"J has {generalized.m} rows; {m} are needed, as the cones have")
         self._check_compliance(m)
+        self._set_view()
+
+    def _set_view(self) -> None:
+        """Set the view for kernels of a problem in generalised coordinates."""
+        assert self.generalized is not None
         self.derived.view = make_generalized_data(
-            self.cones._blocks, self.b, generalized.operator, self.compliance, FRICTION_NUMBER[self.friction]
+            self.cones._blocks,
+            self.b,
+            self.generalized.operator,
+            self.compliance,
+            FRICTION_NUMBER[self.friction],
         )
 
     def _check_compliance(self, m: int) -> None:
@@ -365,7 +374,7 @@ class ProblemData:
         return format_html_table(facts, self.name or "Problem")
 
 
-def _check_rhs(b: FloatArray) -> None:
+def check_rhs(b: FloatArray) -> None:
     """Raise InputError if the largest |b_i| [m/s] is not 0 but below MIN_MAGNITUDE."""
     if not is_rhs_valid(b):
         max_abs = np.abs(b).max()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from lavender.base.arrays import ArrayLike, FloatArray, IntArray, mark_read_only
 from lavender.base.errors import CapabilityError, InputError, TooLarge
 from lavender.base.lazy_import import issparse
 from lavender.base.lazy_import import sparse as sp
-from lavender.problem.data import ProblemData
+from lavender.problem.data import ProblemData, check_rhs
 from lavender.problem.derived import Derived, cached_property, computed_once
 from lavender_ext.core import assemble
 from lavender_ext.core.assemble import dense_to_csr
@@ -27,6 +28,22 @@ SEMIDEFINITE_SHIFT = 1e-12
 # If entries of J and M^-1 do not exceed this, A_ii cannot exceed MAX_MAGNITUDE and is not checked.
 MAX_SAFE_ENTRY = 1e15
 MAX_INDEXABLE_ENTRIES = 2**31  # A with this many entries or more is not formed: its indices have 32 bits.
+# Cached properties that depend on A alone, and fields that do not change with b.
+SHARED_ARRAYS = ("csr", "jacobian", "whitened", "bandwidth", "_compressed", "_couplings", "_matrix_asymmetry")
+FIELDS_BESIDES_RHS = (
+    "cones",
+    "matrix",
+    "rows",
+    "friction",
+    "compliance",
+    "key",
+    "names",
+    "name",
+    "copy",
+    "precision",
+    "law",
+)
+get_fields_besides_rhs = attrgetter(*FIELDS_BESIDES_RHS)
 
 
 class Operators(ProblemData):
@@ -49,25 +66,28 @@ class Operators(ProblemData):
         })  # fmt: skip
 
     def _share_operator(self, other: Operators) -> None:
-        """Give the same problem with another friction law the arrays of this one that do not depend on the law."""
-        known, law = self.__dict__, FRICTION_NUMBER[other.friction]
-        for name in (
-            "csr",
-            "jacobian",
-            "whitened",
-            "bandwidth",
-            "_compressed",
-            "_couplings",
-            "_matrix_asymmetry",
-        ):
+        """Give a problem with the same A, and another law or b, the arrays of this one that depend on neither."""
+        known, law, b = self.__dict__, FRICTION_NUMBER[other.friction], other.b
+        for name in SHARED_ARRAYS:
             if name in known:
                 other.__dict__[name] = known[name]
         if "csr_data" in known:
-            other.__dict__["csr_data"] = known["csr_data"].with_law(law)
+            other.__dict__["csr_data"] = known["csr_data"].with_law(law, b)
         if "data" in known and self.rows is not None:
-            other.__dict__["data"] = known["data"].with_law(law)
+            other.__dict__["data"] = known["data"].with_law(law, b)
         if self.derived.view is not None and self.derived.view.ready:
-            other.derived.view = self.derived.view.with_law(law)
+            other.derived.view = self.derived.view.with_law(law, b)
+
+    def _with_rhs(self, b: FloatArray, generalized: Any, guess: FloatArray | None) -> Any:
+        """Return a problem of the same A with another checked right-hand side b (m,) [m/s] and start."""
+        check_rhs(b)
+        values = dict(zip(FIELDS_BESIDES_RHS, get_fields_besides_rhs(self)))  # noqa: B905 - strict= takes longer
+        values |= {"b": b, "generalized": generalized, "guess": guess, "derived": Derived(), "qp": None}
+        other: Operators = make_instance(type(self), values)
+        self._share_operator(other)
+        if generalized is not None and other.derived.view is None:
+            other._set_view()
+        return other
 
     def _has_large_entries(self) -> bool:
         """Return whether an entry of J, M^-1 or the compliance exceeds MAX_SAFE_ENTRY: A_ii may be too large."""

@@ -307,15 +307,6 @@ class SolverSpec:
             return None
         return f"needs {', '.join(absent)}: pip install {self.install or ' '.join(absent)}"
 
-    def _tries_compiled_call(self, problem: Problem) -> bool:
-        """Return whether the compiled call for small problems accepts problems of this form and law."""
-        small = self.small
-        if small is None or not self.builtin or type(problem) is not Problem:
-            return False
-        if problem.derived.view is not None:
-            return small.limits is not None
-        return small.pivots if problem.law in ("linear", "lcp") else small.hands_over
-
     @cached_property
     def takes_all(self) -> bool:
         """Whether the solver accepts every problem."""

@@ -6,8 +6,6 @@ import math
 from time import perf_counter
 from typing import Any
 
-import numpy as np
-
 from lavender.base.arrays import FloatArray
 from lavender.judge.residuals import make_residual
 from lavender.judge.solution import CONVERGED, TIME_LIMIT, Claim, Solution, Status
@@ -24,7 +22,7 @@ from lavender.solvers.registry import SolverSpec, get
 from lavender.solvers.small import MAX_SWEEPS_BEFORE_FACTOR
 from lavender.solving.finish import FinishedRun, make_fields
 from lavender.solving.loop import select_best_impulse
-from lavender_ext.judge.measure import all_finite
+from lavender_ext.batch.many import bind_types, solve_compiled
 
 COST_PER_SECOND = 0.9e9  # [ns/s] Estimated cost that a compiled call may have per second of its time limit.
 NO_STAGE_MESSAGE = "the time limit was over before its turn: the start"
@@ -53,11 +51,10 @@ def get_call_time_fraction(problem: Problem, seconds: float) -> float:
 def solve_small(
     problem: Problem, spec: SolverSpec, impulse: Any, tol: float, limit: float = math.inf
 ) -> tuple[Solution | None, tuple[int, ...] | None]:
-    """Solve and judge a small problem, which `spec._tries_compiled_call`, by one compiled call.
+    """Solve and judge a small problem by one compiled call, if the solver has one that accepts the problem.
 
     A call ends when its estimated cost reaches the time limit [s]. It then returns the better of its iterate and the
-    start if the problem has at most SMALL_ROWS rows, and otherwise None, because time may remain for other solvers. The
-    fields of claim, counts and residual are computed when they are first accessed.
+    start if the problem has at most SMALL_ROWS rows, and otherwise None, because time may remain for other solvers.
 
     Returns
     -------
@@ -67,53 +64,30 @@ def solve_small(
         Work counts of a call that did not solve the problem. None if the first result is a solution or no call was
         made; empty if the time limit leaves no time for a call.
     """
-    small: Any = spec.small
-    if not isinstance(tol, float) or not 0.0 < tol < math.inf:
-        return None, None
-    view = problem.derived.view
-    if view is None:
-        # Islands of larger problems may take long, so `Prepared` solves them between checks of the clock.
-        if len(problem.b) > SMALL_ROWS or problem.has_singular_program:
-            return None, None
-        view = problem.cones._blocks
-    if view.has_ellipse:
-        return None, None
     fraction = 1.0
-    if limit < math.inf:
+    if limit < math.inf and spec.small is not None:
+        if problem.derived.view is None and len(problem.b) > SMALL_ROWS:
+            return None, None
         fraction = get_call_time_fraction(problem, limit)
         if fraction == 0.0:
             return None, ()
-    start = perf_counter()
-    if impulse is None:
-        first = problem.guess
-    elif (
-        type(impulse) is np.ndarray and impulse.dtype is problem.b.dtype and impulse.shape == problem.b.shape
-        and impulse.flags.c_contiguous and all_finite(impulse)
-    ):  # fmt: skip
-        first = impulse
-    else:
-        first = problem.impulse_array(impulse)
-    judged, counts = small.solve_and_judge(problem, first, tol, COST_PER_SECOND * fraction * limit)
-    if judged is None:
-        return None, counts
-    status = CONVERGED
-    if judged.relative > tol:
-        if limit == math.inf or fraction < 1.0 or judged.relative == judged.roundoff_floor:
-            # `Prepared` continues: time remains, or the impulses are so large that rounding hides b.
-            return None, counts
-        status, judged = TIME_LIMIT, select_best_impulse(problem, judged, first, tol).refine(math.inf)
-        judged.impulse.setflags(write=False)
-    # Copy the start, because the caller may change the array later.
-    start_point = first if first is None or impulse is None else first.copy()
-    solution = Solution.with_late_fields(
-        judged.impulse,
-        status,
-        tol,
-        perf_counter() - start,
-        (compute_postponed_fields, (problem, spec, judged, counts, start_point, status)),
-        (make_residual, (problem, judged)),
+    begin = perf_counter()
+    solution, judged, counts, start = solve_compiled(
+        problem, spec, impulse, tol, COST_PER_SECOND * fraction * limit
     )
-    return solution, None
+    if solution is not None:
+        return solution, None
+    if judged is None or limit == math.inf or fraction < 1.0 or judged.relative == judged.roundoff_floor:
+        # `Prepared` continues: time remains, or the impulses are so large that rounding hides b.
+        return None, counts
+    judged = select_best_impulse(problem, judged, start, tol).refine(math.inf)
+    judged.impulse.setflags(write=False)
+    start = start if start is None or impulse is None else start.copy()
+    rest = compute_postponed_fields, (problem, spec, judged, counts, start, TIME_LIMIT)
+    return (
+        Solution.with_late_fields(judged.impulse, TIME_LIMIT, tol, perf_counter() - begin, rest),
+        None,
+    )
 
 
 def compute_postponed_fields(
@@ -131,3 +105,6 @@ def compute_postponed_fields(
         claim = spec.small.make_claim(problem, counts, start, judged.relative, status)
     run = FinishedRun(problem, spec, {}, judged.impulse, claim, tol=0.0)
     return make_fields(run, judged)
+
+
+bind_types((Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, perf_counter))

@@ -242,7 +242,7 @@ def create_unjudged(
     keeps_start = keeps_start or tol == 0.0 or are_bit_identical(start, problem._start)
     claim = Claim(TIME_LIMIT, 0, {}, message)
     late = judge_late_fields, (problem, spec, options, start, claim, tol, keeps_start)
-    solution = Solution.with_late_fields(start, TIME_LIMIT, tol, 0.0, late, setup_time=setup_time)
+    solution = Solution.with_late_fields(start, TIME_LIMIT, tol, 0.0, late, setup_time)
     if not keeps_start:
         del solution.__dict__["impulse"]
     return solution

@@ -164,6 +164,7 @@ class Prepared:
         self.options = options
         self._original = problem
         self.problem = problem.disk if not late and problem.cones._blocks.has_ellipse else problem
+        self._target: tuple[Problem, FloatArray] | None = None  # [m/s] A problem and its targets b + J v*.
         self._lock = Lock()
         self._setup: SetUp | NotSetUp = NotSetUp()
         self.setup_time = 0.0  # [s] Time of the preparation since the last solve.
@@ -193,6 +194,8 @@ class Prepared:
         self,
         problem: Problem | None = None,
         *,
+        b: ArrayLike | None = None,
+        v_free: ArrayLike | None = None,
         impulse: ArrayLike | None = None,
         tol: float = 1e-6,
         velocity_tol: float | None = None,
@@ -204,8 +207,19 @@ class Prepared:
     ) -> Solution:
         """Solve as `lavender.solve`; `problem`, if given, replaces the prepared one unless an error is raised.
 
+        Parameters
+        ----------
+        problem : Problem, optional
+        b : (m,) m/s, optional
+            New right-hand side of the prepared problem, in place of `problem`.
+        v_free : (nv,) m/s, rad/s, optional
+            New v* of a prepared problem in generalised coordinates, in place of `problem`. Unless b is given, the
+            targets b + J v* of the rows stay.
+
         Raises
         ------
+        InputError
+            `problem` is given together with `b` or `v_free`, or one of these is not valid.
         InUse
             Another call of this object's `solve` has not returned yet.
         UnknownName
@@ -216,6 +230,8 @@ class Prepared:
         begun = 0.0 if time_limit is None else perf_counter()
         limit = math.inf if time_limit is None else check_time_limit(time_limit)
         original = self._original if problem is None else problem
+        if b is not None or v_free is not None:
+            original = self._update_problem(problem, b, v_free)
         if velocity_tol is not None:
             check_problem(original)
             tol = relative_tolerance(original, velocity_tol, tol)
@@ -228,8 +244,7 @@ class Prepared:
             solution: Solution | None = None
             failed_call: tuple[int, ...] | None = None
             is_default = max_iter is None and callback is None and history is False
-            is_default = is_default and self.spec.delegates and not self.options
-            if is_default and self.spec._tries_compiled_call(original):
+            if is_default and self.spec.delegates and not self.options and type(original) is Problem:
                 solution, failed_call = solve_small(original, self.spec, impulse, tol, limit)
             if solution is not None:
                 self._replace_problem(original, None)
@@ -244,6 +259,23 @@ class Prepared:
         finally:
             self._lock.release()
         return solution if velocity_tol is None else accept_velocity(solution, velocity_tol)
+
+    def _update_problem(self, problem: Problem | None, b: Any, v_free: Any) -> Problem:
+        """Return the prepared problem with a new right-hand side b or a new v*, see `solve`."""
+        original, target = self._original, None
+        if problem is not None:
+            raise InputError(
+                "problem is given with b or v_free: give problem.updated(b=...), or leave problem out"
+            )
+        general = original.generalized
+        if v_free is not None and b is None and general is not None:
+            if self._target is None or self._target[0] is not original:
+                self._target = original, original.b + general.velocity_of(general.v_free)
+            target = self._target[1]
+        updated = original.updated(b=b, v_free=v_free, target=target)
+        if target is not None:
+            self._target = updated, target
+        return updated
 
     def _solve(self, arguments: SolveArguments, original: Problem) -> Solution:
         """Prepare, step and finish: solve `original`, without the compiled call for small problems."""
@@ -292,7 +324,9 @@ class Prepared:
     def _replace_problem(self, original: Problem, deadline: Deadline | None) -> None:
         """Replace the prepared problem by another one without a set-up."""
         if original is not self._original:
-            late = check_accepted(original, self.spec, deadline)
+            late = not has_same_operator(original, self._original) and check_accepted(
+                original, self.spec, deadline
+            )
             self._original, self.problem = original, original if late else original.disk
             self._setup = NotSetUp()
 
@@ -305,7 +339,8 @@ class Prepared:
         problem = original.disk if original.cones._blocks.has_ellipse else original
         is_other = original is not self._original
         if is_other:
-            check_accepted(original, spec)
+            if not has_same_operator(original, self._original):
+                check_accepted(original, spec)
             self.setup_time = 0.0
         if problem.metric.reference_energy < 0.0:
             # Compute the judge's reference before a solver gets the problem.
@@ -591,8 +626,17 @@ def _make_solver(spec: SolverSpec, options: dict[str, Any]) -> Solver:
     return BoundedRowSolver(solver)
 
 
+def has_same_operator(p: Problem, q: Problem) -> bool:
+    """Return whether two problems share the arrays of A and of the blocks, as `Problem.updated(b=...)` makes them."""
+    if p.cones is not q.cones or p.friction != q.friction or p.matrix is not q.matrix or p.rows is not q.rows:
+        return False
+    return p.generalized is None or p.generalized.operator is getattr(q.generalized, "operator", None)
+
+
 def same_structure(p: Problem, q: Problem) -> bool:
     """Return whether two problems have the same blocks, form of A, and bodies or sparsity pattern."""
+    if has_same_operator(p, q):
+        return True
     if not (are_equal(p.cones.ptr, q.cones.ptr) and are_equal(p.cones.kind, q.cones.kind)) or p.law != q.law:
         return False
     if p.rows is not None and q.rows is not None:
@@ -613,4 +657,4 @@ def same_structure(p: Problem, q: Problem) -> bool:
                 strict=True,
             )
         )
-    return are_equal(p.csr.indptr, q.csr.indptr) and are_equal(p.csr.indices, q.csr.indices)
+    return all(map(are_equal, p._compressed[:2], q._compressed[:2]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import update_wrapper
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, NoReturn, cast
 
@@ -12,12 +13,13 @@ from lavender.base.arrays import ArrayLike
 from lavender.base.errors import InputError
 from lavender.judge.solution import Solution
 from lavender.problem import Problem, check_problem
-from lavender.solvers.registry import get
+from lavender.solvers.registry import SolverSpec, get, registered
 from lavender.solving.compiled_call import solve_small
 from lavender.solving.limits import check_time_limit, make_deadline
 from lavender.solving.loop import Callback
 from lavender.solving.prepared import Prepared, check_arguments
 from lavender.solving.velocity import accept_velocity, relative_tolerance
+from lavender_ext.batch.many import make_solve
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -100,8 +102,7 @@ def solve(
         tol = relative_tolerance(problem, velocity_tol, tol)
     solution: Solution | None = None
     failed_call: tuple[int, ...] | None = None
-    is_default = max_iter is None and callback is None and history is False and not options
-    if is_default and spec._tries_compiled_call(problem):
+    if max_iter is None and callback is None and history is False and not options:
         solution, failed_call = solve_small(problem, spec, impulse, tol, limit)
     if solution is None:
         deadline = None if limit == math.inf else make_deadline(spec, limit, begun)
@@ -109,6 +110,12 @@ def solve(
         arguments = check_arguments(spec, impulse, tol, max_iter, deadline, history, callback, failed_call)
         solution = prepared._solve(arguments, problem)
     return solution if velocity_tol is None else accept_velocity(solution, velocity_tol)
+
+
+def _solve_after_call(problem: Problem, spec: SolverSpec, impulse: Any, tol: float, counts: Any) -> Solution:
+    """Solve a problem that the compiled call with these work counts did not solve."""
+    prepared = Prepared(problem, spec, {}, False)
+    return prepared._solve(check_arguments(spec, impulse, tol, None, failed_call=counts), problem)
 
 
 def _reject_solver(solver: Any) -> NoReturn:
@@ -128,3 +135,7 @@ def _reject_solver(solver: Any) -> NoReturn:
     raise InputError(
         f"solver is {value}; the name of a solver is needed, all others by name: lavender.solve(problem, {example})"
     )
+
+
+if not TYPE_CHECKING:
+    solve = update_wrapper(make_solve(solve, _solve_after_call, registered), solve)

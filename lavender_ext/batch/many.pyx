@@ -8,15 +8,20 @@ from cpython.exc cimport PyErr_CheckSignals
 from libc.stdint cimport int32_t, int64_t
 from libc.math cimport INFINITY, fabs
 from libc.stdlib cimport calloc, free
-from libc.string cimport memcpy
+from libc.string cimport memcpy, memset
+
+cimport cython
 
 import numpy as np
 
-from lavender_ext.core.arrays cimport as_double_pointer, as_int_pointer, make_read_only, ndarray
+from lavender_ext.core.arrays cimport (C_CONTIGUOUS, DOUBLE, as_double_pointer, as_int_pointer, has_element_type, make_read_only,
+                                       ndarray)
 from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.method cimport workspace_t
 from lavender_ext.core.problem cimport Data, bind_body_arrays, derived_t
 from lavender_ext.core.problem import LAWS
+from lavender_ext.core.checks cimport make_instance
+from lavender_ext.core.validate cimport all_finite
 from lavender_ext.small.call cimport N_COUNTS, Rules, small_rules_t, small_problem_t, judge_small_impulse
 from lavender_ext.batch.task cimport (copy_small_judgement, compute_missing_derived_numbers, judge_task, judge_zero_impulse_of_task,
                                       judge_task_workspace_size, prepare_task_for_small_call,
@@ -26,15 +31,18 @@ from lavender_ext.small.workspace cimport grow_workspace_to, free_workspace
 from lavender_ext.batch.world cimport (BAD, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, LATE, LEFT, MASS, MU, N_ARRAYS, PLACES, READY,
                                        AT_ROW, ROWS, SOFT, STARTED, TARGET, TRIED, VELOCITIES, VELOCITY, worker_scratch_t,
                                        convert_generalized_world, worlds_t)
-from lavender_ext.judge.measure cimport set_zero_impulse, make_judged, count_judge_scratch
+from lavender_ext.judge.measure cimport Judged, set_zero_impulse, make_judged, count_judge_scratch
 from lavender_ext.judge.rounding cimport float32_floor_of_score, compute_squared_float32_rounding
 from lavender_ext.judge.tally cimport compute_rhs_energy_norm
 from lavender_ext.velocity_newton.soft cimport needs_no_proximal_terms
 
-cdef object new = np.empty
-
 cdef extern from *:
     """
+    /* `PyArray_New` and `PyArray_Type` of NumPy's table of functions, whose order has not changed since NumPy 1.0. */
+    static void** lav_numpy;
+    #define lav_read_numpy(capsule) (lav_numpy = (void**)PyCapsule_GetPointer(capsule, NULL))
+    #define lav_new_array(n) ((PyObject* (*)(void*, int, Py_ssize_t*, int, void*, void*, int, int, void*))lav_numpy[93])( \
+        lav_numpy[2], 1, n, 12, NULL, NULL, 0, 0, NULL)
     #if defined(_MSC_VER)
     #include <intrin.h>
     #define lav_add(p, x) _InterlockedExchangeAdd64((volatile __int64*)(p), (x))
@@ -43,9 +51,19 @@ cdef extern from *:
     #endif
     """
     int64_t lav_add(int64_t* p, int64_t x) noexcept nogil
+    void** lav_read_numpy(object capsule) except NULL
+    ndarray lav_new_array(Py_ssize_t* n)
+
+lav_read_numpy((np._core if hasattr(np, "_core") else np.core)._multiarray_umath._ARRAY_API)
+
+
+cdef ndarray new(Py_ssize_t n):
+    """Return an uninitialised array (n,) of float64, in a third of the time of `numpy.empty`."""
+    return lav_new_array(&n)
 
 
 cdef enum:
+    MAX_KEPT_NUMBERS = 1 << 16      # A workspace with more numbers is freed at the end of a call.
     INTERRUPT_CHECK_WORLDS = 256    # worlds between two checks for Ctrl-C
 
 
@@ -109,12 +127,31 @@ cdef void store_zero_residual(task_t* j, Data p):
         p.store_reference(j.p.islands, j.zero_residual)
 
 
+cdef struct call_workspaces_t:      # of one call
+    workspace_t solve
+    workspace_t islands
+
+
+cdef void free_call_workspaces(call_workspaces_t* r) noexcept nogil:
+    free_workspace(&r.solve)
+    free_workspace(&r.islands)
+
+
 cdef class Limits:
-    """Cost limits, from the fields of a `limits_t` as an array (17,)."""
+    """Cost limits, from the fields of a `limits_t` as an array (17,), and the workspaces of calls that have ended."""
     cdef limits_t at
+    cdef call_workspaces_t kept
 
     def __init__(self, const double[::1] numbers):
         self.at = (<const limits_t*>&numbers[0])[0]
+
+    def __dealloc__(self):
+        free_call_workspaces(&self.kept)
+
+    cdef void exchange_kept_workspaces(self, call_workspaces_t* r) noexcept:
+        """Exchange workspaces with the kept ones, so that no two calls of different threads use the same."""
+        with cython.critical_section(self):
+            self.kept, r[0] = r[0], self.kept
 
     def cost(self, Data p, double work, int islands):
         """Return the estimated and permitted cost [ns] of Newton's method; `work`: multiply-adds to factorise every island."""
@@ -132,23 +169,112 @@ def solve_new_generalized_problem(Data p, start, double tol, Limits limits, doub
     iterate is returned. d, Y and the residual of the zero impulse are stored in the data.
     """
     cdef task_t j
-    cdef workspace_t workspace = workspace_t(0, 0, NULL, NULL, 0, 0, 0, 0.0), islands = workspace
+    cdef call_workspaces_t r
     cdef Py_ssize_t m = p.blocks.n_rows
     cdef bint had_derived = p.ready
     impulse, results = make_read_only(new(m)), new(2 * m + 1)
     set_task_from_data(&j, p, start, <double*>(<ndarray>impulse).data, <double*>(<ndarray>results).data)
     j.cost_limit = max_cost
+    memset(&r, 0, sizeof(r))
+    limits.exchange_kept_workspaces(&r)
     with nogil:
-        solve_task(&j, &workspace, &islands, &limits.at, tol)
-        free_workspace(&workspace)
+        r.solve.is_bound = r.solve.tries = 0
+        solve_task(&j, &r.solve, &r.islands, &limits.at, tol)
     if not had_derived and j.has_derived:
         p.adopt_derived(&j.made)
     elif not had_derived:
         free(j.made.marks)
         free(j.made.numbers)
     store_zero_residual(&j, p)
-    free_workspace(&islands)
+    if max(r.solve.n_real, r.solve.n_index, r.islands.n_real, r.islands.n_index) <= MAX_KEPT_NUMBERS:
+        limits.exchange_kept_workspaces(&r)
+    free_call_workspaces(&r)
     return make_task_result(&j, p, impulse, results)
+
+
+cdef tuple NO_CALL = (None, None, None, None), LAWS_OF_ROWS = ("linear", "lcp")
+cdef object Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, read_clock
+
+
+def bind_types(types):
+    """Set the classes and functions of the package that `solve_compiled` needs; this package does not import it."""
+    global Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, read_clock
+    Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, read_clock = types
+
+
+cdef bint is_plain_start(impulse, Py_ssize_t m) noexcept:
+    """Return whether a start is a contiguous array (m,) of finite numbers, which needs no conversion."""
+    if type(impulse) is not ndarray:
+        return False
+    cdef ndarray x = <ndarray>impulse
+    return (x.nd == 1 and x.dimensions[0] == m and x.flags & C_CONTIGUOUS and has_element_type(x, DOUBLE)
+            and all_finite(<const double*>x.data, m))
+
+
+def solve_compiled(problem, spec, impulse, tol, double max_cost=INFINITY):
+    """Solve and judge a problem by the compiled call of a solver, unless the call does not accept the problem.
+
+    Parameters
+    ----------
+    problem : Problem
+    spec : SolverSpec
+    impulse : (m,) N s, or None
+    tol : float, -
+    max_cost : float, ns
+        Estimated cost at which the call ends with the iterate so far.
+
+    Returns
+    -------
+    tuple
+        Solution, or None if there is no result within tol; judged result or None; work counts, None if no call was made or
+        the start is the result; start (m,) of the call or None.
+    """
+    small, solution, view = spec.small, None, problem.derived.view
+    if small is None or not spec.builtin or not isinstance(tol, float) or not 0.0 < <double>tol < INFINITY:
+        return NO_CALL
+    if view is not None:
+        if small.limits is None or (<Data>view).has_ellipse:
+            return NO_CALL
+    elif (not (small.pivots if problem.law in LAWS_OF_ROWS else small.hands_over) or problem.has_singular_program
+            or len(problem.b) > (<Rules>small.rules).at.rows or (<Blocks>problem.cones._blocks).has_ellipse):
+        # Islands of larger problems may take long, so `Prepared` solves them between checks of the clock.
+        return NO_CALL
+    began, first = read_clock(), impulse
+    if impulse is None:
+        first = problem.guess
+    elif not is_plain_start(impulse, len(problem.b)):
+        first = problem.impulse_array(impulse)
+    if view is not None and (<Data>view).blocks.n_rows:
+        judged, counts = solve_new_generalized_problem(view, first, tol, small.limits, max_cost)
+    else:
+        judged, counts = small.solve_and_judge(problem, first, tol, max_cost)
+    if judged is not None and (<Judged>judged).relative <= <double>tol:
+        kept = first if first is None or impulse is None else first.copy()      # The caller may change the array later.
+        solution = make_instance(Solution, {
+            "impulse": (<Judged>judged).impulse, "status": CONVERGED, "tol": tol, "setup_time": 0.0,
+            "solve_time": read_clock() - began, "_late_residual": (make_residual, (problem, judged)),
+            "_rest": (compute_postponed_fields, (problem, spec, judged, counts, kept, CONVERGED)),
+        })
+    return solution, judged, counts, first
+
+
+def make_solve(solve_general, solve_after_call, dict registered):
+    """Return `lavender.solve`: the compiled call if all arguments have their defaults, otherwise `solve_general`.
+
+    `solve_after_call` solves a problem that the call did not solve.
+    """
+    def solve(problem, solver="auto", *surplus, impulse=None, tol=1e-6, velocity_tol=None, max_iter=None, time_limit=None,
+              history=False, callback=None, **options):
+        if (velocity_tol is None and max_iter is None and time_limit is None and callback is None and history is False
+                and not options and not surplus and type(problem) is Problem and type(tol) is float and type(solver) is str):
+            spec = registered.get(solver)
+            if spec is not None:
+                solution, _, counts, _ = solve_compiled(problem, spec, impulse, tol)
+                return solution if solution is not None else solve_after_call(problem, spec, impulse, tol, counts)
+        return solve_general(problem, solver, *surplus, impulse=impulse, tol=tol, velocity_tol=velocity_tol, max_iter=max_iter,
+                             time_limit=time_limit, history=history, callback=callback, **options)
+
+    return solve
 
 
 cdef enum:                      # rows of `Worlds.numbers`: results of each world

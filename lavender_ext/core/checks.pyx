@@ -30,7 +30,7 @@ FAULT_NAMES = (
 MAX_MAGNITUDE, MIN_MAGNITUDE = max_magnitude(), min_magnitude()
 
 
-def make_instance(cls, dict attributes):
+cpdef make_instance(cls, dict attributes):
     """Return an object of the Python class `cls` with these attributes, without calling `__init__` or `__setattr__`."""
     made = lav_make_object(cls, NO_ARGUMENTS)
     PyObject_GenericSetDict(made, attributes, NULL)

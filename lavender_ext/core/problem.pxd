@@ -58,6 +58,7 @@ cdef class Data:
     cdef islands_t islands_at           # target of blocks.islands, if that is not NULL
     cdef object _weight
     cdef list keep
+    cdef Data owner             # owner of all other arrays, if `with_law` made this object; else None
 
     cdef view_t get_pointers(self) noexcept nogil
     cdef void adopt_derived(self, derived_t* derived)

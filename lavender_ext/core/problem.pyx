@@ -358,12 +358,13 @@ cdef class Data:
                 return True
         return False
 
-    def with_law(self, int law):
-        """Return data of the same problem under another friction law (a value of `LAWS`), with the same arrays."""
+    def with_law(self, int law, b):
+        """Return data of the same operator with another friction law (a value of `LAWS`) and right-hand side b (m,) [m/s]."""
         cdef Data other = Data.__new__(Data)
-        other.keep = [self]
+        other.owner = self if self.owner is None else self.owner
+        other.keep = [b]
         other.blocks, other.csr, other.rows, other.general = self.blocks, self.csr, self.rows, self.general
-        other.blocks.law, other.blocks.islands = law, NULL
+        other.blocks.law, other.blocks.islands, other.blocks.b = law, NULL, as_double_pointer(b, self.blocks.n_rows)
         other.factored, other.is_general = self.factored, self.is_general
         other.ready, other.single_rows, other.empty = self.ready, self.single_rows, self.empty
         other._numbers, other._arrays = self._numbers, self._arrays.copy()

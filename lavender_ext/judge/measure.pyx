@@ -260,6 +260,18 @@ cdef class Judged:
         return self.both[self.data.blocks.n_rows:2 * self.data.blocks.n_rows]
 
 
+def list_residual_fields(Judged judged, problem, rest):
+    """Return the fields of a `Residual` of the package; `rest` computes those with one number for each row."""
+    return {
+        "relative": judged.relative, "energy": judged.energy, "velocity": judged.velocity,
+        "roundoff_floor": judged.roundoff_floor, "above_floor": judged.above_floor, "worst_island": judged.island,
+        "floor_energy": judged.floor_energy, "worst_row": judged.worst, "energy_at_zero": judged.data.reference_energy,
+        "velocity_at_zero": judged.data.reference_velocity, "_problem": problem, "_impulse": judged.impulse,
+        "precision": "float64", "rounding": None, "_float64_relative": judged.float64_relative,
+        "_rest": (rest, (judged,)),
+    }
+
+
 def make_relative_score(double energy, double velocity, double reference_energy, double reference_velocity):
     """Return the relative residual: the larger ratio of an error to its reference; inf if a number is not finite."""
     return relative_residual(energy, velocity, reference_energy, reference_velocity)

@@ -256,6 +256,8 @@ CALLS = {
     "Prepared.solve": Call(
         lv.prepare(LCP, "pgs").solve, {"problem": LCP, "impulse": B, "history": True} | LIMITS
     ),
+    "Prepared.solve, b": Call(lv.prepare(LCP, "pgs").solve, {"b": B}),
+    "Prepared.solve, v_free": Call(lv.prepare(GENERAL).solve, {"v_free": GENERAL.generalized.v_free}),
     "register": Call(lv.register, {"spec": lv.get("pgs"), "replace": True}, {"spec": "SolverSpec"}),
     "residual": Call(
         lv.residual, {"problem": LCP, "impulse": B, "precision": "float32", "threshold": 1e-6}, accepts_nan=True

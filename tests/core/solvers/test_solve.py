@@ -1,9 +1,15 @@
 """The front door: what it refuses before anything runs, budgets, clocks, history, callbacks, Ctrl-C."""
 
 import dataclasses
+import gc
+import inspect
+import pickle
 import signal
 import threading
 import time
+import weakref
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -79,3 +85,76 @@ def test_a_solve_leaves_no_result_with_its_problem(name):
     keys = set(problem.derived.cache)
     assert lv.solve(problem, name).success and set(problem.derived.cache) == keys
     assert not any("judged" in str(key) for key in keys)
+
+
+@pytest.mark.parametrize("solver", ["auto", "newton", "pgs"])
+@pytest.mark.parametrize("form", ["matrix", "jacobian"])
+def test_prepared_solve_of_another_b_has_the_bits_of_a_new_problem(solver, form):
+    rng = np.random.default_rng(3)
+    jac, mass, free = rng.normal(size=(6, 9)), np.diag(rng.uniform(1.0, 2.0, 9)), rng.normal(size=9)
+    if form == "matrix":
+        problem = lv.Problem.contact(jac @ jac.T + 0.1 * np.eye(6), rng.normal(size=6), 0.5)
+    else:
+        problem = lv.Problem.from_jacobian(jac, mass, free, mu=0.5, compliance=0.01)
+    prepared = lv.prepare(problem, solver)
+    for _ in range(3):
+        b = problem.b + 0.1 * rng.normal(size=6)
+        own, single = prepared.solve(b=b), lv.solve(replace(problem, b=b), solver)
+        assert own.impulse.tobytes() == single.impulse.tobytes()
+        assert own.success and own.residual.relative == single.residual.relative
+        assert own.residual._problem.b.tolist() == b.tolist()
+    assert prepared.solve().impulse.tobytes() == single.impulse.tobytes()  # b stays.
+
+
+def test_prepared_solve_of_another_velocity_keeps_the_targets():
+    rng = np.random.default_rng(4)
+    jac, mass, target = rng.normal(size=(6, 9)), np.diag(rng.uniform(1.0, 2.0, 9)), rng.normal(size=6)
+    make = partial(lv.Problem.from_jacobian, jac, mass, target=target, mu=0.5, compliance=0.01)
+    prepared = lv.prepare(make(rng.normal(size=9)))
+    for _ in range(20):
+        velocity = 10.0 * rng.normal(size=9)
+        own, single = prepared.solve(v_free=velocity), lv.solve(make(velocity))
+        np.testing.assert_allclose(own.impulse, single.impulse, rtol=1e-5, atol=1e-5)
+        # Rounding of b does not accumulate from call to call.
+        np.testing.assert_allclose(own.residual._problem.b, target - jac @ velocity, rtol=0.0, atol=1e-13)
+        assert own.residual._problem.generalized.v_free.tolist() == velocity.tolist()
+
+
+def test_prepared_solve_rejects_a_problem_with_b_and_a_velocity_of_a_matrix():
+    problem = lv.Problem.lcp(np.eye(2), [1.0, -1.0])
+    prepared = lv.prepare(problem)
+    with pytest.raises(lv.InputError, match=r"problem is given with b or v_free.*problem\.updated\(b="):
+        prepared.solve(problem, b=[1.0, 2.0])
+    with pytest.raises(lv.InputError, match="only in a problem in generalised coordinates"):
+        prepared.solve(v_free=[1.0, 2.0])
+    with pytest.raises(lv.InputError, match=r"b \[m/s\] has shape \(3,\)"):
+        prepared.solve(b=np.ones(3))
+    assert prepared.solve().impulse.tolist() == [1.0, 0.0]
+
+
+def test_problems_that_differ_in_b_share_memory_of_the_operator_and_free_each_other():
+    problem = lv.Problem.from_jacobian(np.eye(3), np.eye(3), -np.ones(3), mu=0.5)
+    lv.solve(problem)
+    prepared, seen = lv.prepare(problem), []
+    for i in range(5):
+        seen.append(weakref.ref(prepared.solve(b=problem.b + 0.01 * i).residual._problem))
+    gc.collect()
+    assert [ref() is not None for ref in seen] == [False] * 4 + [True]
+
+
+def test_solve_shows_signature_documentation_and_module_of_its_definition():
+    assert str(inspect.signature(lv.solve)).startswith("(problem: 'Problem', solver: 'str' = 'auto', *surplus")
+    assert "Warm start" in lv.solve.__doc__
+    assert pickle.loads(pickle.dumps(lv.solve)) is lv.solve
+
+
+@pytest.mark.parametrize("tol", [1e-6, np.float64(1e-6)])
+def test_solve_of_default_arguments_has_the_bits_of_other_calls(tol):
+    for problem in (
+        lv.Problem.from_jacobian(np.eye(3), np.eye(3), -np.ones(3), mu=0.5, friction="cone", compliance=0.01),
+        lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, 0.5]),
+        lv.Problem.lcp([[0.0, 1.0], [-1.0, 0.0]], [1.0, 1.0]),  # The compiled call does not solve it.
+    ):
+        own, other = lv.solve(problem), lv.solve(problem, tol=tol, time_limit=60.0)
+        assert own.impulse.tobytes() == other.impulse.tobytes()
+        assert (own.status, own.work, own.message) == (other.status, other.work, other.message)

@@ -1,0 +1,3 @@
+"""Creation of objects for other modules."""
+
+cpdef make_instance(cls, dict attributes)
