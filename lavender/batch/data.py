@@ -291,7 +291,7 @@ class Batch(Sequence[Problem]):
 
     def make_kernel_worlds(self, impulse: FloatArray, velocity: FloatArray, cold: bool) -> Worlds:
         """Build the data of the compiled loop, which writes results to the flat arrays `impulse` and `velocity`."""
-        worlds = Worlds(convert_table_for_kernel(self.at), impulse, velocity, cold)
+        worlds = Worlds(self.at.view(np.int64).reshape(len(self), len(PLACE)), impulse, velocity, cold)
         if self.cones.has_ellipse:
             worlds.set_from_problems([], [None] * len(self), [])
         else:
@@ -306,11 +306,6 @@ class Batch(Sequence[Problem]):
 
 
 # -- conversion of arguments --------------------------------------------------------------------------
-
-
-def convert_table_for_kernel(at: np.ndarray) -> np.ndarray:
-    """Return a table of worlds (n,) as the kernels read it, (n, fields) int64, without a copy."""
-    return at.view(np.int64).reshape(len(at), len(PLACE))
 
 
 def _compute_offsets(sizes: Any) -> np.ndarray:

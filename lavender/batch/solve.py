@@ -96,7 +96,7 @@ class Solutions(WorldResults, Sequence[Solution]):
         self._late_worlds: list[int] = []  # Late worlds with a start that is not judged yet.
         self._time_per_world = 0.0  # [s] Mean time of the worlds so far.
         # Keep a copy of the starts of a batch, because the loop overwrites them.
-        self._given_starts = None if cold or not isinstance(problems, Batch) else starts.copy()
+        self._given_starts = None if cold or type(problems) is not Batch else starts.copy()
 
     def __getstate__(self) -> dict[str, Any]:
         return super().__getstate__() | {"_spec": self._spec.name}
@@ -107,7 +107,7 @@ class Solutions(WorldResults, Sequence[Solution]):
     @property
     def impulse(self) -> FloatArray:
         """Impulses [N s], see the class."""
-        shape = self.problems.shape if isinstance(self.problems, Batch) else self._impulse.shape
+        shape = self.problems.shape if type(self.problems) is Batch else self._impulse.shape
         return self._export(self._impulse.reshape(shape))
 
     @property
@@ -117,7 +117,7 @@ class Solutions(WorldResults, Sequence[Solution]):
 
     @cached_property
     def _velocities(self) -> FloatArray:
-        if isinstance(self.problems, Batch):
+        if type(self.problems) is Batch:
             self._judge_late_worlds()
             return mark_read_only(self._velocity.reshape(self.problems.velocity_shape))  # type: ignore[union-attr]
         velocities = [np.zeros(0)]
@@ -168,7 +168,7 @@ class Solutions(WorldResults, Sequence[Solution]):
 
     def get_start(self, i: int) -> Any:
         """Return the start (m,) [N s] of world i, or None if none was given."""
-        if isinstance(self.problems, Batch):
+        if type(self.problems) is Batch:
             return None if self._given_starts is None else self._given_starts[self._get_rows(i)]
         return self._starts[i]
 
@@ -178,9 +178,7 @@ class Solutions(WorldResults, Sequence[Solution]):
             self._worlds.code[i] = CODE["late"]
             start = self.get_start(i)
             if start is None:
-                start = (
-                    self.problems.start(i) if isinstance(self.problems, Batch) else self.problems[i].start()
-                )
+                start = self.problems.start(i) if type(self.problems) is Batch else self.problems[i].start()
         else:
             self._solutions[i], start = unjudged, unjudged.impulse
         self._impulse[self._get_rows(i)] = start
@@ -213,7 +211,7 @@ class Solutions(WorldResults, Sequence[Solution]):
 
     def _estimate_late_judging_cost(self) -> float:
         """Estimate the cost [ns] of the results if no world is started before the deadline."""
-        if isinstance(self.problems, Batch):
+        if type(self.problems) is Batch:
             rows, columns = (self.problems.at[name].astype(float) for name in ("rows", "velocities"))
             # Number of entries in a row of J, or of A for a matrix.
             entries = np.where(columns > 0.0, columns, rows)
@@ -231,7 +229,7 @@ class Solutions(WorldResults, Sequence[Solution]):
         for i in self.faults:
             self._impulse[self._get_rows(i)] = np.nan
             self._worlds.counts[i], self._worlds.worst[i] = 0, -1
-            if isinstance(self.problems, Batch) and self._velocity is not None and self._velocity.size:
+            if type(self.problems) is Batch and self._velocity is not None and self._velocity.size:
                 world = self.problems.at[i]
                 self._velocity[world["velocity"] : world["velocity"] + world["velocities"]] = np.nan
 
@@ -355,7 +353,8 @@ def solve_many(
         Ctrl-C was pressed; each thread completes its current world.
     """
     worlds = check_problems(problems, errors)
-    threads = check_int("threads", threads, 1, None)
+    if type(threads) is not int or threads < 1:
+        threads = check_int("threads", threads, 1, None)
     spec, limit = get(solver), check_time_limit(time_limit)
     if velocity_tol is not None:
         velocity_tol = check_velocity_tolerance(velocity_tol, tol)
@@ -385,7 +384,7 @@ def solve_many(
         return int(hand.solve_worlds(tol, *limits, COST_PER_SECOND * seconds))
 
     def solve_single(i: int) -> None:
-        is_batch, code = isinstance(worlds, Batch), solutions._worlds.code[i]
+        is_batch, code = type(worlds) is Batch, solutions._worlds.code[i]
         if deadline.is_set and not is_batch:
             deadline.reserve_seconds(-1e-9 * RATES["late world"])
         if deadline.has_passed():
@@ -414,14 +413,14 @@ def solve_many(
     solutions._process_worlds(process_until_deferred, solve_single, threads, errors)
     solutions.clear_invalid()
     solutions._time_per_world = (perf_counter() - begin) / max(1, len(worlds))
-    if not isinstance(worlds, Batch):
+    if type(worlds) is not Batch:
         solutions._worlds.store_zero_residuals(solutions._data)
     return solutions
 
 
 def _compute_tolerance_for_velocity_error(worlds: Any, velocity_tol: float) -> float:
     """Return the relative residual that guarantees a velocity error [m/s] in every valid world."""
-    if isinstance(worlds, Batch):
+    if type(worlds) is Batch:
         # The velocity error of the zero impulse does not depend on the impulse that is judged.
         references = residual_many(worlds, np.zeros(worlds.shape), errors="status").velocity_at_zero
     else:
@@ -444,7 +443,7 @@ def _convert_starts(
     """
     starts: Any
     parts: Iterable[tuple[int, Any]] = ()
-    if isinstance(worlds, Batch):
+    if type(worlds) is Batch:
         if impulses is not None:
             raise InputError(
                 "impulses= needs a list of problems; a batch takes impulse=, one array for all worlds"
@@ -469,7 +468,7 @@ def _convert_starts(
             invalid[i] = InputError(message)
             if errors == "raise":
                 raise invalid[i]
-            if isinstance(worlds, Batch):
+            if type(worlds) is Batch:
                 start[:] = 0.0
             else:
                 starts[i] = None

@@ -378,22 +378,20 @@ cdef class Worlds:
     cdef int32_t* count
     cdef signed char* code_at
 
-    def __init__(self, const int64_t[:, ::1] at, double[::1] impulse, double[::1] velocity, bint cold):
-        cdef Py_ssize_t n = at.shape[0]
-        self.impulse, self.velocity, self.cold = impulse.base, velocity.base, cold
-        self.numbers, self.worst = np.zeros((N_NUMBERS, n + 1)), np.full(n + 1, -1, np.int32)
-        self.counts, self.code = np.zeros((n + 1, N_COUNTS), np.int32), np.zeros(n + 1, np.int8)
-        cdef double[:, ::1] numbers = self.numbers
-        cdef int32_t[::1] worst = self.worst
-        cdef int32_t[:, ::1] counts = self.counts
-        cdef signed char[::1] code = self.code
-        self.references = [at]
+    def __init__(self, const int64_t[:, ::1] at, impulse, velocity, bint cold):
+        cdef Py_ssize_t n = at.shape[0], i
+        cdef ndarray numbers = np.zeros((N_NUMBERS, n + 1)), worst = np.empty(n + 1, np.int32)
+        cdef ndarray counts = np.zeros((n + 1, N_COUNTS), np.int32), code = np.zeros(n + 1, np.int8)
+        self.impulse, self.velocity, self.cold, self.references = impulse, velocity, cold, [at]
+        self.numbers, self.worst, self.counts, self.code = numbers, worst, counts, code
         self.w.n = n
         if n:
             self.w.at = &at[0, 0]
-        self.lam = &impulse[0] if impulse.shape[0] else NULL
-        self.v = &velocity[0] if velocity.shape[0] else NULL
-        self.number, self.worst_at, self.count, self.code_at = &numbers[0, 0], &worst[0], &counts[0, 0], &code[0]
+        self.lam, self.v = as_double_pointer(impulse, impulse.size), as_double_pointer(velocity, velocity.size)
+        self.number, self.worst_at = <double*>numbers.data, <int32_t*>worst.data
+        self.count, self.code_at = <int32_t*>counts.data, <signed char*>code.data
+        for i in range(n + 1):
+            self.worst_at[i] = -1
 
     def set_from_arrays(self, arrays, strides, pattern, Blocks blocks, int law, double asymmetry):
         """Set the worlds from arrays with checked shapes and types. Their values are checked when a world is converted."""
