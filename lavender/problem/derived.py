@@ -95,10 +95,14 @@ def late_field(name: str) -> cached_property[Any]:
     """Return a property for a field of a dataclass that is computed, if it was not set, when it is first read.
 
     The attribute `_rest` of the object is a function and its arguments; the function returns the late fields by name.
+    `_late_<name>` is a function and its arguments that compute one field without the others.
     """
+    own_name = f"_late_{name}"
 
     def compute(instance: Any) -> Any:
         attributes = instance.__dict__
+        if (own := attributes.get(own_name)) is not None:
+            return own[0](*own[1])
         rest = attributes.get("_rest")
         if rest is not None:
             function, arguments = rest

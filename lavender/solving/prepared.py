@@ -18,7 +18,6 @@ import numpy as np
 from lavender.base.arrays import ArrayLike, FloatArray, are_equal, check_bool, check_float, check_int
 from lavender.base.deadline import NEVER, Deadline
 from lavender.base.errors import BREAKDOWN, CapabilityError, InputError, InUse, UnknownName, format_error
-from lavender.external.foreign import ForeignSolver
 from lavender.judge.certificates import prove_infeasibility
 from lavender.judge.residuals import (
     Residual,
@@ -617,6 +616,9 @@ def _make_solver(spec: SolverSpec, options: dict[str, Any]) -> Solver:
             raise
         raise InputError(f"solver {spec.name!r} cannot take the options {options}: {error}") from error
     if not spec.builtin:
+        # Import the adapters of other packages only here, because they take a quarter of the time of `import lavender`.
+        from lavender.external.foreign import ForeignSolver
+
         return ForeignSolver(spec.name, solver)
     if spec.box_friction_laws <= spec.laws:
         return solver
