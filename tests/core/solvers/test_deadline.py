@@ -14,7 +14,6 @@ from worked import python
 import lavender as lv
 from benchmarks.core_problems import fresh
 from lavender import registry
-from lavender.problem.derived import computed_once
 from lavender.problem.operators import Operators
 from lavender.solvers.costs import estimate_disk_cost, estimate_judge_setup_cost
 
@@ -140,7 +139,7 @@ def test_worlds_whose_turn_comes_too_late_keep_their_start(name, started, clock)
 
 def made_once(problem):
     """What was worked out of a problem and kept."""
-    return {name for name in vars(problem) if isinstance(getattr(type(problem), name, None), computed_once)}
+    return {name for name in vars(problem) if getattr(getattr(type(problem), name, None), "is_locked", False)}
 
 
 def test_a_package_of_others_does_not_read_a_matrix_after_the_deadline(clock):
