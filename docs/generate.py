@@ -520,11 +520,10 @@ def by_structure(report):
 
 def measured_page(site, report, figures):
     """Advice by structure and law from the records of this build, the curves behind it, and their report."""
-    records = report.records
-    run = next(iter(records.runs.values()))
+    run = report.machine
     structures = f"{by_structure(report)}\n\n[A report's page](report.html) shows the same records."
     site.write("report.html", render_report(report))
-    shown = ", ".join(f"{n} {v}" for n, v in run.versions.items())
+    shown = ", ".join(f"{n} {v}" for n, v in run["versions"].items())
     drawn = []
     for law in LAWS:
         if law in figures:
@@ -534,8 +533,9 @@ def measured_page(site, report, figures):
     parts = [
         "# Measured in this build",
         (
-            f"{len(records)} runs on {len(records.cases)} cases of `lavender.suite`, made while these pages were "
-            f"built: {run.cpu}, {run.threads} thread,\nlavender {run.lavender}, Python {run.python}, {shown}. "
+            f"{len(report.runs)} runs on {len(report.cases)} cases of `lavender.suite`, made while these pages were "
+            f"built: {run['cpu']}, {run['threads']} thread,\nlavender {run['lavender']}, Python {run['python']}, "
+            f"{shown}. "
             f"Minimum of {PLAN.repeats} repeats of the whole call of `lv.solve`,\nat most "
             f"{format_seconds(PLAN.time_limit)} a solve. This is a small measurement, not a benchmark: "
             "`lavender report` on your own problems says more. "
@@ -569,11 +569,10 @@ def wide(*tables):
 
 def measured_tables(report):
     """Return the tables that are checked in, by the name of their place in a page."""
-    records = report.records
-    run = next(iter(records.runs.values()))
+    run = report.machine
     note = (
-        f"Measured with {len(records)} runs on {len(records.cases)} cases ({run.cpu}, {run.threads} thread, Python "
-        f"{run.python}) by\n`python docs/generate.py --tables`."
+        f"Measured with {len(report.runs)} runs on {len(report.cases)} cases ({run['cpu']}, {run['threads']} thread, "
+        f"Python {run['python']}) by\n`python docs/generate.py --tables`."
     )
     return {
         "by_structure": f"{by_structure(report)}\n\n{note}",

@@ -23,8 +23,10 @@ from lavender.cli.options import (
 )
 
 if TYPE_CHECKING:
+    from pandas import DataFrame
+
     from lavender.audit.page import ResultPage
-    from lavender.report import Event, Item, Plan, Records
+    from lavender.report import Event, Item, Plan
 
 
 PROGRESS_INTERVAL = 10.0  # [s] Time between two lines of progress if the output is not a terminal.
@@ -34,16 +36,11 @@ MIN_ELAPSED = 1.0  # [s] The remaining time is not estimated from a shorter time
 
 
 class Measured(NamedTuple):
-    """Records of a measuring command, measured by this call or reused from its output folder."""
+    """Lines of a measuring command, measured by this call or reused from its output folder."""
 
-    records: Records
+    lines: DataFrame
     stopped: bool  # Whether Ctrl-C ended the measurement.
-    reuse_note: str = ""  # Sentence on the number of reused records; empty if this call measured all of them.
-
-    @property
-    def n_cases_not_loaded(self) -> int:
-        """Number of cases in folders that did not load."""
-        return sum(not skip.solver for skip in self.records.skips)
+    reuse_note: str = ""  # Sentence on the number of reused runs; empty if this call measured all of them.
 
 
 def check_named_problems_load(items: Sequence[Item]) -> None:
@@ -83,19 +80,32 @@ def measure_files(
         A named file does not load, or the folder cannot be written or is in use by another process.
     """
     from lavender import report
+    from lavender.report.store import get_key, make_lines, select_machines
+    from lavender.solvers import registry
 
     limit_to_one_thread()
     options = context.params
     report.select_solver_names(options["solvers"])  # Reject unknown names before a problem is loaded.
+    solvers = options["solvers"]
+    if options["sweeps"] and not solvers:
+        specs = registry.specs()
+        solvers = [
+            name for name in report.select_solver_names(None) if specs[name].order and specs[name].resumable
+        ]
     plan, workers = _make_plan(context, files)
     reused = 0
     with report.Store(path) as store:
         items = report.resolve_sources(list(files), options["sequence"])
         if is_option_set(context, "sequence_time_limit") and not any(item.sequence for item in items):
             raise InputError("--sequence-time-limit has no effect without a sequence: leave it out")
+        if options["sweeps"] and not any(item.sequence for item in items):
+            raise InputError(
+                "--sweeps needs recorded steps in sequence: a folder that lv.io.Recorder(every=1), `lavender record` "
+                "or `lavender run --record` wrote, or --sequence for any folder of consecutive steps"
+            )
         check_named_problems_load(items)
-        before = {name: run.started for name, run in store.records.runs.items()}
-        measured: list[Records] = []
+        before = {name: machine["started"] for name, machine in select_machines(store.lines).items()}
+        rows: list[dict[str, Any]] = []
 
         def count_event(event: Event) -> None:
             nonlocal reused
@@ -105,18 +115,21 @@ def measure_files(
         stopped = False
         try:
             report.run(
-                items, options["solvers"], plan, store, watch=count_event, into=measured,
+                items, solvers, plan, store, watch=count_event, into=rows,
                 memory=convert_gigabytes_to_bytes(options["memory"]), reuse=not options["no_reuse"], **workers,
             )  # fmt: skip
         except KeyboardInterrupt:
-            if not measured:
+            if not rows:
                 raise
             stopped = True
+    dropped = "An incomplete last line of the records was dropped. " * store.lines.attrs["dropped"]
+    lines = make_lines(rows, str(path))
     if not reused:
-        return Measured(measured[0], stopped)
-    since = before.get(next(iter(measured[0].runs)), "").replace("T", " ")[:16]
-    note = f"{reused} of {len(measured[0])} runs of {since} reused; --no-reuse measures again"
-    return Measured(measured[0], stopped, note)
+        return Measured(lines, stopped, dropped)
+    since = before.get(rows[0]["run"], "").replace("T", " ")[:16]
+    n_runs = len({get_key(row) for row in rows if row["kind"] == "run"})
+    note = f"{reused} of {n_runs} runs of {since} reused; --no-reuse measures again"
+    return Measured(lines, stopped, dropped + note)
 
 
 def _make_plan(context: click.Context, files: Sequence[str]) -> tuple[Plan, dict[str, Any]]:
@@ -126,6 +139,7 @@ def _make_plan(context: click.Context, files: Sequence[str]) -> tuple[Plan, dict
     options = context.params
     names = ("tolerances", "budgets", "orders")
     values = {name: options[name] for name in names if options[name] is not None}
+    values |= {"tolerances": ()} if options["sweeps"] else {}
     if is_campaign(context):
         workers = options["workers"] if is_option_set(context, "workers") else -1
         return CampaignPlan(**{"orders": (), **values}), {"workers": workers, "backend": options["backend"]}

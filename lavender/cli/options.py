@@ -240,6 +240,8 @@ OPTIONS_WITHOUT_EFFECT: dict[str, tuple[str, tuple[str, ...]]] = {
                       ("all but", "files", "out", "compare", "time_budgets", "tables", "no_figures", "solvers")),
     "is_campaign": ("with --workers, which measures no times and ends by iterations",
                     ("repeats", "time_limit", "sequence_time_limit", "time_budgets", "sequence")),
+    "sweeps": ("with --sweeps, which measures fixed numbers of sweeps",
+               ("tolerances", "orders", "repeats", "time_budgets", "workers", "backend")),
     "without_model": ("without a MODEL.xml", RECORDING_NAMES),
     "without_random": ("without --controls random", ("seed",)),
     "without_record": ("without --record", ("replace",)),

@@ -60,6 +60,9 @@ from lavender.io.stored import lock_output, write_text
     metavar="S,S,...",
     help="Times in seconds for which the report lists the best solver; default: three decades about the fastest.",
 )
+@click.option("--sweeps", is_flag=True,
+              help="Answer how many sweeps a step needs: measure only fixed numbers of sweeps (--budgets) of the "
+              "solvers that sweep, on recorded steps in sequence.")  # fmt: skip
 @recording_options
 @click.option("--tables", is_flag=True, help="Print every table, warning and line of code.")
 @click.option("--no-reuse", is_flag=True, help="Repeat runs that the folder already holds.")
@@ -86,13 +89,13 @@ def report(
     if listed:
         _list_suite()
         return
-    from lavender.report.store import read
+    from lavender.report.store import read, select_solvers
     from lavender.report.text import format_count
 
     for limit in options["time_budgets"]:
         if not (math.isfinite(limit) and limit > 0.0):
             raise InputError(f"time budget {limit} is not positive; a positive number of seconds is needed")
-    _reject_unused_options(context, files, options["solvers"])
+    _reject_unused_options(context, files, options)
     context.with_resource(lock_output(out, folder=True))
     used_folders: set[Path] = set()
     recording = {name: options[name] for name in RECORDING_NAMES}
@@ -106,12 +109,12 @@ def report(
                 "a records.jsonl cannot be combined with problems or other records: give one file"
             )
         measured = Measured(read(records_files[0]), False)
-        if not (len(measured.records) or measured.records.skips):
+        if not measured.lines["kind"].isin(["run", "skip"]).any():
             raise InputError(
                 f"{records_files[0]} has no records: measure problems with `lavender report PROBLEM` first"
             )
         if options["solvers"]:
-            measured = measured._replace(records=measured.records.select_solvers(options["solvers"]))
+            measured = measured._replace(lines=select_solvers(measured.lines, options["solvers"]))
     with show_progress() as watch:
         if not records_files:
             measured = measure_files(context, files, path, watch)
@@ -119,8 +122,8 @@ def report(
         from lavender.report.findings import Report, list_skip_reasons, print_report, write
         from lavender.report.tables import read_engine_answers
 
-        engines = [] if is_campaign(context) else read_engine_answers(files, measured.records)
-        shown = Report(measured.records, old, options["time_budgets"], engines)
+        engines = [] if is_campaign(context) else read_engine_answers(files, measured.lines)
+        shown = Report(measured.lines, old, options["time_budgets"], engines)
         # Write the files before printing, as a closed pipe can end the command while it prints. After Ctrl-C, the page
         # has no figures, so that the prompt is back soon.
         try:
@@ -130,20 +133,18 @@ def report(
                 f"the page is not complete; {path} has all runs, and the same command shows them"
             ) from None
     print_report(shown, make_console(), complete=options["tables"])
-    print_escaped(f"\n{format_count(len(measured.records), 'run')}; page: {index}")
+    print_escaped(f"\n{format_count(len(shown.runs), 'run')}; page: {index}")
     if measured.reuse_note:
         print_escaped(measured.reuse_note)
     if measured.stopped:
         print_escaped("Stopped; the same command continues from here.", style="yellow")
         raise click.exceptions.Exit(EXIT_INTERRUPTED)
-    if not (records_files or len(measured.records)):
-        print_escaped(
-            f"nothing was measured: {'; '.join(list_skip_reasons(measured.records.skips))}", style="yellow"
-        )
+    if not (records_files or len(shown.runs)):
+        print_escaped(f"nothing was measured: {'; '.join(list_skip_reasons(shown.skips))}", style="yellow")
         raise click.exceptions.Exit(EXIT_UNMET)
-    if measured.n_cases_not_loaded and not records_files:
+    if (n_left_out := sum(map(len, shown.left_out.values()))) and not records_files:
         print_escaped(
-            f"{format_count(measured.n_cases_not_loaded, 'case')} of a folder left out of all numbers",
+            f"{format_count(n_left_out, 'case')} of a folder left out of all numbers",
             style="yellow",
         )
         raise click.exceptions.Exit(EXIT_UNMET)
@@ -163,15 +164,17 @@ def _list_suite() -> None:
 
 
 def _reject_unused_options(
-    context: click.Context, files: tuple[str, ...], solvers: tuple[str, ...] | None
+    context: click.Context, files: tuple[str, ...], options: Mapping[str, Any]
 ) -> None:
     """Raise InputError for each option that would be ignored."""
     shows_records = any(f.endswith(".jsonl") for f in files)
     has_model = any(Path(f).suffix.lower() in MODEL_SUFFIXES for f in files)
     reject_options_without_effect(
         context, shows_records=shows_records, is_campaign=not shows_records and is_campaign(context),
-        without_model=not has_model, without_random=has_model and context.params["control"] != "random",
-        **describe_solvers(None if shows_records else solvers),  # Records may contain solvers that are not installed.
+        sweeps=options["sweeps"], without_model=not has_model,
+        without_random=has_model and context.params["control"] != "random",
+        # Records may contain solvers that are not installed.
+        **describe_solvers(None if shows_records else options["solvers"]),
     )  # fmt: skip
 
 

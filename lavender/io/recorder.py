@@ -332,6 +332,8 @@ class Recorder:
                 facts["claimed_residuals"] = {key: float(x[i]) for key, x in claims.residuals.items()}
             if is_selected:
                 facts["selected"] = True
+            if self.every is not None and verdict.step % self.every == 0:
+                facts["every"] = self.every
             self.write_step(line | facts, problem, own, None if states is None else states(i))
         except LavenderError as failure:
             self.leave_out(line, failure)

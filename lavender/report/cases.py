@@ -27,7 +27,7 @@ from lavender.io.stored import ENGINE, STATES_FOLDER, SUFFIXES, read_whole_file
 from lavender.judge.residuals import DEFAULT_THRESHOLD, Residual, is_solved_by_zero, residual
 from lavender.problem import Problem, check_problem
 from lavender.problem.derived import cached_property
-from lavender.report.records import CaseInfo
+from lavender.report.store import Row
 from lavender.report.text import escape_unprintable, make_file_name
 from lavender.suite import Case
 
@@ -206,7 +206,8 @@ def make_sequence(problems: Iterable[Problem], name: str) -> list[Item]:
 def list_steps_in_folder(folder: str | Path) -> list[Item]:
     """Return the problem files of a folder as the steps of a sequence, in the numeric order of their names.
 
-    Steps that were recorded from different start states are different sequences; a single step of a state is a case.
+    Steps that were recorded from different start states or in different worlds are different sequences; a single step
+    of a state is a case.
 
     Raises
     ------
@@ -225,11 +226,15 @@ def list_steps_in_folder(folder: str | Path) -> list[Item]:
         )
     _check_one_recording(folder, paths)
     name = folder.resolve().name
-    starts = {str(line["file"]): line.get("start") for line in _read_engine_records(folder)}
+    lines = {str(line["file"]): line for line in _read_engine_records(folder)}
+    n_worlds = len({line.get("world", 0) for line in lines.values()})
     groups: dict[str, list[Path]] = {}
     for path in paths:
-        start = starts.get(path.name)
-        groups.setdefault(name if start is None else f"{name}, state {start}", []).append(path)
+        line = lines.get(path.name, {})
+        group = name if line.get("start") is None else f"{name}, state {line['start']}"
+        groups.setdefault(f"{group}, world {line.get('world', 0)}" if n_worlds > 1 else group, []).append(
+            path
+        )
     return [
         replace(_make_item_of_file(path), name=f"{group}[{i}]", sequence=group, step=i)
         if len(members) > 1
@@ -245,10 +250,13 @@ def _check_one_recording(folder: Path, paths: list[Path]) -> None:
     It does if two files have the same number, if file names have different prefixes, or if the list of steps that the
     engine wrote to the folder does not contain a file.
     """
+    lines = _read_engine_records(folder)
+    # The files of a `Recorder` end with the number of the world, and its lines have the number of the step.
     numbered = [(m[1], int(m[2])) for p in paths if (m := re.fullmatch(r"(.*?)(\d+)", p.stem))]
+    numbered = [] if any("world" in line for line in lines) else numbered
     series = [prefix for prefix, n in Counter(prefix for prefix, _ in numbered).items() if n > 1]
     twice = len(numbered) > len(set(numbered))
-    listed = {str(line["file"]) for line in _read_engine_records(folder)}
+    listed = {str(line["file"]) for line in lines}
     unlisted = [p.name for p in paths if listed and p.name not in listed]
     if twice or len(series) > 1 or unlisted:
         reason = (
@@ -308,12 +316,22 @@ def _natural_sort_key(path: Path) -> list[tuple[int, int | str]]:
 
 
 def _holds_recorded_steps(folder: Path) -> bool:
-    """Whether a folder holds the recorded steps of one simulation."""
+    """Whether a folder holds the recorded steps of one simulation.
+
+    `Recorder(every=...)` marks its steps. Other recordings have files that differ in one number, and steps that
+    assign impulses to the same blocks; states that have nothing in common are single cases.
+    """
     paths = _list_problem_files(folder) if folder.is_dir() else []
+    lines = [line for line in _read_engine_records(folder) if "left_out" not in line]
+    if any("world" in line for line in lines):
+        return len(paths) > 1 and all("every" in line for line in lines)
     if len(paths) < 2 or len({re.sub(r"\d+$", "", p.stem) for p in paths}) > 1:
         return False
     try:
-        return _make_item_of_file(paths[0]).problem.key is not None
+        first, second = (_make_item_of_file(path).problem.key for path in paths[:2])
+        return (
+            first is not None and second is not None and bool(np.isin(second, first).any() or not second.size)
+        )
     except Exception:  # The error is reported when the case is run.
         return False
 
@@ -416,25 +434,28 @@ def _make_names_differ(items: list[Item]) -> list[Item]:
     return items
 
 
-def describe_case(item: Item, run: str) -> CaseInfo:
-    """Load the problem of an item and describe it for the report."""
+def describe_case(item: Item, run: str) -> Row:
+    """Load the problem of an item and return the row that describes it."""
     p = item.problem
     contacts = count_contacts(p)
     answer = item.judge_stored_answer()
     structure, islands = classify_structure_and_count_islands(p)
-    return CaseInfo(
-        run=run, case=item.name, source=item.source, sha=hash_problem(p), law=p.law, rows=p.m, blocks=p.n_blocks,
-        contacts=contacts, bodies=p.rows.n_bodies if p.rows is not None else 0,
-        nonzeros=int(p.jacobian.nnz if p.rows is not None else p.csr.nnz), mass_ratio=compute_mass_ratio(p),
-        structure=structure, islands=islands, symmetric=p.is_symmetric, reason=item.reason, sequence=item.sequence,
-        step=item.step, stored=math.nan if answer is None else answer.relative,
-        stored_verdict=answer.verdict_in_words if answer and answer.rounding else "",
-        nothing_to_do=is_solved_by_zero(p), diagnostics=tuple(map(str, diagnose(p))), guess=_classify_guess(item),
-    )  # fmt: skip
+    return {
+        "kind": "case", "run": run, "case": item.name, "source": item.source, "sha": hash_problem(p), "law": p.law,
+        "rows": p.m, "blocks": p.n_blocks, "islands": islands, "contacts": contacts,
+        "bodies": p.rows.n_bodies if p.rows is not None else 0,
+        "nonzeros": int(p.jacobian.nnz if p.rows is not None else p.csr.nnz), "mass_ratio": compute_mass_ratio(p),
+        "structure": ", ".join(structure), "symmetric": bool(p.is_symmetric), "reason": item.reason,
+        "sequence": item.sequence, "step": item.step, "identity": "",
+        "stored": math.nan if answer is None else float(answer.relative),
+        "stored_verdict": answer.verdict_in_words if answer and answer.rounding else "",
+        "nothing_to_do": bool(is_solved_by_zero(p)), "diagnostics": list(map(str, diagnose(p))),
+        "guess": _classify_guess(item),
+    }  # fmt: skip
 
 
 def _classify_guess(item: Item) -> str:
-    """Return the kind of the problem's guess for `CaseInfo.guess`: "", "start" or "answer".
+    """Return the kind of the problem's guess: "" without one, "start" or "answer".
 
     A guess is an answer if it is the stored answer, or if its residual is at most `DEFAULT_SOLVE_TOL`.
     """

@@ -182,7 +182,7 @@ def build_cost_figure(report: Contents) -> Figure:
     for fit in fits.to_dict("records"):
         if fit["solver"] in drawn:
             own = times.loc[fit["solver"]].dropna()
-            rows = np.array([report.records.cases[c].rows for c in own.index], float)
+            rows = np.array([report.cases.loc[c, "rows"] for c in own.index], float)
             solver, ends = fit["solver"], np.array([rows[rows > 0].min(), rows.max()])
             line = fit["fit at 1000 rows [s]"] * (ends / 1000.0) ** fit["exponent of rows"]
             label = f"{solver}, rows^{fit['exponent of rows']:.2f}"

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,6 @@ from lavender.problem.derived import cached_property
 from lavender.report import tables
 from lavender.report.figures import build_figures
 from lavender.report.recommendation import recommend
-from lavender.report.records import Records, Skip
 from lavender.report.render import Section, Statement, format_markdown, print_table, render_page, write_files
 from lavender.report.runner import Event
 from lavender.report.text import (
@@ -42,7 +42,7 @@ tens of per cent are not significant without more repetitions. Ratios are comput
 A time is the time of one call of lv.solve, including the judge and Python; below about 0.2 ms the share of Python is \
 as large as that of the solver. A simulation that reuses a factorisation between steps needs the set-up less often. \
 BLAS and OpenMP have one thread; threads that a backend starts in other ways are not limited.
-Means of times are those of the solved cases: compare them only between solvers that solve the same cases.
+Means of times count the solved cases only: compare them only between solvers that solve the same cases.
 Recommendations hold for these cases: by cases solved, then by time; solvers within noise of the best are in a fixed \
 order, auto first.
 The residual is zero exactly at a solution; the distance of an impulse from the solution also depends on the \
@@ -74,6 +74,11 @@ SECTIONS: dict[str, tuple[str, str, Callable[[tables.Contents], pd.DataFrame]]] 
     "failures": (
         "Failures", "Runs that missed their tolerance, that died, or that made a false claim.", tables.tabulate_failures
     ),
+    "sweeps": ("Sweeps", (
+        "Largest errors over all steps after a fixed number of sweeps, from zero impulses (cold) and from the impulses "
+        "of the step before (carried). The velocity error is that of the worst row, the motion error the largest "
+        "difference of a body's velocity from that of a solution, over about 20 steps."
+    ), tables.tabulate_sweeps),
     "engines": ("Inside the engine", (
         "The engine's own answers, judged like all others. Its time excludes the copy of the problem and the judge."
     ), tables.tabulate_engines),
@@ -98,7 +103,7 @@ class Report(tables.Contents):
         """Sentences on a busy machine, on missing times and on cases that are left out."""
         texts = [self.busy_warning] if self.busy_warning else []
         texts += ["Error and robustness without times: runs end by iterations."] if self.is_campaign else []
-        left_out = list_cases_not_loaded(self.records)
+        left_out = list_cases_not_loaded(self)
         texts += [f"Left out of all numbers: {cases}: {reason}" for cases, reason in left_out[:MAX_LEFT_OUT]]
         more = len(left_out) - MAX_LEFT_OUT
         return [*texts, f"{more} more are left out: see the table Not run."] if more > 0 else texts
@@ -112,6 +117,14 @@ class Report(tables.Contents):
         wanted = ["solver", "cases", f"solved {target}", f"time {target} [s]"]
         if self.has_passes_only:
             name, wanted = "sequences", ["target", "steps, cold", "time, cold [s]", "residual, cold [-]"]
+        elif "sweeps" in self.sections and (self.frame["mode"] == "budget").all():
+            name, starts = (
+                "sweeps",
+                [start for start in ("carried", "cold") if (self.frame["start"] == start).any()],
+            )
+            wanted = ["solver", "sweeps", *(f"velocity error, {start} [m/s]" for start in starts),
+                      *(f"motion error, {start} [m/s]" for start in starts)]  # fmt: skip
+            wanted = ["sequence"] * (self.frame["sequence"].nunique() > 1) + wanted
         elif len(self.structures) > 1 and not self.is_campaign:
             name, wanted = "structures", ["structure", target, f"time {target} [s]"]
         frame = self.sections[name].frames[0]
@@ -123,7 +136,9 @@ class Report(tables.Contents):
         made: list[Section] = []
         if len(self.newest):
             wanted = ("times", "budgets", "claims", "failures") if self.is_campaign else tuple(SECTIONS)
-            wanted = ("sequences", "budgets", "claims", "failures") if self.has_passes_only else wanted
+            wanted = (
+                ("sequences", "budgets", "sweeps", "claims", "failures") if self.has_passes_only else wanted
+            )
             for name, (title, note, make) in SECTIONS.items():
                 if name in wanted and len(self.frame):
                     made.append(Section(title, [make(self)], note, name=name))
@@ -133,9 +148,9 @@ class Report(tables.Contents):
             made.append(
                 Section("Solved by the zero impulse", [tables.tabulate_idle(self)], note, name="idle")
             )
-        diagnostics = pd.DataFrame(list_diagnostics(self.records), columns=["case", "possible mistake"])
+        diagnostics = pd.DataFrame(list_diagnostics(self), columns=["case", "possible mistake"])
         made.append(Section("Diagnostics about the data", [diagnostics], name="diagnostics"))
-        made.append(Section("Not run", [tables.tabulate_skips(self.records.skips)], name="skipped"))
+        made.append(Section("Not run", [tables.tabulate_skips(self)], name="skipped"))
         return {section.name: section for section in made if len(section.frames[0])}
 
     def _compare_with_earlier_run(self) -> Section:
@@ -149,24 +164,25 @@ class Report(tables.Contents):
             changes = pd.DataFrame(
                 {"change": ["nothing beyond noise" if compared else "nothing was compared"]}
             )
-        return Section(f"Against {escape_unprintable(self.earlier.source)}", [changes], note, name="changes")
+        title = f"Against {escape_unprintable(str(self.earlier.attrs.get('source', 'earlier runs')))}"
+        return Section(title, [changes], note, name="changes")
 
     def describe_run(self) -> pd.DataFrame:
         """Return the machine, versions and plan of the newest run."""
-        facts = []
-        for run in list(self.records.runs.values())[-1:]:
+        run, facts = self.machine, {}
+        if run:
             counts = format_count(self.frame["case"].nunique(), "case"), format_count(len(self.newest), "run")
-            versions = {"lavender": run.lavender, "Python": run.python, **run.versions}
-            load = "" if run.load is None else f"; load {run.load:.2g}"
-            facts += [
-                ("run", f"{run.run}, started {run.started}; {', '.join(counts)}"),
-                ("machine", f"{run.cpu}, {run.cores} cores; {run.platform}"),
-                ("threads", f"{run.threads} for BLAS and OpenMP while timing; runs are serial"),
-                ("versions", ", ".join(f"{name} {v}" for name, v in versions.items())),
-                ("build", "; ".join(f"{name} {v}" for name, v in run.build.items()) + load),
-                ("plan", "; ".join(f"{name} {v}" for name, v in run.plan.items())),
-            ]
-        return pd.DataFrame(facts, columns=["fact", "value"], dtype=object)
+            load = "" if math.isnan(run["load"]) else f"; load {run['load']:.2g}"
+            versions = {"lavender": run["lavender"], "Python": run["python"], **run["versions"]}
+            facts = {
+                "run": f"{run['run']}, started {run['started']}; {', '.join(counts)}",
+                "machine": f"{run['cpu']}, {run['cores']} cores; {run['platform']}",
+                "threads": f"{run['threads']} for BLAS and OpenMP while timing; runs are serial",
+                "versions": ", ".join(f"{name} {v}" for name, v in versions.items()),
+                "build": "; ".join(f"{name} {v}" for name, v in run["build"].items()) + load,
+                "plan": "; ".join(f"{name} {v}" for name, v in run["plan"].items()),
+            }
+        return pd.DataFrame(facts.items(), columns=["fact", "value"], dtype=object)
 
 
 def render_report(report: Report, figures: bool = True, folder: Path | None = None) -> str:
@@ -189,7 +205,7 @@ def render_report(report: Report, figures: bool = True, folder: Path | None = No
 
 
 def write(
-    source: Records | Report,
+    source: pd.DataFrame | Report,
     folder: str | Path,
     *,
     figures: bool = True,
@@ -201,9 +217,9 @@ def write(
 
     Parameters
     ----------
-    source : Records or Report
-        Records, or a report of them with earlier records and budgets. Times are compared within the newest run alone;
-        `records.csv` holds all runs.
+    source : DataFrame or Report
+        Lines of `lavender.report.run` or `read`, or a report of them with earlier lines and budgets. Times are
+        compared within the newest run alone; `records.csv` holds all runs.
     folder : path
     figures : bool
         False leaves out the figures, which take the largest part of the time.
@@ -218,14 +234,14 @@ def write(
     Raises
     ------
     InputError
-        `source` is neither records nor a report, or the folder cannot be written.
+        `source` is neither a DataFrame nor a report, or the folder cannot be written.
     """
-    report = Report(source) if isinstance(source, Records) else source
+    report = Report(source) if isinstance(source, pd.DataFrame) else source
     if not isinstance(report, Report):
         raise InputError(
-            f"source is a {type(source).__name__}; Records (the result of lavender.report.run) or a Report is needed"
+            f"source is a {type(source).__name__}; the DataFrame of lavender.report.run or a Report is needed"
         )
-    folder, frame = Path(folder), report.records.frame
+    folder, frame = Path(folder), report.runs
     files: dict[str, Any] = {"records.csv": frame}
     if importlib.util.find_spec("pyarrow") is not None:
         files["records.parquet"] = frame
@@ -245,9 +261,9 @@ def write(
 def summarise(report: Report) -> str:
     """Return recommendations and tables in Markdown, to paste into a pull request."""
     lines = ["## lavender report", ""]
-    for run in list(report.records.runs.values())[-1:]:
-        machine = f"{run.cpu}, {run.threads} thread; lavender {run.lavender}, Python {run.python}"
-        lines += [escape_markdown(f"{machine}; run {run.run}, {run.started}"), ""]
+    if run := report.machine:
+        machine = f"{run['cpu']}, {run['threads']} thread; lavender {run['lavender']}, Python {run['python']}"
+        lines += [escape_markdown(f"{machine}; run {run['run']}, {run['started']}"), ""]
     for statement in report.statements:
         lines += [escape_markdown(statement.text), ""]
         lines += ["```python", *statement.code, "```", ""] if statement.code else []
@@ -307,7 +323,6 @@ def print_report(report: Report, console: Console, complete: bool = False) -> No
 
 def _list_notes(report: Report, longest: int) -> Iterator[tuple[str, str]]:
     """Yield (note, style): at most `longest` notes of each kind; if there are more, a note has their number."""
-    records = report.records
     failures = tables.select_failures(report) if len(report.frame) else report.frame
     false = failures[failures["status_conflict"].astype(str) != ""]
     kinds = {
@@ -318,14 +333,16 @@ def _list_notes(report: Report, longest: int) -> Iterator[tuple[str, str]]:
                 for c, s, x in zip(false["case"], false["solver"], false["status_conflict"], strict=True)
             ],
         ),
-        "suspicious": ("yellow", [f"{case}: {reason}" for case, reason in list_diagnostics(records)]),
-        "left out": ("yellow", [f"{cases}: {reason}" for cases, reason in list_cases_not_loaded(records)]),
+        "suspicious": ("yellow", [f"{case}: {reason}" for case, reason in list_diagnostics(report)]),
+        "left out": ("yellow", [f"{cases}: {reason}" for cases, reason in list_cases_not_loaded(report)]),
     }
     for kind, (style, texts) in kinds.items():
         for i, text in enumerate(texts[:longest], 1):
             place = f" ({i} of {len(texts)})" if longest > 1 else f", the first of {len(texts)}"
             yield f"{kind}{place if len(texts) > 1 else ''}: {text}", style
-    skipped = [s.reason.partition(":")[0] for s in records.skips if s.solver]
+    skipped = [
+        reason.partition(":")[0] for reason in report.skips.loc[report.skips["solver"] != "", "reason"]
+    ]
     replacements = Counter(pair for pair in skipped if " → " in pair)
     for pair, n in replacements.items():
         cases = format_count(n, "case")
@@ -346,47 +363,45 @@ def _list_notes(report: Report, longest: int) -> Iterator[tuple[str, str]]:
         yield f"{cases} solved by the zero impulse; largest error {speed} m/s, by {solver} on {case}", "dim"
 
 
-def list_diagnostics(records: Records) -> list[tuple[str, str]]:
+def list_diagnostics(report: Report) -> list[tuple[str, str]]:
     """Return (case, possible mistake in its data) for all cases.
 
     Equal diagnostics of a sequence are one entry, with its first step and the number of further steps.
     """
     seen: dict[tuple[str, str], list[tuple[str, str]]] = {}
-    for name, info in records.cases.items():
-        for diagnostic in info.diagnostics:
-            kind = diagnostic.partition(":")[0]
-            seen.setdefault((info.sequence or name, kind), []).append((name, diagnostic))
+    for name, sequence, diagnostics in report.cases[["sequence", "diagnostics"]].itertuples():
+        for diagnostic in map(escape_unprintable, map(str, diagnostics)):
+            seen.setdefault((sequence or name, diagnostic.partition(":")[0]), []).append((name, diagnostic))
     found = []
     for (name, diagnostic), *more in seen.values():
         found.append((f"{name} and {format_count(len(more), 'more step')}" if more else name, diagnostic))
     return found
 
 
-def _group_by_reason(skips: Iterable[Skip]) -> dict[str, list[Skip]]:
+def _group_by_reason(skips: pd.DataFrame) -> dict[str, list[Any]]:
     """Group skips by their reason without the name of the case."""
-    same: dict[str, list[Skip]] = {}
-    for skip in skips:
+    same: dict[str, list[Any]] = {}
+    for skip in skips.itertuples():
         reason = skip.reason.removeprefix("did not load: ").removeprefix(f"{skip.case}: ")
         same.setdefault(reason, []).append(skip)
     return same
 
 
-def list_skip_reasons(skips: Iterable[Skip]) -> list[str]:
+def list_skip_reasons(skips: pd.DataFrame) -> list[str]:
     """Return each different reason of some skips; if it holds for several cases, with their number."""
     same = _group_by_reason(skips)
     cases = {reason: len({skip.case for skip in some}) for reason, some in same.items()}
     return [same[r][0].reason if n == 1 else f"{r} ({n} cases)" for r, n in cases.items()]
 
 
-def list_cases_not_loaded(records: Records) -> list[tuple[str, str]]:
+def list_cases_not_loaded(report: Report) -> list[tuple[str, str]]:
     """Return (cases that did not load, reason), grouped by reason, and the number of steps of each sequence."""
-    cases = [
-        (f"{some[0].case} and {format_count(len(some) - 1, 'more case')}", reason)
-        if len(some) > 1
-        else (some[0].case, some[0].reason)
-        for reason, some in _group_by_reason(records.left_out.get("", ())).items()
-    ]
-    for name, some in records.left_out.items():
+    cases = []
+    for name, some in report.left_out.items():
         if name:
-            cases.append((f"{format_count(len(some), 'step')} of {name}", some[0].reason))
+            cases.append((f"{format_count(len(some), 'step')} of {name}", some["reason"].iloc[0]))
+            continue
+        for reason, same in _group_by_reason(some).items():
+            more = f" and {format_count(len(same) - 1, 'more case')}" if len(same) > 1 else ""
+            cases.append((same[0].case + more, reason if more else same[0].reason))
     return cases

@@ -21,7 +21,6 @@ from typing import Any
 
 from lavender._version import __version__
 from lavender.base.errors import require_packages
-from lavender.report.records import Run
 from lavender.solvers import registry
 from lavender_ext.sweep import serial
 
@@ -86,8 +85,8 @@ def _map_modules_to_distributions() -> Mapping[str, list[str]]:
     return metadata.packages_distributions()
 
 
-def describe_run(plan: Mapping[str, Any], packages: Iterable[str] = ()) -> Run:
-    """Describe a run that starts now; its identity is a hash of CPU, versions and plan, not of the time."""
+def describe_run(plan: Mapping[str, Any], packages: Iterable[str] = ()) -> dict[str, Any]:
+    """Return the row of a machine, its versions and a plan; `run` is a hash of these, without the time."""
     facts: dict[str, Any] = {
         "lavender": __version__, "python": platform.python_version(), "platform": platform.platform(),
         "cpu": get_cpu_name(), "cores": os.cpu_count() or 1, "threads": 1, "versions": get_versions(packages),
@@ -98,7 +97,8 @@ def describe_run(plan: Mapping[str, Any], packages: Iterable[str] = ()) -> Run:
     digest = hashlib.sha256(json.dumps(identity, sort_keys=True, default=str).encode()).hexdigest()[:12]
     started = datetime.now(timezone.utc).isoformat(timespec="seconds")
     build = build | get_processor_clock()
-    return Run(run=digest, started=started, plan=dict(plan), build=build, load=get_load_average(), **facts)
+    return {"kind": "machine", "run": digest, "started": started, "plan": dict(plan), "build": build,
+            "load": get_load_average(), "whole": True, **facts}  # fmt: skip
 
 
 def get_load_average() -> float | None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,17 +15,20 @@ from lavender.io.stored import SUFFIXES
 from lavender.report.render import Statement
 from lavender.report.tables import (
     INSIDE,
+    PLAIN_SWEEPS,
     STRUCTURE_ORDER,
     Contents,
     is_plug_in,
     rank_solvers,
     select_ranked_runs,
+    tabulate_sweeps,
 )
 from lavender.report.text import format_count, format_residual, format_tolerance
 from lavender.report.timing import format_call
 from lavender.suite import FAMILIES
 
 MAX_NAMED = 2  # A sentence names up to this many ties, misses or plug-ins.
+MAX_SWEEP_ERROR = 1e-3  # [m/s] A number of sweeps is recommended if no velocity error is larger.
 PLURALS = {"mesh": "meshes"}
 
 
@@ -35,16 +40,69 @@ def recommend(report: Contents) -> tuple[Statement, ...]:
     if report.is_campaign:
         return ()
     if not len(report.frame):
-        stopped = report.is_stopped and len(report.records)
+        stopped = report.is_stopped and len(report.runs)
         return (Statement("Stopped: no problem was measured with every solver."),) if stopped else ()
     if report.has_passes_only:
         return (
             Statement(f"Stopped: the tables have the finished passes of {report.frame['solver'].iloc[0]}."),
         )
     single = report.frame["step"] < 0
-    return tuple(
-        _recommend_for(report, some) for some in (report.frame[single], report.frame[~single]) if len(some)
-    )
+    parts = [some for some in (report.frame[single], report.frame[~single]) if len(some)]
+    sweeps = _recommend_sweeps(report)
+    if (report.frame["mode"] == "budget").all():
+        return sweeps or tuple(_recommend_for(report, some) for some in parts)
+    return (*(_recommend_for(report, some) for some in parts), *sweeps)
+
+
+def _recommend_sweeps(report: Contents) -> tuple[Statement, ...]:
+    """State for each sequence the smallest number of sweeps that keeps every velocity error below the limit."""
+    table, statements = tabulate_sweeps(report), []
+    limit = f"{1e3 * MAX_SWEEP_ERROR:g} mm/s"
+    for name, own in table.groupby("sequence", sort=False) if len(table) else ():
+        steps, counts = own["steps"].max(), {}
+        for start in ("carried", "cold"):
+            errors = own.get(f"velocity error, {start} [m/s]")
+            good = (
+                own[(errors <= MAX_SWEEP_ERROR) & (own["steps"] == steps)]
+                if errors is not None
+                else own.iloc[:0]
+            )
+            good = (
+                good[good["solver"].isin(PLAIN_SWEEPS)] if good["solver"].isin(PLAIN_SWEEPS).any() else good
+            )
+            counts[start] = good.sort_values("sweeps", kind="stable").iloc[:1].to_dict("records")
+        if counts["carried"]:
+            (best,) = counts["carried"]
+            sweeps, error = format_count(best["sweeps"], "sweep"), best["velocity error, carried [m/s]"]
+            cold = [f"cold: {x['sweeps']} of {x['solver']}" for x in counts["cold"]] or ["cold: not reached"]
+            text = (
+                f"{name}: {sweeps} of {best['solver']} with warm starts keep every velocity error below {limit} "
+                f"({format_residual(error)} m/s; {cold[0]})"
+            )
+        else:
+            column = next(
+                c for c in ("velocity error, carried [m/s]", "velocity error, cold [m/s]") if c in own
+            )
+            best = own.loc[own[column].idxmin()].to_dict()
+            text = (
+                f"{name}: no measured number of sweeps keeps every velocity error below {limit}; the smallest is "
+                f"{format_residual(best[column])} m/s, after {best['sweeps']} sweeps of {best['solver']}"
+            )
+        statements.append(Statement(f"{text}{_describe_own_sweeps(report, str(name))}."))
+    return tuple(statements)
+
+
+def _describe_own_sweeps(report: Contents, sequence: str) -> str:
+    """Return the largest velocity error of the engine's own answers to a sequence, if it was recorded."""
+    sources = report.cases.loc[report.cases["sequence"] == sequence, "source"]
+    for engine in report.engines:
+        files = [Path(source).name for source in sources if engine.contains(source)]
+        lines = engine.lines[engine.lines["file"].isin(files)]
+        error, counts = lines["velocity"].max(), lines["iterations"].dropna()
+        if len(lines) and math.isfinite(error):
+            own = f" {counts.max():.0f} iterations" if len(counts) else " answers"
+            return f"; the engine's own{own} ({engine.solver}): {format_residual(error)} m/s"
+    return ""
 
 
 def _recommend_for(report: Contents, frame: pd.DataFrame) -> Statement:
@@ -57,7 +115,7 @@ def _recommend_for(report: Contents, frame: pd.DataFrame) -> Statement:
         (
             rank
             for e in report.engines
-            if (rank := e.rank(report.records, cases, report.tolerance)) is not None
+            if (rank := e.rank(report.cases.loc[cases], report.tolerance)) is not None
         ),
         None,
     )
@@ -88,7 +146,7 @@ def _recommend_for(report: Contents, frame: pd.DataFrame) -> Statement:
         sentences.append(f"Not reached within the time of a pass (--sequence-time-limit): {steps}.")
     sentences += _describe_plug_ins(ranking, solver)
     call = SimpleNamespace(**loosest.loc[loosest["iterations"].idxmax()].to_dict())
-    guessed = any(report.records.cases[c].guess for c in cases)
+    guessed = bool((report.cases.loc[cases, "guess"] != "").any())
     return Statement(_add_engine(" ".join(sentences), engine, first), format_call(call, guessed))
 
 
@@ -99,7 +157,9 @@ def _describe_start(frame: pd.DataFrame, runs: pd.DataFrame) -> str:
     names = ["case", "solver", "tol", "iterations", "solution_hash"]
     cold = set(frame.loc[frame["start"] == "cold", names].itertuples(index=False, name=None))
     n = sum(run not in cold for run in runs[names].itertuples(index=False, name=None))
-    return f"with the impulses of the previous recorded step as start (it changed {n} of {len(runs)} solves)"
+    carrying = format_seconds(runs["carry_time"].mean()) if runs["carry_time"].notna().any() else ""
+    apart = f"mapping them takes {carrying} a step, not included; " if carrying else ""
+    return f"with the impulses of the previous recorded step as start ({apart}it changed {n} of {len(runs)} solves)"
 
 
 def _list_unsolved_cases(
@@ -115,7 +175,7 @@ def _list_unsolved_cases(
     sequences = set(own["sequence"].astype(str)) - {""}
     missed, unreached = [], 0
     for case, x in left[~(left <= report.tolerance)].items():
-        if x != x and report.records.cases[str(case)].sequence in sequences:
+        if x != x and report.cases.loc[str(case), "sequence"] in sequences:
             unreached += 1
         else:
             missed.append(f"{case} ({'not accepted' if x != x else f'residual {format_residual(x)}'})")
@@ -141,24 +201,21 @@ def _shorten_list(texts: Sequence[str], separator: str = ", ") -> str:
 
 def _describe_cases(report: Contents, names: Sequence[str]) -> str:
     """Return words for cases: steps of sequences, built-in problems, or the structure that all of them have."""
-    infos, lost = [report.records.cases[c] for c in names], report.records.left_out
-    sequences = list(dict.fromkeys(i.sequence for i in infos if i.sequence))
+    infos, lost, n = report.cases.loc[list(names)], report.left_out, len(names)
+    sequences = [name for name in infos["sequence"].unique() if name]
     if sequences:
         of = sequences[0] if len(sequences) == 1 else f"your {format_count(len(sequences), 'sequence')}"
         n_lost = sum(len(lost.get(name, ())) for name in sequences)
-        return f"the {format_count(len(names), 'step')} of {of}{_format_left_out_count(n_lost)}"
+        return f"the {format_count(n, 'step')} of {of}{_format_left_out_count(n_lost)}"
     left_out = _format_left_out_count(len(lost.get("", ())))
-    many, n = len(names) > 1, len(names)
     if report.is_stopped:
         return f"the {format_count(n, 'problem')} measured so far{left_out}"
-    if all(
-        c.partition("(")[0] in FAMILIES and not i.source.endswith(SUFFIXES)
-        for c, i in zip(names, infos, strict=True)
-    ):
-        return (f"the {n} built-in problems" if many else names[0]) + left_out
-    common = set.intersection(*(set(i.structure) for i in infos))
+    is_file = infos["source"].astype(str).str.endswith(SUFFIXES)
+    if not is_file.any() and all(name.partition("(")[0] in FAMILIES for name in names):
+        return (f"the {n} built-in problems" if n > 1 else names[0]) + left_out
+    common = set.intersection(*(set(words.split(", ")) for words in infos["structure"]))
     shape = next((s for s in STRUCTURE_ORDER[1:5] if s in common), "problem")
-    return (f"your {format_count(n, shape, PLURALS.get(shape, ''))}" if many else f"your {shape}") + left_out
+    return (f"your {format_count(n, shape, PLURALS.get(shape, ''))}" if n > 1 else f"your {shape}") + left_out
 
 
 def _add_engine(text: str, engine: Any, first: Any) -> str:

@@ -1,4 +1,4 @@
-"""Measure every solver on every case, in this process or with workers; each record is stored as soon as it is made.
+"""Measure every solver on every case, in this process or with workers; each row is stored as soon as it is made.
 
 A run with times measures in this process, one solve after the other. A campaign (`CampaignPlan`) measures no times:
 its pairs of case and solver may be distributed over workers, and its records have the same bits with any number of
@@ -17,20 +17,32 @@ from functools import cache
 from itertools import product
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lavender.base.arrays import FloatArray, check_sequence
 from lavender.base.errors import InputError, LavenderError, require_packages
+from lavender.diagnostics.motion_error import motion_error
 from lavender.problem import Problem, check_problem
 from lavender.report import machine
 from lavender.report.cases import Item, Source, describe_case, hash_problem, resolve_item, resolve_sources
-from lavender.report.records import CaseInfo, Entry, Record, Records, Run, Skip, describe_target
-from lavender.report.store import Store, open_store
+from lavender.report.store import (
+    CASE_COLUMNS,
+    CASE_DETAILS,
+    RUN_COLUMNS,
+    Row,
+    Store,
+    convert_columns,
+    describe_target,
+    get_key,
+    make_lines,
+    open_store,
+)
 from lavender.report.timing import (
     LONG_TIME,
     CampaignPlan,
     Plan,
     Task,
+    add_times,
     limit_to_one_thread,
     list_passes,
     measure_task,
@@ -39,10 +51,16 @@ from lavender.report.workers import Worker, check_workers, connect_backend, map_
 from lavender.solvers import registry
 from lavender.solvers.registry import SolverSpec
 
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
 # If a step took less than this fraction of the time limit, no guarded solve (`timing`) precedes the next step's.
 UNGUARDED_TIME_RATIO = 0.05
 # Each step of a sequence with more steps is solved once, not `Plan.repeats` times: the sum over many steps varies less.
 MAX_REPEATED_STEPS = 20
+MAX_MOTION_STEPS = (
+    20  # The error of the motion is computed for about this number of steps, evenly distributed.
+)
 # A solver with up to this multiple of the fastest time on a case is timed again, alternately with the fastest.
 NEAR_TIME_RATIO = 1.6
 MAX_NEAR = 5  # Solvers that are timed again on a case, at most.
@@ -61,8 +79,8 @@ class Event:
     total: int  # Number of all; 0 if unknown.
     case: str
     solver: str
-    record: Record | None = None  # The record that was made last.
-    reused: bool = False  # Whether this record was not measured now.
+    row: Row | None = None  # The row of the run that was made last.
+    reused: bool = False  # Whether this run was not measured now.
     phase: str = ""  # The present phase, such as "measuring".
 
 
@@ -75,12 +93,10 @@ def carry_impulses(before: Problem, impulse: FloatArray, problem: Problem) -> Fl
     return problem.start() if start is None else start
 
 
-def remove_times(record: Record, time_limit: float) -> Record:
-    """Return the record without times and with the plan's `time_limit` [s], so that it is equal on all machines."""
-    nan = math.nan
-    return replace(
-        record, times=(), setup_time=nan, solve_time=nan, calibration_time=None, load=None, time_limit=time_limit
-    )  # fmt: skip
+def remove_times(row: Row, time_limit: float) -> Row:
+    """Return the row without times and with the plan's `time_limit` [s], so that it is equal on all machines."""
+    names = ("carry_time", "setup_time", "solve_time", "calibration_time", "load")
+    return add_times({**row, **dict.fromkeys(names, math.nan), "time_limit": time_limit}, ())
 
 
 def is_third_party_solver(spec: SolverSpec) -> bool:
@@ -115,9 +131,9 @@ def run(
     backend: str = "loky",
     watch: Watch | None = None,
     memory: int | None = None,
-    into: list[Records] | None = None,
+    into: list[Row] | None = None,
     reuse: bool = True,
-) -> Records:
+) -> DataFrame:
     """Measure every solver on every case that it accepts.
 
     Parameters
@@ -130,7 +146,7 @@ def run(
     plan : Plan, optional
         Default: `Plan()`, or with several workers or a cluster, which measure no times, `CampaignPlan()`.
     store : Store or path of a `.jsonl` file, optional
-        Stores each record when it is made; a measurement that it holds from the same machine, versions and plan is not
+        Stores each row when it is made; a measurement that it holds from the same machine, versions and plan is not
         repeated.
     workers : int
         Number of processes; 1: this one, -1: one for each core. A cluster determines its own number.
@@ -142,14 +158,15 @@ def run(
         Memory limit of the process in which third-party solvers run. Default: half of the machine's memory, shared by
         the workers here or by the cores of a machine of a cluster.
     into : list, optional
-        Receives the records before the first is made, so that they are available if the run is interrupted.
+        Receives each row when it is made, so that the rows are available if the run is interrupted.
     reuse : bool
         Do not repeat measurements that `store` holds.
 
     Returns
     -------
-    Records
-        New and reused records of this run, in the order of cases and solvers. Records of a campaign have no times.
+    DataFrame
+        A row for each line of a records file: machine, cases, new and reused runs in the order of cases and solvers,
+        and pairs that did not run. `select_runs` returns the runs. Runs of a campaign have no times.
 
     Raises
     ------
@@ -177,9 +194,9 @@ def run(
     # The limit of threads covers the description of cases, which uses BLAS.
     with cluster, open_store(store) as kept, Worker(memory) as worker, limit_to_one_thread():
         runner = Runner(this, plan, names, worker, kept, watch, reuse)
-        if into is not None:
-            into.append(runner.out)
-        return runner.measure_items(items, workers, backend, memory)
+        runner.out = runner.out if into is None else into
+        runner.measure_items(items, workers, backend, memory)
+    return make_lines(runner.out, str(kept.path) if kept else "")
 
 
 class Runner:
@@ -187,7 +204,7 @@ class Runner:
 
     def __init__(
         self,
-        this: Run,
+        this: Row,
         plan: Plan,
         names: list[str],
         worker: Worker,
@@ -198,36 +215,44 @@ class Runner:
         self.this, self.plan, self.names = this, plan, names
         self.store, self.watch, self.worker = store, watch, worker
         self.specs = registry.specs()
-        self.out = Records(str(store.path) if store else "")
+        self.out: list[Row] = []
         self.done = 0
         self.total = 0
-        stored = Records() if store is None or not reuse else store.records
-        self.known: dict[Any, Record] = {r.key: r for r in stored if r.run == this.run}
-        # Many cases take longer to describe than to load.
-        self.described = {n: i for n, i in stored.cases.items() if i.run == this.run}
+        self.known: dict[Any, Row] = {}
+        self.described: dict[str, Row] = {}  # Many cases take longer to describe than to load.
+        if store is not None and reuse:
+            parts = {"run": RUN_COLUMNS, "case": CASE_DETAILS | CASE_COLUMNS}
+            for kind, columns in parts.items():
+                for row in convert_columns(store.lines, kind, columns).to_dict("records"):
+                    if row["run"] == this["run"] and kind == "run":
+                        times = [float(t) for t in row["times"]]
+                        self.known[get_key(row)] = {"kind": kind, **row, "times": times}
+                    elif row["run"] == this["run"]:
+                        self.described[row["case"]] = {"kind": kind, **row}
 
-    def add_entry(self, entry: Entry) -> None:
-        """Add an entry to the returned records and to the store."""
-        self.out.add(entry)
+    def add_row(self, row: Row) -> None:
+        """Add a row to the returned rows and to the store."""
+        self.out.append(row)
         if self.store is not None:
-            self.store.add(entry)
+            self.store.add(row)
 
-    def report_progress(
-        self, case: str, solver: str, record: Record | None = None, reused: bool = False
-    ) -> None:
+    def add_skip(self, case: str, solver: str, reason: str, sequence: str = "") -> None:
+        """Add the row of a solver that does not run on a case, or without a solver of a case that does not load."""
+        self.add_row({"kind": "skip", "run": self.this["run"], "case": case, "solver": solver, "reason": reason,
+                      "sequence": sequence})  # fmt: skip
+
+    def report_progress(self, case: str, solver: str, row: Row | None = None, reused: bool = False) -> None:
         """Call `watch` with the number of pairs that are done."""
         if self.watch is not None:
-            event = Event(
-                done=self.done, total=self.total, case=case, solver=solver, record=record, reused=reused
-            )
+            event = Event(done=self.done, total=self.total, case=case, solver=solver, row=row, reused=reused)
             self.watch(replace(event, phase="measuring"))
 
     def measure_items(
         self, items: list[Item], workers: int = 1, backend: str = "", memory: int | None = None
-    ) -> Records:
+    ) -> None:
         """Measure every case and sequence; by the workers of a joblib backend if one is named."""
         self.total = len(items) * len(self.names)
-        self.add_entry(replace(self.this, whole=False))
+        self.add_row({**self.this, "whole": False})
         if backend:
             self.distribute_pairs(items, workers, backend, memory)
         else:
@@ -238,12 +263,11 @@ class Runner:
                     self.measure_case(group[0])
                 for item in group:
                     item.release_problem()
-        self.add_entry(self.this)
+        self.add_row(self.this)
         self.report_progress("", "")
-        return self.out
 
     def distribute_pairs(self, items: list[Item], workers: int, backend: str, memory: int | None) -> None:
-        """Measure the pairs of a campaign with workers, and store the entries of each pair when a worker returns them.
+        """Measure the pairs of a campaign with workers, and store the rows of each pair when a worker returns them.
 
         Raises
         ------
@@ -256,126 +280,124 @@ class Runner:
             memory = machine.get_memory_per_process(joblib.effective_n_jobs(workers))
         local = tuple(spec for n in self.names if not ((spec := self.specs[n]).builtin or spec.distribution))
         order = Order(self.plan, self.this, memory, local)
-        known: dict[tuple[str, str], list[Record]] = {}
-        for record in self.known.values():
-            known.setdefault((record.case, record.solver), []).append(record)
+        known: dict[tuple[str, str], list[Row]] = {}
+        for row in self.known.values():
+            known.setdefault((row["case"], row["solver"]), []).append(row)
         pairs: list[Pair] = []
         for item, name in product(items, self.names):
             # Send a name or path, which the worker reads itself: machines of a cluster share files and suite.
             source = item.source if item.in_memory is None else replace(item.in_memory, copy=False)
-            records = tuple(known.get((item.name, name), ()))
-            info = self.described.get(item.name)
+            stored, described = tuple(known.get((item.name, name), ())), self.described.get(item.name)
             pair = Pair(
-                index=len(pairs), case=item.name, source=source, reason=item.reason, solver=name, info=info,
-                known=records,
+                index=len(pairs), case=item.name, source=source, reason=item.reason, solver=name, described=described,
+                known=stored,
             )  # fmt: skip
             pairs.append(pair)
-        entries: dict[int, list[Entry]] = {}
+        rows: dict[int, list[Row]] = {}
         try:
             for _ in range(MAX_ATTEMPTS):
-                remaining = [p for p in pairs if p.index not in entries]
+                remaining = [p for p in pairs if p.index not in rows]
                 if not remaining:
                     break
                 calls = ((pair, order) for pair in remaining)
                 for index, new in map_unordered(measure_in_worker, calls, workers, backend):
                     self.store_new(new)
-                    entries[index], pair = new, pairs[index]
+                    rows[index], pair = new, pairs[index]
                     self.done += 1
-                    for record in (entry for entry in new if isinstance(entry, Record)):
-                        self.report_progress(pair.case, pair.solver, record, record.key in self.known)
+                    for row in (row for row in new if row["kind"] == "run"):
+                        self.report_progress(pair.case, pair.solver, row, get_key(row) in self.known)
                     self.report_progress(pair.case, pair.solver)
         finally:
-            for index in sorted(entries):
-                for entry in entries[index]:
-                    self.out.add(entry)
-        if len(entries) < len(pairs):
+            self.out.extend(row for index in sorted(rows) for row in rows[index])
+        if len(rows) < len(pairs):
             raise InputError(
-                f"{len(pairs) - len(entries)} of {len(pairs)} pairs are not done: workers were lost {MAX_ATTEMPTS} "
+                f"{len(pairs) - len(rows)} of {len(pairs)} pairs are not done: workers were lost {MAX_ATTEMPTS} "
                 "times; run the same command again, with fewer workers if memory is short"
             )
 
-    def store_new(self, entries: list[Entry]) -> None:
-        """Store the entries that a worker returned, except the records that are stored already."""
-        for entry in entries:
-            is_stored = isinstance(entry, Record) and entry.key in self.known
+    def store_new(self, rows: list[Row]) -> None:
+        """Store the rows that a worker returned, except the runs that are stored already."""
+        for row in rows:
+            is_stored = row["kind"] == "run" and get_key(row) in self.known
             if self.store is not None and not is_stored:
-                self.store.add(entry)
+                self.store.add(row)
 
-    def load_case(self, item: Item) -> CaseInfo | None:
-        """Load and describe a case. Return None, with a note in the records, if it does not load."""
+    def load_case(self, item: Item) -> Row | None:
+        """Load and describe a case. Return None, and add the reason to the rows, if it does not load."""
         try:
-            info = self.described.get(item.name)
-            if info is None or info.sha != hash_problem(item.problem):
-                info = describe_case(item, self.this.run)
+            case = self.described.get(item.name)
+            if case is None or case["sha"] != hash_problem(item.problem):
+                case = describe_case(item, self.this["run"])
         except Exception as error:  # A reader may raise any exception; only its own case is lost.
-            self.add_entry(
-                Skip(self.this.run, item.name, "", describe_load_error(item.source, error), item.sequence)
-            )
+            self.add_skip(item.name, "", describe_load_error(item.source, error), item.sequence)
             self.report_progress(item.name, "")
             return None
         if not item.sequence:
-            self.add_entry(info)
-        return info
+            self.add_row(case)
+        return case
 
-    def measure_case(self, item: Item, info: CaseInfo | None = None) -> None:
-        """Measure every solver on a case outside sequences; `info` is its description, if it is known."""
-        if info is not None:
-            self.add_entry(info)
+    def measure_case(self, item: Item, case: Row | None = None) -> None:
+        """Measure every solver on a case outside sequences; `case` is its description, if it is known."""
+        if case is not None:
+            self.add_row(case)
         else:
-            info = self.load_case(item)
-        records: list[Record] = []
+            case = self.load_case(item)
+        rows: list[Row] = []
         for name in self.names:
-            if info is not None:
+            if case is not None:
                 self.report_progress(item.name, name)
-                records += self.measure_solver(info, item.problem, name)
+                rows += self.measure_solver(case, item.problem, name)
             self.done += 1
         if not self.plan.campaign and self.plan.repeats > 1:
-            self.repeat_near_best(item, records)
+            self.repeat_near_best(item, rows)
 
-    def repeat_near_best(self, item: Item, records: list[Record]) -> None:
-        """Time the fastest solvers to the middle tolerance again, alternately, and store their records again.
+    def repeat_near_best(self, item: Item, rows: list[Row]) -> None:
+        """Time the fastest solvers to the middle tolerance again, alternately, and store their rows again.
 
         Disturbances of the machine then affect these solvers equally. Each gets `2 repeats + 1` times in all.
         """
         if not self.plan.tolerances:
             return
-        tolerance, best = self.plan.tolerances[len(self.plan.tolerances) // 2], dict[str, Record]()
-        to_tolerance = [r for r in records if r.mode == "tol" and r.start == "cold"]
-        reached = [r for r in to_tolerance if max(r.relative, r.tol) <= tolerance]
-        for r in sorted(reached, key=lambda r: r.time):
-            best.setdefault(r.solver, r)
-        near = [r for r in best.values() if r.time <= NEAR_TIME_RATIO * min(r.time for r in best.values())]
-        near, wanted = near[:MAX_NEAR], 2 * self.plan.repeats + 1
+        tolerance, best = self.plan.tolerances[len(self.plan.tolerances) // 2], dict[str, Row]()
+        to_tolerance = [r for r in rows if r["mode"] == "tol" and r["start"] == "cold"]
+        reached = [r for r in to_tolerance if max(r["relative"], r["tol"]) <= tolerance]
+        for r in sorted(reached, key=lambda r: r["time"]):
+            best.setdefault(r["solver"], r)
+        limit = NEAR_TIME_RATIO * min((r["time"] for r in best.values()), default=0.0)
+        near = [r for r in best.values() if r["time"] <= limit][:MAX_NEAR]
+        wanted = 2 * self.plan.repeats + 1
         if len(near) < 2 or any(self.was_timed_again(r) for r in near):
             return
-        changed, begun = dict[str, Record](), perf_counter()
-        while any(len(r.times) < wanted for r in near) and (
+        changed, begun = dict[str, Row](), perf_counter()
+        while any(len(r["times"]) < wanted for r in near) and (
             perf_counter() - begun < AGAIN_TIME or not changed
         ):
             for i, r in enumerate(near):
-                if len(r.times) < wanted:
-                    self.report_progress(item.name, f"{r.solver}, again")
-                    task = Task.of_record(r, self.plan.time_limit)
-                    new = self.make_record(item.problem, task, self.specs[r.solver], None)[0]
-                    near[i] = changed[r.solver] = replace(r, times=(*r.times, *(new.times or (math.inf,))))
-        for record in changed.values():
-            self.add_entry(record)
+                if len(r["times"]) < wanted:
+                    self.report_progress(item.name, f"{r['solver']}, again")
+                    task = Task.of_row(r, self.plan.time_limit)
+                    new = self.measure_task(item.problem, task, self.specs[r["solver"]], None)[0]
+                    near[i] = changed[r["solver"]] = add_times(
+                        r, [*r["times"], *(new["times"] or [math.inf])]
+                    )
+        for row in changed.values():
+            self.add_row(row)
 
-    def was_timed_again(self, record: Record) -> bool:
-        """Whether a record has more times than its first measurement takes."""
-        return len(record.times) > (1 if max(record.times, default=0.0) > LONG_TIME else self.plan.repeats)
+    def was_timed_again(self, row: Row) -> bool:
+        """Whether a row has more times than its first measurement takes."""
+        return len(row["times"]) > (1 if max(row["times"], default=0.0) > LONG_TIME else self.plan.repeats)
 
     def measure_sequence(self, items: list[Item]) -> None:
         """Measure every solver on the steps of a sequence, in passes: each budget and tolerance, cold and carried."""
-        infos = [self.load_case(item) for item in items]
-        identity = hashlib.sha256("".join(i.sha for i in infos if i is not None).encode()).hexdigest()[:16]
+        cases = [self.load_case(item) for item in items]
+        identity = hashlib.sha256("".join(c["sha"] for c in cases if c is not None).encode()).hexdigest()[:16]
         steps = [
-            (item, replace(info, identity=identity))
-            for item, info in zip(items, infos, strict=True)
-            if info is not None
+            (item, {**case, "identity": identity})
+            for item, case in zip(items, cases, strict=True)
+            if case is not None
         ]
-        for _, info in steps:
-            self.add_entry(info)
+        for _, case in steps:
+            self.add_row(case)
         for name in self.names:
             spec = self.select_solver(items[0].sequence, name, [item for item, _ in steps])
             if spec is not None:
@@ -384,23 +406,23 @@ class Runner:
                     repeats = self.plan.repeats if len(steps) <= MAX_REPEATED_STEPS else 1
                     limit = self.plan.time_limit
                     tasks = [
-                        Task.of_case(info, spec.name, mode, tol, max_iter, start, limit, repeats)
-                        for _, info in steps
+                        Task.of_case(case, spec.name, mode, tol, max_iter, start, limit, repeats)
+                        for _, case in steps
                     ]
                     self.measure_pass([item for item, _ in steps], spec, tasks)
             self.done += len(items)
 
     def measure_pass(self, problems: list[Item], spec: SolverSpec, tasks: list[Task]) -> None:
         """Measure one pass. It ends, with a note, when its steps have taken `Plan.sequence_time_limit` together."""
-        call = tasks[0]
+        call, stride = tasks[0], -(-len(tasks) // MAX_MOTION_STEPS)
         limit, spent, made = self.plan.sequence_time_limit, 0.0, 0
         for task in tasks:
-            record = self.known.get(task.key)
-            if record is None or spent > limit:
+            row = self.known.get(get_key(task))
+            if row is None or spent > limit:
                 break
-            spent, made = spent + _get_elapsed_time(record), made + 1
-            self.out.add(record)
-            self.report_progress(task.case, spec.name, record, True)
+            spent, made = spent + _get_elapsed_time(row), made + 1
+            self.out.append(row)
+            self.report_progress(task.case, spec.name, row, True)
         before: tuple[Problem, FloatArray] | None = None
         if call.start == "carried" and 0 < made < len(tasks) and spent <= limit:
             # If an earlier run was stopped in this pass, repeat its steps without records for the last step's impulses.
@@ -409,37 +431,45 @@ class Runner:
                 before = self.measure_step(item.problem, again, spec, before)[1]
         while made < len(tasks) and spent <= limit:
             task = tasks[made]
-            if (
-                record is not None
-                and record.times
-                and max(record.times) < UNGUARDED_TIME_RATIO * self.plan.time_limit
-            ):
+            if row and row["times"] and max(row["times"]) < UNGUARDED_TIME_RATIO * self.plan.time_limit:
                 task = replace(task, guarded=False)
-            record, before = self.measure_step(problems[made].problem, task, spec, before)
-            self.add_entry(record)
-            self.report_progress(record.case, spec.name, record)
-            spent, made = spent + _get_elapsed_time(record), made + 1
+            row, before = self.measure_step(problems[made].problem, task, spec, before, made % stride == 0)
+            self.add_row(row)
+            self.report_progress(row["case"], spec.name, row)
+            spent, made = spent + _get_elapsed_time(row), made + 1
         if made < len(tasks):
             target = describe_target(call.mode, call.tol, call.max_iter)
             reason = (
                 f"stopped after {made} of {len(tasks)} steps, which took more than the pass limit of {limit:.3g} s "
                 "together (--sequence-time-limit)"
             )
-            self.add_entry(
-                Skip(self.this.run, f"{problems[0].sequence}, {target}, {call.start}", spec.name, reason)
-            )
+            self.add_skip(f"{problems[0].sequence}, {target}, {call.start}", spec.name, reason)
 
     def measure_step(
-        self, problem: Problem, task: Task, spec: SolverSpec, before: tuple[Problem, FloatArray] | None
-    ) -> tuple[Record, tuple[Problem, FloatArray] | None]:
-        """Measure one step; if its task has start "carried", start from the previous problem and impulses."""
+        self,
+        problem: Problem,
+        task: Task,
+        spec: SolverSpec,
+        before: tuple[Problem, FloatArray] | None,
+        with_motion: bool = False,
+    ) -> tuple[Row, tuple[Problem, FloatArray] | None]:
+        """Measure one step; if its task has start "carried", start from the previous problem and impulses.
+
+        `with_motion` adds the error of the motion after a fixed number of sweeps, which is not timed.
+        """
         start = None
         if task.start == "carried":
             begun = perf_counter()
             start = problem.start() if before is None else carry_impulses(*before, problem)
-            task = replace(task, lead=perf_counter() - begun)
-        record, impulse = self.make_record(problem, task, spec, start)
-        return record, None if impulse is None else (problem, impulse)
+            task = replace(task, carry_time=perf_counter() - begun)
+        row, impulse = self.measure_task(problem, task, spec, start)
+        if with_motion and task.mode == "budget" and spec.order and impulse is not None:
+            error = motion_error(
+                problem, impulse
+            )  # Without bodies, the largest difference of a row's velocity counts.
+            speed = error.rows if error.speed is None else error.speed
+            row["motion_error"] = math.nan if speed is None else float(speed)
+        return row, None if impulse is None else (problem, impulse)
 
     def select_solver(self, case: str, name: str, items: Sequence[Item | Problem]) -> SolverSpec | None:
         """Return the solver to run for `name`.
@@ -457,51 +487,50 @@ class Runner:
         other = None if self.plan.campaign else spec.standing_in(problem)
         if other is not None and other.name in self.names:
             other = None  # The bounded variant is measured under its own name already.
-        self.add_entry(
-            Skip(self.this.run, case, name, f"{name} → {other.name}: {reason}" if other else reason)
-        )
+        self.add_skip(case, name, f"{name} → {other.name}: {reason}" if other else reason)
         return other
 
-    def measure_solver(self, info: CaseInfo, problem: Problem, name: str) -> list[Record]:
-        """Measure one solver on one case, at every budget and tolerance; return the records."""
-        spec = self.select_solver(info.case, name, [problem])
+    def measure_solver(self, case: Row, problem: Problem, name: str) -> list[Row]:
+        """Measure one solver on one case, at every budget and tolerance; return the rows."""
+        spec = self.select_solver(case["case"], name, [problem])
         if spec is None:
             return []
-        name, records = spec.name, list[Record]()
+        name, rows = spec.name, list[Row]()
 
-        def measure_task(task: Task) -> Record:
-            """Measure one task, or return its record if an earlier run stored it."""
-            record = self.known.get(task.key)
-            reused = record is not None
-            if record is not None:
-                self.out.add(record)
+        def measure_or_reuse(task: Task) -> Row:
+            """Measure one task, or return its row if an earlier run stored it."""
+            row = self.known.get(get_key(task))
+            reused = row is not None
+            if row is not None:
+                self.out.append(row)
             else:
-                record = self.make_record(problem, task, spec, None)[0]
-                self.add_entry(record)
-            self.report_progress(info.case, name, record, reused)
-            records.append(record)
-            return record
+                row = self.measure_task(problem, task, spec, None)[0]
+                self.add_row(row)
+            self.report_progress(case["case"], name, row, reused)
+            rows.append(row)
+            return row
 
-        self.plan.measure_solver(info, problem, spec, measure_task)
-        return records
+        self.plan.measure_solver(case, problem, spec, measure_or_reuse)
+        return rows
 
-    def make_record(self, problem: Problem, task: Task, spec: SolverSpec, impulse: Any) -> tuple[Record, Any]:
-        """Solve a task, here or in the process for other packages; return its record and impulses (m,) [N s]."""
+    def measure_task(self, problem: Problem, task: Task, spec: SolverSpec, impulse: Any) -> tuple[Row, Any]:
+        """Solve a task, here or in the process for other packages; return its row and impulses (m,) [N s]."""
         if self.plan.campaign and not is_third_party_solver(spec):
             # In a campaign, a time limit may only end processes of third-party solvers.
             task = replace(task, time_limit=math.inf)
         if is_third_party_solver(spec):
-            record, found = self.worker.measure_task(replace(problem, copy=False), task, impulse)
+            row, found = self.worker.measure_task(replace(problem, copy=False), task, impulse)
         else:
-            record, found = measure_task(problem, task, impulse)
+            row, found = measure_task(problem, task, impulse)
         if found is not None:
-            record = replace(record, solution_hash=hashlib.sha256(found.tobytes()).hexdigest()[:16])
-        return remove_times(record, self.plan.time_limit) if self.plan.campaign else record, found
+            row["solution_hash"] = hashlib.sha256(found.tobytes()).hexdigest()[:16]
+        return remove_times(row, self.plan.time_limit) if self.plan.campaign else row, found
 
 
-def _get_elapsed_time(record: Record) -> float:
-    """Return the time [s] that a record took, from its fields, so that a resumed pass ends at the same step."""
-    return sum(record.times) if record.times else record.time_limit
+def _get_elapsed_time(row: Row) -> float:
+    """Return the time [s] that a run took, from its row, so that a resumed pass ends at the same step."""
+    carry_time = row["carry_time"] if row["carry_time"] > 0.0 else 0.0
+    return float(sum(row["times"]) + carry_time if row["times"] else row["time_limit"])
 
 
 def _group_sequences(items: list[Item]) -> list[tuple[str, list[Item]]]:
@@ -535,8 +564,8 @@ class Pair:
     source: str | Problem  # A name or path that the worker resolves itself, or the problem.
     reason: str
     solver: str
-    info: CaseInfo | None  # Stored description of the case.
-    known: tuple[Record, ...]  # Stored records of the pair.
+    described: Row | None  # Stored description of the case.
+    known: tuple[Row, ...]  # Stored rows of the pair.
 
 
 @dataclass(frozen=True)
@@ -544,7 +573,7 @@ class Order:
     """Data that all workers need."""
 
     plan: Plan
-    run: Run
+    machine: Row
     # [bytes] Memory limit of each third-party solver's process; None: a share of the machine's.
     memory: int | None
     local: tuple[SolverSpec, ...] = ()  # Solvers that are registered only in the parent.
@@ -571,25 +600,25 @@ def _register_solvers(specs: tuple[SolverSpec, ...]) -> Iterator[None]:
 
 
 # Source, item and description of the case of the last pair. Pairs of one case are consecutive, so it is loaded once.
-_last_case: tuple[Any, Item | None, CaseInfo | None] = None, None, None
+_last_case: tuple[Any, Item | None, Row | None] = None, None, None
 
 
-def measure_in_worker(pair: Pair, order: Order) -> tuple[int, list[Entry]]:
-    """Measure a pair in a worker, on one thread as pairs run in parallel; return its index and its entries."""
+def measure_in_worker(pair: Pair, order: Order) -> tuple[int, list[Row]]:
+    """Measure a pair in a worker, on one thread as pairs run in parallel; return its index and its rows."""
     global _last_case
     shared = machine.get_memory_per_process(os.cpu_count() or 1) if order.memory is None else order.memory
     with _register_solvers(order.local), limit_to_one_thread(pair.solver):
-        runner = Runner(order.run, order.plan, [pair.solver], _get_isolated_worker(shared))
-        runner.known = {record.key: record for record in pair.known}
-        runner.described = {} if pair.info is None else {pair.case: pair.info}
-        key, item, info = None, None, None
+        runner = Runner(order.machine, order.plan, [pair.solver], _get_isolated_worker(shared))
+        runner.known = {get_key(row): row for row in pair.known}
+        runner.described = {} if pair.described is None else {pair.case: pair.described}
+        key, item, case = None, None, None
         if not isinstance(pair.source, Problem):
             changed = os.stat(pair.source).st_mtime_ns if os.path.exists(pair.source) else 0
-            key = order.run.run, pair.case, pair.source, changed
+            key = order.machine["run"], pair.case, pair.source, changed
             if _last_case[0] == key:
-                _, item, info = _last_case
+                _, item, case = _last_case
         item = item or resolve_item(pair.source, pair.case, pair.reason)
-        runner.measure_case(item, info)
-    out = runner.out
-    _last_case = key, item, out.cases.get(pair.case)
-    return pair.index, [*out.cases.values(), *out.skips, *out]
+        runner.measure_case(item, case)
+    case = next((row for row in runner.out if row["kind"] == "case"), None)
+    _last_case = key, item, case
+    return pair.index, runner.out

@@ -1,38 +1,100 @@
-"""Write and read files of records (`records.jsonl`), with one JSON object per line.
+"""Write and read `records.jsonl`: one JSON object in a line for each machine, case, run, and pair that did not run.
 
-Lines are appended and flushed as each entry is made: runs, cases, pairs that did not run, and machines. A measurement
-that was killed leaves at most one incomplete line, the last one, which is removed before the next line is written. One
-process writes a file, under the lock of `lavender.io.stored.lock_output`.
+A measurement makes a dictionary, the store appends it as a line, and `read` returns all lines as one DataFrame, which
+`select_runs`, `select_cases` and `select_skips` divide. docs/report.md lists the columns of runs with their units.
+
+Lines are appended and flushed as they are made. A measurement that was killed leaves at most one incomplete line, the
+last one, which is removed before the next line is written. One process writes a file, under the lock of
+`lavender.io.stored.lock_output`.
 """
 
 from __future__ import annotations
 
 import contextlib
+import io
 import json
+import math
 import os
 import time
-from collections.abc import Iterator
+import warnings
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
 
-from lavender.base.errors import InputError
+import numpy as np
+
+from lavender.base.errors import InputError, require_packages
 from lavender.io.stored import MAX_BYTES, as_path, lock_output, make_folder, resolve_destination
-from lavender.report.records import (
-    RECORD_DEFAULTS,
-    RECORD_FIELDS,
-    Entry,
-    Record,
-    Records,
-    from_json,
-    parse_fields,
-    to_json,
-)
+from lavender.judge.solution import CLAIM_CHECKS, CONFIRMED
+from lavender.report.text import escape_unprintable, format_tolerance
 
-MAX_LINE_BYTES = 2**26  # A longer line is not a record; the longest records have a few thousand bytes.
-SYNC_INTERVAL = 1.0  # [s] A power cut loses at most the records of this time, a killed process none.
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+Row: TypeAlias = dict[str, Any]  # Content of one line.
+KINDS = ("machine", "case", "run", "skip")
+MAX_LINE_BYTES = (
+    2**26
+)  # A longer last line is not of a records file; the longest lines have a few thousand bytes.
+SYNC_INTERVAL = 1.0  # [s] A power cut loses at most the lines of this time, a killed process none.
+# Statuses of a run that returned no solution, in addition to the statuses of a solve.
+ERROR, KILLED, CRASHED = "ERROR", "KILLED", "CRASHED"
+#: Columns that are equal in two lines about the same measurement; the later line counts.
+KEY = ("run", "case", "sha", "solver", "start", "mode", "tol", "max_iter", "time_limit", "order")
+#: Columns of runs with their defaults, which are the values of a run without an answer and determine the types.
+RUN_COLUMNS: Row = {
+    "run": "", "case": "", "sha": "", "solver": "", "start": "cold", "mode": "tol", "tol": math.nan, "max_iter": 0,
+    "time_limit": math.nan, "order": "given", "step": -1, "status": "", "relative": math.inf, "energy": math.inf,
+    "velocity": math.inf, "roundoff_floor": math.nan, "motion_error": math.nan, "worst_row": -1, "worst_name": "",
+    "success": False, "claims": False, "claim_check": CONFIRMED, "status_conflict": "", "iterations": 0, "work": "{}",
+    "form": "", "message": "", "time": math.nan, "time_median": math.nan, "repetitions": 0, "carry_time": math.nan,
+    "setup_time": math.nan, "solve_time": math.nan, "calibration_time": math.nan, "load": math.nan,
+    "solution_hash": "", "times": (),
+}  # fmt: skip
+#: Columns of cases with their defaults. The second line of names is not repeated in the rows of runs.
+CASE_COLUMNS: Row = {
+    "law": "", "rows": 0, "blocks": 0, "islands": 0, "contacts": 0, "mass_ratio": math.nan, "structure": "",
+    "symmetric": True, "sequence": "", "nothing_to_do": False,
+}  # fmt: skip
+CASE_DETAILS: Row = {
+    "run": "", "case": "", "sha": "", "step": -1, "source": "", "identity": "", "bodies": 0, "nonzeros": 0,
+    "reason": "", "guess": "", "stored": math.nan, "stored_verdict": "", "diagnostics": (),
+}  # fmt: skip
+CHOICES = {"start": ("cold", "warm", "carried"), "mode": ("tol", "budget"), "claim_check": CLAIM_CHECKS}
+SKIP_COLUMNS: Row = {"run": "", "case": "", "solver": "", "reason": "", "sequence": ""}
+MACHINE_COLUMNS = ("started", "cpu", "cores", "threads", "platform", "python", "lavender")
+
+
+def describe_target(mode: str, tol: float, max_iter: int) -> str:
+    """Describe the target of a run: "to 1e-6", or "16 iterations"."""
+    return f"{max_iter} iterations" if mode == "budget" else f"to {format_tolerance(tol)}"
+
+
+def get_key(row: Any) -> tuple[Any, ...]:
+    """Return the key of a measurement from its row or task: the values of the columns `KEY`."""
+    return tuple(row[name] if isinstance(row, Mapping) else getattr(row, name) for name in KEY)
+
+
+def to_jsonable(value: Any) -> Any:
+    """Convert a value to one that JSON can hold: inf and nan become strings."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else str(value)
+    if isinstance(value, Mapping):
+        return {str(k): to_jsonable(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [to_jsonable(v) for v in value]
+    if isinstance(value, (bool, int, str)) or value is None:
+        return value
+    return to_jsonable(value.tolist()) if hasattr(value, "tolist") else str(value)
+
+
+# -- lines -------------------------------------------------------------------------------------------------
 
 
 class Store:
-    """Appends entries to a `.jsonl` file, which no other process can write while it is open.
+    """Appends rows to a `.jsonl` file, which no other process can write while it is open.
+
+    `lines` is the DataFrame of the lines that the file had when it was opened.
 
     Raises
     ------
@@ -46,8 +108,10 @@ class Store:
         with contextlib.ExitStack() as held:
             held.enter_context(lock_output(self.path))
             try:
-                self.records = read(self.path) if self.path.exists() else Records()
-                _remove_incomplete_last_line(self.path)
+                self.lines = read(self.path) if self.path.exists() else make_lines([])
+                if self.lines.attrs.get("dropped"):
+                    with self.path.open("rb+") as f:
+                        f.truncate(f.read().rfind(b"\n") + 1)
                 self.file = self.path.open("a", encoding="utf-8")
             except OSError as error:
                 raise InputError(
@@ -56,15 +120,15 @@ class Store:
             self._lock = held.pop_all()
         self._synced = time.monotonic()
 
-    def add(self, entry: Entry) -> None:
-        """Write one entry and flush it to the operating system before returning.
+    def add(self, row: Row) -> None:
+        """Write one row and flush it to the operating system before returning.
 
         Raises
         ------
         InputError
-            The disk is full (earlier entries are stored), or the file was removed.
+            The disk is full (earlier rows are stored), or the file was removed.
         """
-        line = json.dumps(to_json(entry), allow_nan=False)
+        line = json.dumps(to_jsonable(row), allow_nan=False)
         try:
             self.file.write(line + "\n")
             self.file.flush()
@@ -81,7 +145,6 @@ class Store:
                 f"cannot write {self.path} ({error.strerror or error}): free disk space and run the same command "
                 "again; it continues after the last record"
             ) from None
-        self.records.add(entry)
 
     def close(self) -> None:
         """Close the file and release its lock. Errors of the disk are ignored here: `add` has raised them."""
@@ -106,76 +169,254 @@ def open_store(store: Store | str | Path | None) -> Iterator[Store | None]:
         yield made
 
 
-def _remove_incomplete_last_line(path: Path) -> None:
-    """Remove a last line without a line end, which an interrupted run leaves."""
-    if not path.exists():
-        return
-    with path.open("rb+") as f:
-        whole = sum(len(line) for line in f if line.endswith(b"\n"))
-        if whole != f.tell():
-            f.truncate(whole)
+def make_lines(rows: Iterable[Row], source: str = "", dropped: int = 0) -> DataFrame:
+    """Return a DataFrame with a row for each of `rows`, as `read` does.
+
+    Its `attrs` have `source` and the number of incomplete lines that were `dropped`.
+    """
+    require_packages("a table of runs", "pandas")
+    import pandas as pd
+
+    lines = pd.DataFrame(list(rows))
+    lines = lines if "kind" in lines else pd.DataFrame({"kind": pd.Series(dtype=object)})
+    lines.attrs = {"source": source, "dropped": dropped}
+    return lines
 
 
-def read(path: str | Path) -> Records:
-    """Read a file `records.jsonl`, or the one in a folder, without an incomplete last line.
+def read(path: str | Path) -> DataFrame:
+    """Read a file `records.jsonl`, or the one in a folder, as a DataFrame with a row for each line.
+
+    An incomplete last line, which a killed measurement leaves, is dropped and counted in `attrs["dropped"]`.
 
     Raises
     ------
     InputError
         The file does not exist, or a line is not a record.
     """
+    require_packages("a table of runs", "pandas")
+    import pandas as pd
+
     path = as_path(path)
-    if path.is_dir():
-        path = path / "records.jsonl"
+    path = path / "records.jsonl" if path.is_dir() else path
     if path.exists() and not path.is_file():
         raise InputError(f"{path} is not a file; a records.jsonl is needed")
-    records = Records(source=str(path))
-    for number, line in enumerate(_read_lines(path), 1):
-        if not line.strip():
-            continue
-        try:
-            content = json.loads(line)
-            if isinstance(content, dict) and content.get("kind") == "record":
-                # No `Record` is created: a file may have a million of them.
-                values = RECORD_DEFAULTS | parse_fields(Record, content)
-                if missing := [name for name in RECORD_FIELDS if name not in values]:
-                    raise ValueError(f"a record has no {missing[0]}")
-                if not (values["case"] in records.cases and values["run"] in records.runs):
-                    owner = "case" if values["run"] in records.runs else "run"
-                    raise ValueError(
-                        f"the record belongs to a {owner} that no earlier line describes; a complete records.jsonl is "
-                        "needed: copy the whole file"
-                    )
-                records.add_values(values)
-            else:
-                records.add(from_json(content))
-        except (ValueError, RecursionError) as error:
-            raise InputError(
-                f"{path}, line {number}: {error}. Give a records.jsonl that `lavender report` wrote, or "
-                "remove this line"
-            ) from None
-    return records
-
-
-def _read_lines(path: Path) -> Iterator[str]:
-    """Yield the lines of a file without byte order marks, and without an incomplete last line."""
     try:
-        size = path.stat().st_size
-        if size > MAX_BYTES:
+        if (size := path.stat().st_size) > MAX_BYTES:
             raise InputError(
-                f"{path} holds {size} bytes, more than the limit of {MAX_BYTES}; measure fewer cases in one "
-                "folder"
+                f"{path} holds {size} bytes, more than the limit of {MAX_BYTES}; measure fewer cases in one folder"
             )
-        with path.open("rb") as f:
-            while line := f.readline(MAX_LINE_BYTES):
-                if not line.endswith(b"\n"):
-                    if len(line) == MAX_LINE_BYTES:
-                        raise InputError(
-                            f"{path} has a line of more than {MAX_LINE_BYTES} bytes; a records.jsonl is needed"
-                        )
-                    return
-                yield line[:-1].decode("utf-8", errors="replace").removeprefix("\ufeff")
+        content = path.read_bytes()
     except OSError as error:
         raise InputError(
             f"cannot read {path} ({error.strerror or error}); a records.jsonl is needed"
         ) from None
+    dropped = len(content) - content.rfind(b"\n") - 1
+    if dropped > MAX_LINE_BYTES:
+        raise InputError(f"{path} has a line of more than {MAX_LINE_BYTES} bytes; a records.jsonl is needed")
+    # Editors of some systems begin a file, and so each part of joined files, with a byte order mark.
+    whole = content[: content.rfind(b"\n") + 1].replace(b"\xef\xbb\xbf", b"")
+    try:
+        with warnings.catch_warnings():  # Recent versions of pandas need and know no `convert_dates`.
+            warnings.simplefilter("ignore")
+            lines = pd.read_json(
+                io.BytesIO(whole), lines=True, dtype=False, convert_dates=False, precise_float=True,
+                encoding_errors="replace",
+            )  # fmt: skip
+        is_known = not len(lines) or ("kind" in lines and lines["kind"].isin(KINDS).all())
+    except (ValueError, RecursionError, OverflowError, TypeError):
+        is_known = False
+    if not is_known:
+        raise InputError(
+            f"{path}{_describe_invalid_line(whole)}. Give a records.jsonl that `lavender report` wrote, or remove this "
+            "line"
+        )
+    lines = lines if len(lines) else make_lines([])
+    lines.attrs = {"source": str(path), "dropped": int(dropped > 0)}
+    select_runs(lines)  # Raises the errors of invalid columns.
+    return lines
+
+
+def _describe_invalid_line(content: bytes) -> str:
+    """Return the number of the first line that is not a row, and the reason."""
+    for number, line in enumerate(content.decode(errors="replace").splitlines(), 1):
+        try:
+            row = json.loads(line) if line.strip() else {"kind": KINDS[0]}
+            reason = (
+                ""
+                if isinstance(row, dict) and row.get("kind") in KINDS
+                else "it is not an entry of a records file"
+            )
+        except (ValueError, RecursionError, TypeError) as error:
+            reason = f"it is not JSON ({error})"
+        if reason:
+            return f", line {number}: {reason}; an object with a kind is needed, one of {', '.join(KINDS)}"
+    return ": a number or text is too large"
+
+
+# -- parts -------------------------------------------------------------------------------------------------
+
+
+def convert_columns(lines: DataFrame, kind: str, columns: Row) -> DataFrame:
+    """Return the lines of one kind with these columns, in the types of the defaults, which replace missing values.
+
+    Texts are made printable; only messages may have several lines.
+
+    Raises
+    ------
+    InputError
+        A column has a value of another type.
+    """
+    import pandas as pd
+
+    some, converted = lines[lines["kind"] == kind], {}
+    for name, default in columns.items():
+        if name not in some:
+            converted[name] = pd.Series([default] * len(some), index=some.index, dtype=object)
+        else:
+            converted[name] = some[name].astype(object).where(some[name].notna(), None)
+        values = converted[name]
+        try:
+            if isinstance(default, tuple):
+                values = values.map(lambda x: [] if x is None else list(x))
+            else:
+                values = values.map(lambda x, default=default: default if x is None else x)
+            if isinstance(default, str):
+                unique = values.unique().tolist()
+                if not all(isinstance(text, str) and text in CHOICES.get(name, (text,)) for text in unique):
+                    raise TypeError(
+                        f"one of {', '.join(CHOICES[name])} is needed"
+                        if name in CHOICES
+                        else "a text is needed"
+                    )
+                texts = {text: escape_unprintable(text, name == "message") for text in unique}
+                values = values.map(texts).astype("category")
+            elif isinstance(default, bool):
+                if not values.isin([True, False]).all():
+                    raise TypeError("true or false is needed")
+                values = values.astype(bool)
+            elif not isinstance(default, tuple):
+                values = values.astype("int64" if isinstance(default, int) else float)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise InputError(
+                f"{lines.attrs.get('source') or 'lines'}: the column {name!r} of a {kind} has an invalid value "
+                f"({error}); give a records.jsonl that `lavender report` wrote"
+            ) from None
+        converted[name] = values
+    return pd.DataFrame(converted, index=some.index)
+
+
+def select_runs(lines: DataFrame) -> DataFrame:
+    """Return a row for each run, with facts about its case and its machine; docs/report.md lists the columns.
+
+    Raises
+    ------
+    InputError
+        A column has values of another type, or no line describes the case or the machine of a run.
+    """
+    runs = _keep_last(convert_columns(lines, "run", RUN_COLUMNS).drop(columns="times"), KEY)
+    cases, machines = select_cases(lines), select_machines(lines)
+    described = convert_columns(lines, "case", {"case": ""})["case"].unique()
+    for name, known in (("case", described), ("run", machines)):
+        if not runs[name].isin(list(known)).all():
+            raise InputError(
+                f"{lines.attrs.get('source') or 'lines'}: a record belongs to a {name} that no line describes; a "
+                "complete records.jsonl is needed: copy the whole file"
+            )
+    case, run = runs["case"].astype(object), runs["run"].astype(object)
+    facts = {name: case.map(cases[name].to_dict()) for name in CASE_COLUMNS}
+    for name in (*MACHINE_COLUMNS, "versions"):
+        facts[name] = run.map({r: machine.get(name) for r, machine in machines.items()})
+    facts["versions"] = run.map({
+        r: ", ".join(f"{name} {v}" for name, v in machine["versions"].items()) for r, machine in machines.items()
+    })  # fmt: skip
+    runs = runs.assign(**facts).reset_index(drop=True)
+    texts = [name for name in facts if runs[name].dtype.kind not in "biuf"]
+    return runs.astype(dict.fromkeys(texts, "category"))
+
+
+def _keep_last(frame: DataFrame, key: Iterable[str]) -> DataFrame:
+    """Return the last of the rows with equal keys, at the place of the first of them."""
+    group = frame.groupby(list(key), sort=False, observed=True, dropna=False).ngroup()
+    last = frame.assign(_group=group).drop_duplicates("_group", keep="last")
+    return last.sort_values("_group", kind="stable").drop(columns="_group")
+
+
+def select_cases(lines: DataFrame) -> DataFrame:
+    """Return the last description of each case, by its name; of two sequences with one name, the steps of the last."""
+    cases = convert_columns(lines, "case", CASE_DETAILS | CASE_COLUMNS).drop_duplicates("case", keep="last")
+    cases = cases.astype(dict.fromkeys(("case", "sequence", "identity", "source", "structure"), object))
+    latest = cases.groupby("sequence")["identity"].last()
+    cases = cases[(cases["identity"] == cases["sequence"].map(latest)) | (cases["sequence"] == "")]
+    return cases.set_index("case", drop=False)
+
+
+def select_skips(lines: DataFrame) -> DataFrame:
+    """Return the pairs that did not run, and with an empty `solver` the cases that did not load and never loaded later.
+
+    `sequence` is the sequence of a step that did not load.
+    """
+    skips = _keep_last(convert_columns(lines, "skip", SKIP_COLUMNS), ("run", "case", "solver"))
+    loaded = convert_columns(lines, "case", {"run": "", "case": ""}).drop_duplicates(keep="last")
+    last = {(run, case): i for run, case, i in zip(loaded["run"], loaded["case"], loaded.index, strict=True)}
+    is_open = [
+        bool(solver) or last.get((run, case), -1) < i
+        for run, case, solver, i in zip(
+            skips["run"], skips["case"], skips["solver"], skips.index, strict=True
+        )
+    ]
+    return skips.loc[skips.index[np.array(is_open, bool)]].astype(object)
+
+
+def select_machines(lines: DataFrame) -> dict[str, Row]:
+    """Return the last description of each machine with its versions and plan, by the name of its run; the newest last.
+
+    Raises
+    ------
+    InputError
+        A description has values of another type.
+    """
+    machines: dict[str, Row] = {}
+    defaults = {"run": "", "started": "", "lavender": "", "python": "", "platform": "", "cpu": "", "cores": 1,
+                "threads": 1, "load": math.nan, "whole": True}  # fmt: skip
+    texts = convert_columns(lines, "machine", defaults).astype(dict.fromkeys(("run", "cpu"), object))
+    for i, row in zip(texts.index, texts.to_dict("records"), strict=True):
+        parts = {name: lines[name].get(i) if name in lines else {} for name in ("versions", "plan", "build")}
+        tolerances = parts["plan"].get("tolerances", []) if isinstance(parts["plan"], dict) else None
+        if not (
+            all(isinstance(part, dict) for part in parts.values())
+            and isinstance(tolerances, (list, tuple))
+            and all(isinstance(x, (int, float)) and 0.0 < x < math.inf for x in tolerances)
+        ):
+            raise InputError(
+                f"{lines.attrs.get('source') or 'lines'}: versions, plan or build of a machine are invalid; tables of "
+                "words and numbers and positive tolerances are needed"
+            )
+        machines.pop(row["run"], None)
+        machines[row["run"]] = {**row, **_escape_texts(parts)}
+    return machines
+
+
+def _escape_texts(value: Any) -> Any:
+    """Make all texts in a value printable."""
+    if isinstance(value, str):
+        return escape_unprintable(value)
+    if isinstance(value, Mapping):
+        return {escape_unprintable(str(k)): _escape_texts(v) for k, v in value.items()}
+    return [_escape_texts(v) for v in value] if isinstance(value, list) else value
+
+
+def select_solvers(lines: DataFrame, names: Iterable[str]) -> DataFrame:
+    """Return the lines about some solvers, and the lines about machines and cases.
+
+    Raises
+    ------
+    InputError
+        There are no runs of a solver.
+    """
+    own = lines["solver"] if "solver" in lines else lines["kind"].map({})
+    known = sorted({str(name) for name in own.dropna()} - {""})
+    names = list(names)
+    for name in names:
+        if name not in known:
+            raise InputError(f"no records of solver {name!r}; there are records of {', '.join(known)}")
+    return lines[own.isna() | own.isin(["", *names])]

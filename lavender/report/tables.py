@@ -7,9 +7,10 @@ in advance. Single cases count from a cold start, steps of a sequence with carri
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -17,13 +18,22 @@ from typing import Any, TypeAlias
 import numpy as np
 import pandas as pd
 
+from lavender import io
 from lavender.base.deadline import format_seconds
+from lavender.base.errors import LavenderError
 from lavender.io.stored import ENGINE, SUFFIXES, read_whole_file
-from lavender.judge.residuals import AT_FLOOR, UNCONVERGED, WRONG, at_floor
+from lavender.judge.residuals import AT_FLOOR, UNCONVERGED, WRONG, at_floor, residual
 from lavender.judge.solution import CONFIRMED, CONTRADICTED, NOT_PROVEN
 from lavender.problem.derived import cached_property
 from lavender.report import machine
-from lavender.report.records import Records, Skip, describe_target
+from lavender.report.store import (
+    Row,
+    describe_target,
+    select_cases,
+    select_machines,
+    select_runs,
+    select_skips,
+)
 from lavender.report.text import escape_unprintable, format_count, format_residual, format_tolerance
 from lavender.solvers import registry
 
@@ -43,6 +53,14 @@ MEAN_TIME_SHIFT = 1e-5
 # Times within noise count as equal. Noise is twice the difference of median and minimum of the repetitions, relative to
 # the minimum, and within these bounds.
 MIN_NOISE, MAX_NOISE = 0.05, 0.25
+ANSWER_NUMBERS = (
+    "relative",
+    "seconds",
+    "velocity",
+    "iterations",
+)  # Numbers of an engine's answer; nan if missing.
+# Methods with the sweeps of most engines: they are listed first, and recommended if one of them is enough.
+PLAIN_SWEEPS = ("sequential_impulses", "pgs", "block_gauss_seidel", "gauss_seidel", "sor", "jacobi")
 PREFERRED_SOLVER = "auto"  # Listed first among equally good solvers, as its users need not choose a method.
 STRUCTURE_ORDER = (
     *("separate", "chain", "mesh", "stack", "pile", "dense"),
@@ -177,8 +195,8 @@ class EngineAnswers:
     left_out : int
         Number of steps that could not be recorded.
     lines : DataFrame
-        One row for each answer: file, rows, seconds [s], relative, velocity [m/s] and worst (nan and "" if they were
-        not recorded), verdict and solver.
+        One row for each answer: file, rows, seconds [s], relative, velocity [m/s], iterations and worst (nan and "" if
+        they were not recorded), verdict and solver.
     """
 
     folder: str
@@ -204,53 +222,73 @@ class EngineAnswers:
         """Return whether the source of a case is a file of the engine's folder."""
         return str(Path(source).parent) == self.folder
 
-    def rank(self, records: Records, cases: Sequence[str], tolerance: float) -> dict[str, Any] | None:
+    def rank(self, cases: Frame, tolerance: float) -> dict[str, Any] | None:
         """Return the engine's result on cases as solvers are ranked; None if it did not answer every case."""
-        sources = [records.cases[name].source for name in cases]
         timed = (
             self.lines[self.lines["seconds"] >= 0.0].drop_duplicates("file", keep="last").set_index("file")
         )
-        answers = timed.reindex([Path(s).name for s in sources if self.contains(s)])
-        if not cases or answers["seconds"].isna().any() or len(answers) < len(cases):
+        answers = timed.reindex([Path(s).name for s in cases["source"] if self.contains(s)])
+        if not len(cases) or answers["seconds"].isna().any() or len(answers) < len(cases):
             return None
         is_solved = answers["relative"] <= tolerance
         mean = float(compute_mean(answers["seconds"][is_solved]))
         return {"solver": self.solver, "solved": int(is_solved.sum()), "cases": len(cases), "mean": mean}
 
 
-def read_engine_answers(sources: Sequence[str], records: Records) -> list[EngineAnswers]:
-    """Read the engine's answers in the folders among `sources`, and in the folders of the records' files.
+def read_engine_answers(sources: Sequence[str], lines: Frame) -> list[EngineAnswers]:
+    """Read the engine's answers in the folders among `sources`, and in the folders of the cases of `lines`.
 
-    Lines that cannot be read are left out.
+    Each line of `engine.jsonl` is one answer; if it has no residual, the impulse in the file of the step is judged. A
+    folder without such a file has the answers that are stored with the steps of sequences.
     """
-    parents = (Path(x.source).parent for x in records.cases.values() if x.source.endswith(SUFFIXES))
-    engines = (_read_folder(folder) for folder in dict.fromkeys([*map(Path, sources), *parents]))
-    return [engine for engine in engines if engine is not None]
+    cases = select_cases(lines)
+    files = cases[cases["source"].astype(str).str.endswith(SUFFIXES)]
+    stored = files[files["stored"].notna() & (files["sequence"] != "")]
+    parents = [Path(source).parent for source in files["source"].astype(str)]
+    engines = []
+    for folder in dict.fromkeys([*map(Path, sources), *parents]):
+        own = [Path(s).name for s in stored["source"].astype(str) if Path(s).parent == folder]
+        answers = _read_lines(folder) or [{"file": name, "solver": "engine"} for name in own]
+        entries = [entry for answer in answers if (entry := _complete_answer(folder, answer)) is not None]
+        if entries:
+            left_out = sum("left_out" in answer for answer in answers)
+            engines.append(EngineAnswers(escape_unprintable(str(folder)), left_out, pd.DataFrame(entries)))
+    return engines
 
 
-def _read_folder(folder: Path) -> EngineAnswers | None:
-    """Read the answers in one folder; return None if it has none."""
-    path = folder / ENGINE
-    if not path.is_file():
+def _read_lines(folder: Path) -> list[Any]:
+    """Return the lines of a folder's `engine.jsonl` without those that are not JSON; empty if there is no such file."""
+    answers = []
+    if (folder / ENGINE).is_file():
+        for line in (
+            read_whole_file(folder / ENGINE, "the engine's answers").decode(errors="replace").splitlines()
+        ):
+            with contextlib.suppress(ValueError, RecursionError):
+                answers.append(json.loads(line))
+    return [answer for answer in answers if isinstance(answer, dict)]
+
+
+def _complete_answer(folder: Path, answer: Row) -> Row | None:
+    """Return an answer with the judge's numbers on its impulse; None if it has neither these nor a readable file."""
+    try:
+        if "left_out" in answer:
+            return None
+        if "relative" not in answer:
+            path = folder / Path(str(answer["file"])).name
+            problem, impulse = io.load(path), io.load_solution(path)
+            if impulse is None:
+                return None
+            judged = residual(problem, impulse)
+            answer = {"rows": problem.m, "relative": judged.relative, "velocity": judged.velocity,
+                      "verdict": judged.verdict, "worst": judged.worst_name, **answer}  # fmt: skip
+        texts = {name: str(answer.get(name, "")) for name in ("verdict", "solver", "file", "worst")}
+        numbers = {"rows": answer["rows"], **{name: answer.get(name) for name in ANSWER_NUMBERS}}
+        numbers = {
+            name: math.nan if x is None else float(x) for name, x in numbers.items()
+        }  # JSON has no NaN.
+        return numbers | {name: escape_unprintable(text) for name, text in texts.items()}
+    except (ValueError, KeyError, TypeError, LavenderError, OSError):
         return None
-    entries, left_out = [], 0
-    for line in read_whole_file(path, "the engine's answers").decode(errors="replace").splitlines():
-        try:
-            entry = json.loads(line)
-            left_out += "left_out" in entry
-            # JSON has null in place of numbers that are not finite.
-            values = {name: entry[name] for name in ("rows", "seconds", "relative")}
-            numbers = {name: math.nan if x is None else float(x) for name, x in values.items()}
-            texts = {name: str(entry[name]) for name in ("verdict", "solver")}
-            texts |= {name: str(entry.get(name, "")) for name in ("file", "worst")}
-            velocity = entry.get("velocity")
-            numbers["velocity"] = math.nan if velocity is None else float(velocity)
-            entries.append(numbers | {name: escape_unprintable(text) for name, text in texts.items()})
-        except (ValueError, KeyError, TypeError, RecursionError):
-            continue
-    return (
-        EngineAnswers(escape_unprintable(str(folder)), left_out, pd.DataFrame(entries)) if entries else None
-    )
 
 
 # -- contents ----------------------------------------------------------------------------------------------
@@ -258,34 +296,60 @@ def _read_folder(folder: Path) -> EngineAnswers | None:
 
 @dataclass(frozen=True, eq=False)
 class Contents:
-    """Records, earlier records, and requested budgets of a report, with the frames of the runs that count.
+    """Lines of a records file, earlier lines, and requested budgets, with the frames of the runs that count.
 
     Parameters
     ----------
-    records : Records
-        Times are compared within the newest run alone.
-    earlier : Records, optional
-        An earlier run to compare with.
+    lines : DataFrame
+        The result of `lavender.report.run` or `read`. Times are compared within the newest run alone.
+    earlier : DataFrame, optional
+        Lines of an earlier run to compare with.
     times : s, optional
         Time budgets for which a solver is recommended; default: three decades about the fastest times.
     engines : sequence of EngineAnswers
         Answers of the engines that recorded the steps: `lavender.report.tables.read_engine_answers`.
     """
 
-    records: Records
-    earlier: Records | None = None
+    lines: Frame
+    earlier: Frame | None = None
     times: Sequence[float] = ()
     engines: Sequence[EngineAnswers] = ()
 
     @cached_property
+    def runs(self) -> Frame:
+        """All runs of all machines (`select_runs`)."""
+        return select_runs(self.lines)
+
+    @cached_property
+    def cases(self) -> Frame:
+        """The descriptions of the cases by name."""
+        return select_cases(self.lines)
+
+    @cached_property
+    def skips(self) -> Frame:
+        """Pairs that did not run, and cases that did not load."""
+        return select_skips(self.lines)
+
+    @cached_property
+    def left_out(self) -> dict[str, Frame]:
+        """Cases that did not load, by sequence ("" for single cases). No number of a report counts them."""
+        skips = self.skips[self.skips["solver"] == ""]
+        return {str(name): some for name, some in skips.groupby("sequence", sort=False)}
+
+    @cached_property
+    def machine(self) -> Row:
+        """The machine, versions and plan of the newest run; empty without runs."""
+        return ([{}, *select_machines(self.lines).values()])[-1]
+
+    @cached_property
     def is_stopped(self) -> bool:
         """Whether the newest run ended before everything was measured."""
-        return bool(self.records.runs) and not list(self.records.runs.values())[-1].whole
+        return not self.machine.get("whole", True)
 
     @cached_property
     def is_campaign(self) -> bool:
         """Whether the newest run has no times."""
-        return bool(self.records.runs) and bool(list(self.records.runs.values())[-1].plan.get("campaign"))
+        return bool(self.machine.get("plan", {}).get("campaign"))
 
     @cached_property
     def newest(self) -> pd.DataFrame:
@@ -308,22 +372,19 @@ class Contents:
         A stopped run has the cases on which every solver was measured. If it was stopped in its first sequence, it has
         the solvers before the one that was measured then, or, without any, the passes before the last.
         """
-        frame = self.records.latest_frame
+        frame = select_newest_runs(self.lines)
         if not (self.is_stopped and len(frame)):
             return frame, []
-        run, last = list(self.records.runs.values())[-1], frame.iloc[-1]
-        solvers = run.plan.get("solvers", ())
+        last, solvers = frame.iloc[-1], self.machine["plan"].get("solvers", ())
         is_running = (frame["sequence"] == (last["sequence"] or None)) & (frame["solver"] == last["solver"])
         finished = frame[~is_running]
         done: dict[str, set[str]] = {}
         for case, solver in finished[["case", "solver"]].drop_duplicates().itertuples(index=False):
             done.setdefault(case, set()).add(solver)
-        for skip in self.records.skips:
-            if skip.run == run.run:
-                info = self.records.cases.get(skip.case)
-                members = [n for n, i in self.records.cases.items() if i.sequence == skip.case]
-                for name in members if info is None else [skip.case]:
-                    done.setdefault(name, set()).add(skip.solver)
+        skips, sequences = self.skips[self.skips["run"] == self.machine["run"]], self.cases["sequence"]
+        for name, solver in zip(skips["case"], skips["solver"], strict=True):
+            for case in [name] if name in self.cases.index else self.cases.index[sequences == name]:
+                done.setdefault(str(case), set()).add(solver)
         whole = finished[finished["case"].isin([name for name, some in done.items() if some >= set(solvers)])]
         if len(whole) or not last["sequence"]:
             return whole, []
@@ -340,15 +401,15 @@ class Contents:
     def earlier_frame(self) -> pd.DataFrame:
         """The newest of the earlier runs."""
         assert self.earlier is not None
-        return self.earlier.latest_frame
+        return select_newest_runs(self.earlier)
 
     @cached_property
     def tolerances(self) -> tuple[float, ...]:
         """Residual tolerances, largest first."""
-        for run in reversed(list(self.records.runs.values())):
-            if run.plan.get("tolerances"):
-                return tuple(sorted(map(float, run.plan["tolerances"]), reverse=True))
-        to_tolerance = self.records.frame.query("mode == 'tol'")["tol"] if len(self.records) else ()
+        for run in reversed(select_machines(self.lines).values()):
+            if run["plan"].get("tolerances"):
+                return tuple(sorted(map(float, run["plan"]["tolerances"]), reverse=True))
+        to_tolerance = self.runs.loc[self.runs["mode"] == "tol", "tol"]
         return tuple(sorted(set(to_tolerance), reverse=True)) or (1e-3, 1e-6, 1e-9)
 
     @property
@@ -374,6 +435,16 @@ class Contents:
         loads = [None if x != x else float(x) for x in self.frame["load"]]
         busy = machine.make_busy_warning(loads, int(self.frame["cores"].iloc[0]))
         return f"{busy} The times are invalid; measure again with --no-reuse." if busy else ""
+
+
+def select_newest_runs(lines: Frame) -> Frame:
+    """Return the runs of the machine that wrote last, of cases with unchanged numbers.
+
+    Times are compared only within one run, and a file that has changed is another problem.
+    """
+    runs, cases = select_runs(lines), select_cases(lines)
+    same = runs["sha"].astype(str) == runs["case"].astype(object).map(cases["sha"].astype(str).to_dict())
+    return runs[same & (runs["run"] == next(reversed(select_machines(lines)), ""))]
 
 
 # -- tables ------------------------------------------------------------------------------------------------
@@ -426,11 +497,15 @@ def tabulate_cases(report: Contents) -> Frame:
         times.loc[times.index == solver, times.columns == case] = math.nan
     target, rows = f"fastest to {format_tolerance(report.tolerance)}", []
     for name in times.columns:
-        info, own = report.records.cases[name], times[name].dropna()
-        stored = "" if math.isnan(info.stored) else f"{format_residual(info.stored)} {info.stored_verdict}"
+        case, own = report.cases.loc[name], times[name].dropna()
+        stored = (
+            ""
+            if math.isnan(case["stored"])
+            else f"{format_residual(case['stored'])} {case['stored_verdict']}"
+        )
         rows.append({
-            "case": name, "law": info.law, "rows": info.rows, "contacts": info.contacts, "islands": info.islands,
-            "structure": ", ".join(info.structure), target: own.idxmin() if len(own) else "none",
+            "case": name, "law": case["law"], "rows": case["rows"], "contacts": case["contacts"],
+            "islands": case["islands"], "structure": case["structure"], target: own.idxmin() if len(own) else "none",
             "time [s]": own.min() if len(own) else math.nan, "stored answer [-]": stored,
         })  # fmt: skip
     table = pd.DataFrame(rows)
@@ -507,11 +582,11 @@ def tabulate_costs(report: Contents) -> Frame:
 
     The exponent is fitted to the logarithms of the cases that a solver solves.
     """
-    times, rows_of = get_times(report.frame, report.tolerance), report.records.cases
+    times, rows_of = get_times(report.frame, report.tolerance), report.cases["rows"].to_dict()
     rows = []
     for solver, own in times.iterrows():
         t = own.dropna()
-        t, n = t[t > 0.0], np.array([rows_of[c].rows for c in t.index if t[c] > 0.0], float)
+        t, n = t[t > 0.0], np.array([rows_of[c] for c in t.index if t[c] > 0.0], float)
         if len(t) < MIN_FIT_CASES or n.min() <= 0.0 or n.max() < MIN_FIT_SIZE_RATIO * n.min():
             continue
         x, y = np.log(n), np.log(t.to_numpy(float))
@@ -556,14 +631,18 @@ def tabulate_in_time(report: Contents) -> Frame:
 
 
 def tabulate_sequences(report: Contents) -> Frame:
-    """Tabulate the time and iterations of all steps of each sequence, cold and with carried (warm) impulses."""
+    """Tabulate the time and iterations of all steps of each sequence, cold and with carried (warm) impulses.
+
+    The time to map impulses to the next step is apart from the times of the solves, as an engine stores impulses in
+    its contacts.
+    """
     runs = report.frame[(report.frame["step"] >= 0) & (report.frame["order"] == "given")].astype(
         {"start": str}
     )
     keys = ["sequence", "solver", "mode", "tol", "max_iter"]
     groups = runs.groupby([*keys, "start"], observed=True)
-    table = groups.agg(steps=("case", "size"), time=("time", "sum"), iterations=("iterations", "sum"),
-                       residual=("relative", "median")).unstack("start")  # fmt: skip
+    table = groups.agg(steps=("case", "size"), time=("time", "sum"), carry=("carry_time", "sum"),
+                       iterations=("iterations", "sum"), residual=("relative", "median")).unstack("start")  # fmt: skip
     out = table.index.to_frame(index=False)[["sequence", "solver"]].astype(str)
     out["target"] = [describe_target(*x[2:]) for x in table.index]
     for start in ("cold", "carried"):
@@ -571,17 +650,46 @@ def tabulate_sequences(report: Contents) -> Frame:
             if (name, start) in table:
                 out[f"{name}, {start}{unit}"] = table[name, start].to_numpy()
     if "time, carried [s]" in out and "time, cold [s]" in out:
+        out["carrying [s]"] = table["carry", "carried"].to_numpy()
         out["cold / carried"] = (out["time, cold [s]"] / out["time, carried [s]"]).round(2)
     return out
+
+
+def tabulate_sweeps(report: Contents) -> Frame:
+    """Tabulate the largest errors over the steps of each sequence after fixed numbers of sweeps, cold and carried.
+
+    The solvers are those with a sweep order. The velocity error is the judge's, of the worst row. The motion error is
+    the largest difference of a body's velocity from that of a solution, over about 20 steps of a sequence.
+    """
+    sweeps = [name for name, spec in registry.specs().items() if spec.order and name not in PLAIN_SWEEPS]
+    order = [*PLAIN_SWEEPS, *sorted(sweeps)]
+    runs = report.frame[(report.frame["mode"] == "budget") & (report.frame["step"] >= 0)]
+    runs = runs[(runs["order"] == "given") & runs["solver"].isin(order)]
+    if not len(runs):
+        return pd.DataFrame()
+    keys = ["sequence", "solver", "max_iter", "start"]
+    groups = runs.astype(dict.fromkeys(("sequence", "solver", "start"), str)).groupby(keys, sort=False)
+    largest = groups.agg(steps=("case", "size"), relative=("relative", "max"), velocity=("velocity", "max"),
+                         motion=("motion_error", "max"))  # fmt: skip
+    table = largest.unstack("start")
+    out = table.index.to_frame(index=False).rename(columns={"max_iter": "sweeps"})
+    columns = {"steps": "", "relative": "residual, {} [-]", "velocity": "velocity error, {} [m/s]",
+               "motion": "motion error, {} [m/s]"}  # fmt: skip
+    for name, head in columns.items():
+        for start in ("cold", "carried"):
+            if head and (name, start) in table:
+                out[head.format(start)] = table[name, start].to_numpy()
+    out["steps"] = table["steps"].max(axis=1).to_numpy()
+    return out.sort_values("solver", key=lambda solvers: solvers.map(order.index), kind="stable")
 
 
 def tabulate_engines(report: Contents) -> Frame:
     """Tabulate engines' own answers, and the fastest solver here on the same cases, to the middle tolerance."""
     target, rows = f"to {format_tolerance(report.tolerance)}", []
     for e in report.engines:
-        cases = [n for n, i in report.records.cases.items() if e.contains(i.source)]
-        ranking = rank_solvers(report.frame[report.frame["case"].isin(cases)], report.tolerance)
-        engine = e.rank(report.records, cases, report.tolerance)
+        cases = report.cases[[e.contains(source) for source in report.cases["source"]]]
+        ranking = rank_solvers(report.frame[report.frame["case"].isin(list(cases.index))], report.tolerance)
+        engine = e.rank(cases, report.tolerance)
         first = ranking.iloc[0] if len(ranking) and ranking["solved"].iloc[0] else None
         relative = e.lines["relative"]
         worst = e.lines.sort_values("velocity", na_position="first").iloc[-1]
@@ -634,6 +742,6 @@ def tabulate_idle(report: Contents) -> Frame:
     return idle[["case", "rows", "solver", "velocity", "energy"]].rename(columns=columns)
 
 
-def tabulate_skips(skips: Iterable[Skip]) -> Frame:
+def tabulate_skips(report: Contents) -> Frame:
     """Tabulate pairs of case and solver that did not run, or not to the end, with the reason."""
-    return pd.DataFrame([{"case": s.case, "solver": s.solver, "reason": s.reason} for s in skips])
+    return report.skips[["case", "solver", "reason"]]

@@ -9,10 +9,13 @@ collector is off.
 from __future__ import annotations
 
 import gc
+import json
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
+from statistics import median
 from time import perf_counter
 from typing import Any
 
@@ -26,7 +29,7 @@ from lavender.judge.solution import CONTRADICTED, Claim, Solution, Status, raise
 from lavender.problem import Problem
 from lavender.problem.ordering import SWEEP_ORDERS
 from lavender.report import machine
-from lavender.report.records import ERROR, CaseInfo, Record, make_measurement_key
+from lavender.report.store import ERROR, RUN_COLUMNS, Row
 from lavender.report.text import format_tolerance
 from lavender.solvers import registry
 from lavender.solvers.registry import SolverSpec
@@ -53,9 +56,8 @@ CARRIED_START = (
 class Task:
     """One measurement of a solver on a case.
 
-    If `guarded` is true, the first call has the time limit; without it no call has. `lead` [s] is the time that was
-    spent before the call to map the impulses of the previous step; it is added to the call's time. For the other
-    fields see `Record`.
+    If `guarded` is true, the first call has the time limit; without it no call has. `carry_time` [s] is the time that
+    was spent before the call to map the impulses of the previous step. For the other fields see the columns of runs.
     """
 
     run: str
@@ -72,29 +74,23 @@ class Task:
     repeats: int = 1
     step: int = -1
     guarded: bool = True
-    lead: float = 0.0
-
-    @property
-    def key(self) -> tuple[Any, ...]:
-        """The `Record.key` of the measurement."""
-        return make_measurement_key(self)
+    carry_time: float = math.nan
 
     @classmethod
     def of_case(
-        cls, info: CaseInfo, solver: str, mode: str, tol: float, max_iter: int, start: str, limit: float,
+        cls, case: Row, solver: str, mode: str, tol: float, max_iter: int, start: str, limit: float,
         repeats: int = 1, order: str = "given",
     ) -> Task:  # fmt: skip
         """Create the task of a solver on a case."""
         return cls(
-            info.run, info.case, info.sha, solver, mode, tol, max_iter, limit, start, order, repeats=repeats,
-            step=info.step,
+            case["run"], case["case"], case["sha"], solver, mode, tol, max_iter, limit, start, order, repeats=repeats,
+            step=case["step"],
         )  # fmt: skip
 
     @classmethod
-    def of_record(cls, record: Record, time_limit: float) -> Task:
-        """Create the task that measures the run of a record once more."""
-        shared = {name: getattr(record, name) for name in _SHARED}
-        return cls(**{**shared, "time_limit": time_limit})
+    def of_row(cls, row: Row, time_limit: float) -> Task:
+        """Create the task that measures the run of a row once more."""
+        return cls(**{**{name: row[name] for name in _SHARED}, "time_limit": time_limit})
 
     @property
     def arguments(self) -> dict[str, Any]:
@@ -104,12 +100,20 @@ class Task:
         order |= {"seed": int(seed)} if seed else {}
         return {**self.options, **order, "tol": self.tol, "max_iter": self.max_iter or None}
 
-    def make_record(self, **results: Any) -> Record:
-        """Create a record of this task with `results`."""
-        return Record(**{name: getattr(self, name) for name in _SHARED}, **results)
+    def make_row(self, times: Sequence[float] = (), **results: Any) -> Row:
+        """Return the row of this task with the times [s] of its repetitions and other results."""
+        shared = {"kind": "run", **{name: getattr(self, name) for name in _SHARED}}
+        return add_times(RUN_COLUMNS | shared | results, times)
 
 
-_SHARED = {f.name for f in fields(Task)} & {f.name for f in fields(Record)}
+_SHARED = tuple(f.name for f in fields(Task) if f.name in RUN_COLUMNS)
+
+
+def add_times(row: Row, times: Sequence[float]) -> Row:
+    """Return a row with the times [s] of its repetitions, their minimum, median and number."""
+    middle = median(times) if times else math.nan
+    return {**row, "times": list(times), "time": min(times, default=math.nan), "time_median": middle,
+            "repetitions": len(times)}  # fmt: skip
 
 
 def format_call(record: Any, guessed: bool = False) -> tuple[str, ...]:
@@ -171,26 +175,8 @@ def _stabilise_timing(solver: str) -> Iterator[None]:
             gc.enable()
 
 
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """Result of the repeats of one measurement, before it is judged."""
-
-    impulse: FloatArray  # (m,) [N s]
-    certificate: FloatArray | None  # (m,) Certificate of infeasibility, if the status is INFEASIBLE.
-    status: str
-    iterations: int
-    work: Mapping[str, int]
-    message: str
-    form: str
-    setup_time: float  # [s] Of the last repeat.
-    solve_time: float
-    times: tuple[float, ...]  # [s] Time of the call of each repeat.
-    calibration_time: float | None
-    status_conflict: str = ""
-
-
-def measure_task(problem: Problem, task: Task, impulse: Any = None) -> tuple[Record, FloatArray | None]:
-    """Make one measurement. An exception of the solver becomes a record of status ERROR.
+def measure_task(problem: Problem, task: Task, impulse: Any = None) -> tuple[Row, FloatArray | None]:
+    """Make one measurement. An exception of the solver becomes a row of status ERROR.
 
     Parameters
     ----------
@@ -201,7 +187,7 @@ def measure_task(problem: Problem, task: Task, impulse: Any = None) -> tuple[Rec
 
     Returns
     -------
-    Record, and the final impulses (m,) [N s] or None
+    Row, and the final impulses (m,) [N s] or None
 
     Raises
     ------
@@ -211,8 +197,12 @@ def measure_task(problem: Problem, task: Task, impulse: Any = None) -> tuple[Rec
     return judge_outcome(problem, task, run_task_or_return_error(problem, task, impulse))
 
 
-def run_task_or_return_error(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
-    """Run the solver of a task in this process. Return an exception as text."""
+def run_task_or_return_error(problem: Problem, task: Task, impulse: Any = None) -> Row | str:
+    """Run the solver of a task in this process. Return an exception as text.
+
+    Otherwise, return the impulse, the status and the other attributes of the last solution by name, with `times` [s] of
+    the repetitions and `calibration_time` [s]. Nothing of it is judged.
+    """
     times: list[float] = []
     calibration_times: list[float] = []
     try:
@@ -232,11 +222,11 @@ def run_task_or_return_error(problem: Problem, task: Task, impulse: Any = None) 
     except Exception as error:
         # A backend may raise any exception; only its own record is lost.
         return f"{type(error).__name__}: {error}".strip()
-    shared = {name: getattr(solution, name) for name in _OF_SOLUTION}
-    return Outcome(
-        **shared, status=solution.status.name, form=solution.solver.form, times=tuple(times),
-        calibration_time=min(calibration_times), status_conflict=solution.status_conflict[:500],
-    )  # fmt: skip
+    outcome = {name: getattr(solution, name) for name in _OF_SOLUTION}
+    return outcome | {
+        "status": solution.status.name, "form": solution.solver.form, "times": times,
+        "calibration_time": min(calibration_times), "status_conflict": solution.status_conflict[:500],
+    }  # fmt: skip
 
 
 #: Fields of an outcome that are attributes of a solution.
@@ -284,49 +274,49 @@ def _time_call(problem: Problem, task: Task, impulse: Any, limited: bool) -> tup
         fresh = copy_problem_into_new_arrays(problem, task.start)
         start_time = perf_counter()
         solution = solve(fresh, task.solver, **{**arguments, "max_iter": max_iter})
-        elapsed = perf_counter() - start_time + task.lead
+        elapsed = perf_counter() - start_time
         if raise_if_interrupted(solution).status is not Status.MAX_ITERATIONS:
             break
     return solution, elapsed
 
 
-def judge_outcome(problem: Problem, task: Task, outcome: Outcome | str) -> tuple[Record, FloatArray | None]:
-    """Judge an outcome on `problem`; return its record, and its impulses (m,) [N s] if they are finite."""
+def judge_outcome(problem: Problem, task: Task, outcome: Row | str) -> tuple[Row, FloatArray | None]:
+    """Judge an outcome on `problem`; return its row, and its impulses (m,) [N s] if they are finite."""
     if isinstance(outcome, str):
-        return task.make_record(status=ERROR, message=outcome[:500]), None
+        return task.make_row(status=ERROR, message=outcome[:500]), None
     solution = make_solution(problem, task, outcome)
     impulse = solution.impulse if np.isfinite(solution.impulse).all() else None
-    return make_record(problem, task, solution, outcome), impulse
+    return make_row(problem, task, solution, outcome), impulse
 
 
-def make_solution(problem: Problem, task: Task, outcome: Outcome) -> Solution:
+def make_solution(problem: Problem, task: Task, outcome: Row) -> Solution:
     """Judge an outcome on `problem` and return its solution."""
     claim = Claim(
-        Status[outcome.status], outcome.iterations, outcome.work, outcome.message, outcome.form,
-        certificate=outcome.certificate,
+        Status[outcome["status"]], outcome["iterations"], outcome["work"], outcome["message"], outcome["form"],
+        certificate=outcome["certificate"],
     )  # fmt: skip
     run = FinishedRun(
-        problem, registry.get(task.solver), dict(task.options), np.array(outcome.impulse), claim, tol=task.tol,
-        setup_time=outcome.setup_time, solve_time=outcome.solve_time,
-        refutation=outcome.status_conflict.removeprefix("says INFEASIBLE, "),
+        problem, registry.get(task.solver), dict(task.options), np.array(outcome["impulse"]), claim, tol=task.tol,
+        setup_time=outcome["setup_time"], solve_time=outcome["solve_time"],
+        refutation=outcome["status_conflict"].removeprefix("says INFEASIBLE, "),
     )  # fmt: skip
     return finish(run)
 
 
-def make_record(problem: Problem, task: Task, s: Solution, outcome: Outcome) -> Record:
-    """Return the record of a measurement; its last repeat returned the solution `s`."""
+def make_row(problem: Problem, task: Task, s: Solution, outcome: Row) -> Row:
+    """Return the row of a measurement; its last repeat returned the solution `s`."""
     r = s.residual
     is_false = s.claim_check == CONTRADICTED
     observed = explain_contradicted_claim(task.solver, problem, s.status) if is_false else ""
-    return task.make_record(
-        status=s.status.name, relative=float(r.relative), energy=float(r.energy), velocity=float(r.velocity),
-        roundoff_floor=float(r.roundoff_floor), worst_row=int(r.worst_row), worst_name=r.worst_name,
-        success=bool(s.success) and task.mode == "tol", claim_check=s.claim_check,
+    return task.make_row(
+        outcome["times"], status=s.status.name, relative=float(r.relative), energy=float(r.energy),
+        velocity=float(r.velocity), roundoff_floor=float(r.roundoff_floor), worst_row=int(r.worst_row),
+        worst_name=r.worst_name, success=bool(s.success) and task.mode == "tol", claim_check=s.claim_check,
         status_conflict="; ".join(filter(None, (s.status_conflict, observed))),
-        claims=s.status in CLAIM_STATUSES, iterations=int(s.iterations), work={k: int(v) for k, v in s.work.items()},
-        form=s.solver.form, message=s.message[:500], times=outcome.times, setup_time=outcome.setup_time,
-        solve_time=outcome.solve_time, calibration_time=outcome.calibration_time,
-        load=machine.count_runnable_processes(),
+        claims=s.status in CLAIM_STATUSES, iterations=int(s.iterations),
+        work=json.dumps({k: int(v) for k, v in s.work.items()}), form=s.solver.form, message=s.message[:500],
+        setup_time=outcome["setup_time"], solve_time=outcome["solve_time"],
+        calibration_time=outcome["calibration_time"], load=machine.count_runnable_processes(),
     )  # fmt: skip
 
 
@@ -413,9 +403,9 @@ class Plan:
             object.__setattr__(self, name, tuple(values))
 
     def measure_solver(
-        self, info: CaseInfo, problem: Problem, spec: SolverSpec, make: Callable[[Task], Record]
+        self, case: Row, problem: Problem, spec: SolverSpec, make: Callable[[Task], Row]
     ) -> None:
-        """Measure one solver on one case; each record decides the next measurement.
+        """Measure one solver on one case; each row decides the next measurement.
 
         Runs to a tolerance come first. An exact solver runs once, at the tightest tolerance; other solvers run at each
         tolerance, the loosest first. After a missed tolerance, a resumable solver does not run at tighter tolerances,
@@ -423,22 +413,22 @@ class Plan:
         budgets, then runs in other sweep orders at the middle budget.
         """
 
-        def measure_one(mode: str, tol: float, max_iter: int, start: str, order: str = "given") -> Record:
+        def measure_one(mode: str, tol: float, max_iter: int, start: str, order: str = "given") -> Row:
             """Make one measurement; a fixed number of iterations is timed once."""
             repeats = 1 if mode == "budget" else self.repeats
             return make(
-                Task.of_case(info, spec.name, mode, tol, max_iter, start, self.time_limit, repeats, order)
+                Task.of_case(case, spec.name, mode, tol, max_iter, start, self.time_limit, repeats, order)
             )
 
         starts = ["cold"]
-        if self.warm and info.guess == "start" and spec.impulse and not spec.exact:
+        if self.warm and case["guess"] == "start" and spec.impulse and not spec.exact:
             starts.append("warm")
         max_iterations = self.cap if spec.resumable else 0
         for start in starts:
             for tolerance in self.tolerances[-1:] if spec.exact else self.tolerances:
-                record = measure_one("tol", tolerance, max_iterations, start)
-                is_last = spec.resumable or _rules_out_tighter_tolerances(record)
-                if is_last and not record.relative <= tolerance:
+                row = measure_one("tol", tolerance, max_iterations, start)
+                is_last = spec.resumable or _rules_out_tighter_tolerances(row)
+                if is_last and not row["relative"] <= tolerance:
                     break
             if spec.resumable and not spec.exact:
                 for n in self.budgets:
@@ -477,6 +467,6 @@ def list_passes(plan: Plan, spec: SolverSpec) -> list[tuple[str, float, int, str
     return [(*target, start) for start in starts for target in targets]
 
 
-def _rules_out_tighter_tolerances(record: Record) -> bool:
+def _rules_out_tighter_tolerances(row: Row) -> bool:
     """Whether a run that missed its tolerance shows that tighter tolerances cannot be reached either."""
-    return record.status.startswith(("TIME_LIMIT", "KILLED", "ERROR", "INFEASIBLE", "CRASHED"))
+    return str(row["status"]).startswith(("TIME_LIMIT", "KILLED", "ERROR", "INFEASIBLE", "CRASHED"))

@@ -15,7 +15,6 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import fields, replace
 from functools import cache
 from multiprocessing import resource_tracker
 from typing import Any
@@ -29,8 +28,8 @@ from lavender.judge.solution import Solution, Status
 from lavender.problem import Problem
 from lavender.report.cases import hash_problem
 from lavender.report.machine import get_memory_per_process
-from lavender.report.records import CRASHED, ERROR, KILLED, Record, parse_fields, to_jsonable
-from lavender.report.timing import Outcome, Task, judge_outcome, make_solution, run_task_or_return_error
+from lavender.report.store import CRASHED, ERROR, KILLED, Row, to_jsonable
+from lavender.report.timing import Task, judge_outcome, make_solution, run_task_or_return_error
 from lavender.solvers import registry
 from lavender.solving.limits import check_time_limit
 from lavender.solving.prepared import Prepared
@@ -41,7 +40,7 @@ CONNECT_TIMEOUT = 10.0  # [s] Time for a scheduler to answer.
 PARENT_CHECK_INTERVAL = 0.5  # [s] Time between two checks of a worker that its parent still runs.
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 ORPHAN_CPU_TIME = 60.0  # [s] A worker without a parent is killed this CPU time after its task's limit.
-OUTCOME_ARRAYS = ("impulse", "certificate")  # Fields of `Outcome`, in the order in which they are sent.
+OUTCOME_ARRAYS = ("impulse", "certificate")  # Arrays of an outcome, in the order in which they are sent.
 DIED_MESSAGE = "its code ended its process; report this to its authors, and use another solver"
 GRACE_TIME = 2.0  # [s] Time for set-up and judging beyond the repetitions' limits, before a worker is killed.
 
@@ -204,12 +203,12 @@ class Worker:
 
     def measure_task(
         self, problem: Problem, task: Task, impulse: Any = None
-    ) -> tuple[Record, FloatArray | None]:
+    ) -> tuple[Row, FloatArray | None]:
         """Make one measurement in the worker; equivalent to `lavender.report.timing.measure_task`."""
         try:
             return judge_outcome(problem, task, self._run_task(problem, task, impulse))
         except TaskFailed as failure:
-            return task.make_record(status=failure.status, message=failure.text), None
+            return task.make_row(status=failure.status, message=failure.text), None
 
     def solve(self, problem: Problem, task: Task) -> Solution:
         """Return the solution of a task, judged in this process.
@@ -224,7 +223,7 @@ class Worker:
             raise TaskFailed(ERROR, outcome)
         return make_solution(problem, task, outcome)
 
-    def _run_task(self, problem: Problem, task: Task, impulse: Any) -> Outcome | str:
+    def _run_task(self, problem: Problem, task: Task, impulse: Any) -> Row | str:
         """Return the outcome of a task, or the text of the exception that the solver raised."""
         process = self._process
         if not process.is_alive:
@@ -246,7 +245,7 @@ class Worker:
             )
             elapsed = time.monotonic() - start_time
             self._problem_hash = task.sha
-            return parse_outcome(answer, arrays, problem.m, elapsed, task.lead)
+            return parse_outcome(answer, arrays, problem.m, elapsed)
         except TimeoutError:
             raise TaskFailed(KILLED, f"did not stop; its process was killed after {limit:.3g} s") from None
         except ProcessEnded as error:
@@ -311,51 +310,52 @@ def run_task(problem: Problem | None, task: Task, impulse: Any) -> subprocesses.
     outcome = run_task_or_return_error(_problem, task, impulse)
     if isinstance(outcome, str):
         return {"error": outcome[: subprocesses.MAX_ERROR_LENGTH]}, ()
-    message, form = (str(x)[: subprocesses.MAX_ERROR_LENGTH] for x in (outcome.message, outcome.form))
-    outcome = replace(outcome, message=message, form=form)
-    answer = {
-        f.name: to_jsonable(getattr(outcome, f.name)) for f in fields(outcome) if f.name not in OUTCOME_ARRAYS
-    }
-    return answer, [getattr(outcome, name) for name in OUTCOME_ARRAYS]
+    for name in ("message", "form"):
+        outcome[name] = str(outcome[name])[: subprocesses.MAX_ERROR_LENGTH]
+    arrays = [outcome.pop(name) for name in OUTCOME_ARRAYS]
+    return to_jsonable(outcome), arrays
 
 
-def parse_outcome(
-    answer: dict[str, Any], arrays: list[Any], m: int, elapsed: float, lead: float = 0.0
-) -> Outcome:
+def _is_count(value: Any) -> bool:
+    """Return whether a value is a 64-bit integer that is not negative."""
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**63
+
+
+#: Test of each entry of an outcome but its arrays, as another process sends it; times are tested later.
+OUTCOME_TESTS: dict[str, Callable[[Any], bool]] = {
+    "status": lambda v: isinstance(v, str) and v in Status.__members__,
+    "iterations": _is_count,
+    "work": lambda v: isinstance(v, dict) and all(map(_is_count, v.values())),
+    **dict.fromkeys(("message", "form", "status_conflict"), lambda v: isinstance(v, str)),
+    **dict.fromkeys(("setup_time", "solve_time", "calibration_time"), lambda v: isinstance(v, (int, float))),
+    "times": lambda v: isinstance(v, list) and bool(v) and all(isinstance(t, (int, float)) for t in v),
+}
+
+
+def parse_outcome(answer: Row, arrays: list[Any], m: int, elapsed: float) -> Row:
     """Check every part of an answer and return its outcome.
 
-    Parameters
-    ----------
-    elapsed : float, s
-        Time that the call took, measured here.
-    lead : float, s
-        `Task.lead`: time that is included in each of `Outcome.times` but passed in this process before the call.
+    `elapsed` [s] is the time that the call took, measured here.
 
     Raises
     ------
     ValueError
         The answer has other fields, counts or sizes, or times longer than `elapsed`.
     """
-    values = parse_fields(Outcome, answer)
-    if values.get("status") not in Status.__members__:
-        raise ValueError(
-            f"the status is {values.get('status')!r:.60}; one of {', '.join(Status.__members__)} is needed"
-        )
+    for name, is_valid in OUTCOME_TESTS.items():
+        if not is_valid(answer.get(name)):
+            raise ValueError(f"{name} is {answer.get(name)!r:.60}")
     if len(arrays) != 2 or arrays[0] is None or any(x is not None and len(x) != m for x in arrays):
         sizes = ["none" if x is None else str(len(x)) for x in arrays]
         raise ValueError(
             f"the worker returned {len(arrays)} arrays with numbers of entries {', '.join(sizes)}; two arrays are "
             f"needed: {m} impulses, and {m} impulses or none"
         )
-    try:
-        outcome = Outcome(*arrays, **values)
-    except TypeError as error:
-        raise ValueError(str(error)) from None
-    times = [outcome.setup_time, outcome.solve_time, *(t - lead for t in outcome.times)]
-    if not outcome.times or not all(0.0 <= t <= elapsed for t in times):
+    times = [answer["setup_time"], answer["solve_time"], *answer["times"]]
+    if not all(0.0 <= t <= elapsed for t in times):
         raise ValueError(
-            f"the worker returned no times, negative times, or times longer than the call of {elapsed:.3g} s"
+            f"the worker returned negative times, or times longer than the call of {elapsed:.3g} s"
         )
-    if math.fsum(times[2:]) > elapsed or (outcome.calibration_time or 0.0) > elapsed:
+    if math.fsum(times[2:]) > elapsed or not 0.0 <= answer["calibration_time"] <= elapsed:
         raise ValueError(f"the worker returned times that add up to more than the call of {elapsed:.3g} s")
-    return outcome
+    return {name: answer[name] for name in OUTCOME_TESTS} | dict(zip(OUTCOME_ARRAYS, arrays, strict=True))

@@ -21,6 +21,7 @@ from lavender import cli, io, report, suite
 from lavender import export as export
 from lavender.cli import measuring
 from lavender.report import Event
+from lavender.report.store import select_cases, select_skips
 from lavender.suite import steps
 
 
@@ -91,7 +92,7 @@ def test_records_are_shown_again_with_some_solvers(lavender, path, tmp_path):
     page = (tmp_path / "again" / "tables" / "times.csv").read_text(encoding="utf-8")
     assert code == 0 and "newton" not in out + page
     assert "jacobi" in page and "pgs" in page
-    assert len(report.read(records)) > len(report.read(records).select_solvers(["pgs"])) > 0  # the file keeps all
+    assert set(report.select_runs(report.read(records))["solver"]) == {"jacobi", "newton", "pgs"}  # The file keeps all.
     code, _, err = lavender("report", records, "--solvers", "nncg", *again)
     assert code == cli.EXIT_BAD_INPUT
     assert "no records of solver 'nncg'; there are records of jacobi, newton, pgs" in err
@@ -106,10 +107,9 @@ def test_lists_take_commas_or_blanks_and_files_may_follow(lavender, path, tmp_pa
         "--repeats", 1, "--no-figures", "--out", tmp_path / "out",
     )  # fmt: skip
     assert code == 0
-    records = report.read(tmp_path / "out")
-    assert {r.solver for r in records} == {"pgs", "jacobi"}
-    assert {r.max_iter for r in records if r.mode == "budget"} == {3, 5}
-    assert {r.order for r in records} == {"given", "reverse"}
+    runs = report.select_runs(report.read(tmp_path / "out"))
+    assert set(runs["solver"]) == {"pgs", "jacobi"} and set(runs["order"]) == {"given", "reverse"}
+    assert set(runs.loc[runs["mode"] == "budget", "max_iter"]) == {3, 5}
 
 
 def test_a_file_of_a_folder_that_cannot_be_read_is_named_and_costs_itself_alone(lavender, path):
@@ -199,7 +199,7 @@ def test_report_stopped_by_a_signal_keeps_records_and_writes_the_page(stop, tmp_
     assert b"continues from here" in printed
     assert (out / "index.html").exists()
     kept = [json.loads(line) for line in records.read_text().splitlines()]
-    assert any(r["kind"] == "record" and r["case"] == "easy" for r in kept)
+    assert any(r["kind"] == "run" and r["case"] == "easy" for r in kept)
 
 
 def test_campaigns_put_together_are_one(lavender, tmp_path):
@@ -252,11 +252,11 @@ def test_report_repeated_reuses_the_runs_of_the_first(lavender, path, tmp_path):
     assert "By structure" not in out
     code, out, _ = lavender(*words, "--tables")
     assert "By structure" in out
-    n = len(report.read(tmp_path / "out"))
+    n = len(report.select_runs(report.read(tmp_path / "out")))
     assert f"{n} of {n} runs of 20" in out
     code, out, _ = lavender(*words, "--no-reuse")
     assert "reused" not in out
-    assert len(report.read(tmp_path / "out")) == n  # Each replaces the earlier one.
+    assert len(report.select_runs(report.read(tmp_path / "out"))) == n  # Each replaces the earlier one.
 
 
 WORKER = """
@@ -296,8 +296,8 @@ def test_models_of_one_file_name_are_kept_apart(lavender, tmp_path):
     words = ("--steps", 20, "--record-every", 5, *quick, "--out", tmp_path / "o")
     models = [tmp_path / name / "scene.xml" for name in ("h1", "g1")]
     assert lavender("report", *models, *words)[0] == 0
-    found = report.read(tmp_path / "o")
-    rows = {info.sequence: info.rows for info in found.cases.values()}
+    cases = select_cases(report.read(tmp_path / "o"))
+    rows = dict(zip(cases["sequence"], cases["rows"], strict=True))
     assert set(rows) == {"h1-scene", "g1-scene"}
     assert rows["h1-scene"] > rows["g1-scene"]  # a box has more contacts than a sphere
     folders = {p.name for p in (tmp_path / "o" / "recorded").iterdir()}
@@ -323,11 +323,13 @@ def test_steps_that_could_not_be_recorded_are_counted(lavender, tmp_path, monkey
     model = (tmp_path / "box.xml", "--steps", 45)
     for _ in range(2):  # recorded, and found recorded
         code, out, _ = lavender("report", *model, *more, *shown)
-        (name,) = {info.sequence for info in report.read(tmp_path / "o").cases.values()}
+        lines = report.read(tmp_path / "o")
+        (name,) = set(select_cases(lines)["sequence"])
         assert code == cli.EXIT_UNMET and f"steps of {name} (3 left out)" in " ".join(out.split())
         assert "step 15 is of another <problem>" in " ".join(out.split())
-        skips = [s for s in report.read(tmp_path / "o").skips if "of another" in s.reason]
-        assert [(s.sequence, s.solver) for s in skips] == [(name, "")] * 3
+        skips = select_skips(lines)
+        skips = skips[skips["reason"].str.contains("of another")]
+        assert skips[["sequence", "solver"]].to_numpy().tolist() == [[name, ""]] * 3
     assert lavender("report", tmp_path / "o" / "records.jsonl", *shown)[0] == 0  # shown again
     (folder,) = (tmp_path / "o" / "recorded").iterdir()
     code, out, _ = lavender("report", folder, "--solvers", "pgs", "--workers", 1, "--out", tmp_path / "c")

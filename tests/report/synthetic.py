@@ -1,51 +1,70 @@
-"""Records that nothing solved, and a report of them in which every part of a page has something to show."""
+"""Rows that nothing solved, and a report of them in which every part of a page has something to show."""
 
-import dataclasses
 import io
 import json
 
 from rich.console import Console
 
-from lavender.report import CaseInfo, Record, Records, Report, Run, Skip
+from lavender.report import Report
 from lavender.report.findings import print_report
+from lavender.report.store import CASE_COLUMNS, CASE_DETAILS, RUN_COLUMNS, make_lines
 from lavender.report.tables import read_engine_answers
+from lavender.report.timing import add_times
 
 TOLERANCES = (1e-3, 1e-6)
 FALSE_CLAIM = {"claim_check": "contradicted", "status_conflict": "says CONVERGED"}
 BUDGET = {"mode": "budget", "tol": 0.0, "max_iter": 8, "status": "MAX_ITERATIONS", "claims": False,
-          "work": {"sweeps": 8}, "iterations": 8}  # fmt: skip
+          "work": '{"sweeps": 8}', "iterations": 8}  # fmt: skip
 EVIL = '</script><script>alert("x")</script>&|'
 
 
-def info(case, law="lcp", structure=("stack",), **more):
-    made = CaseInfo("run", case, case, "sha" + case, law, 8, 8, 0, 0, 22, 1.0, structure, True, "a reason")
-    return dataclasses.replace(made, **more)
-
-
 def record(case, solver, time, relative, **more):
-    """A record of three repetitions, the smallest of which took `time`."""
+    """The row of a run of three repetitions, the smallest of which took `time`."""
     values = {
-        "run": "run", "case": case, "sha": "sha" + case, "solver": solver, "start": "cold", "mode": "tol",
-        "tol": 1e-6, "max_iter": 0, "time_limit": 2.0, "relative": relative, "energy": relative, "velocity": relative,
-        "roundoff_floor": 1e-15, "status": "CONVERGED", "claims": True, "times": (1.02 * time, time, 1.04 * time),
-        "success": relative <= more.get("tol", 1e-6), "calibration_time": 1e-4,
+        "kind": "run", "run": "run", "case": case, "sha": "sha" + case, "solver": solver, "tol": 1e-6,
+        "time_limit": 2.0, "relative": relative, "energy": relative, "velocity": relative, "roundoff_floor": 1e-15,
+        "status": "CONVERGED", "claims": True, "success": relative <= more.get("tol", 1e-6), "calibration_time": 1e-4,
     }  # fmt: skip
-    return Record(**(values | more))
+    times = more.pop("times", (1.02 * time, time, 1.04 * time))
+    return add_times(RUN_COLUMNS | values | more, times)
 
 
-def records_of(*made, structure=None, law=None, rows=None, whole=True):
-    found = Records()
-    plan = {"tolerances": list(TOLERANCES), "solvers": sorted({r.solver for r in made})}
-    found.add(
-        Run("run", "2026-01-01", "0.1", "3.11", "linux", "a cpu", 2, 1, {"numpy": "2"}, plan, whole=whole)
-    )
-    for case in dict.fromkeys(r.case for r in made):
-        words = (structure or {}).get(case, ("stack",))
-        more = {"rows": rows[case]} if rows else {}
-        found.add(info(case, (law or {}).get(case, "lcp"), words, **more))
-    for r in made:
-        found.add(r)
-    return found
+def skip(case, solver, reason, sequence=""):
+    return {
+        "kind": "skip",
+        "run": "run",
+        "case": case,
+        "solver": solver,
+        "reason": reason,
+        "sequence": sequence,
+    }
+
+
+def lines_of(*made, cases=None, whole=True, solvers=None, walk=False, more=()):
+    """Lines with a machine, the cases of the runs `made` with the facts `cases`, and `more` rows.
+
+    With `walk`, all cases called walk[STEP] are steps of one sequence.
+    """
+    plan = {"tolerances": list(TOLERANCES), "solvers": solvers or sorted({r["solver"] for r in made})}
+    machine = {
+        "kind": "machine", "run": "run", "started": "2026-01-01", "lavender": "0.1", "python": "3.11",
+        "platform": "linux", "cpu": "a cpu", "cores": 2, "threads": 1, "versions": {"numpy": "2"}, "plan": plan,
+        "build": {}, "load": None, "whole": whole,
+    }  # fmt: skip
+    rows = [machine]
+    for case in dict.fromkeys(r["case"] for r in made):
+        facts = {
+            "kind": "case", "run": "run", "case": case, "source": case, "sha": "sha" + case, "law": "lcp", "rows": 8,
+            "blocks": 8, "structure": "stack", "mass_ratio": 1.0, "reason": "a reason",
+        }  # fmt: skip
+        if walk and case.startswith("walk"):
+            facts |= {"sequence": "walk", "step": int(case[5:-1])}
+        rows.append(CASE_DETAILS | CASE_COLUMNS | facts | (cases or {}).get(case, {}))
+    return make_lines([*rows, *made, *more])
+
+
+def report_of(*made, **more):
+    return Report(lines_of(*made, **more))
 
 
 def shown(report, width=200, **more):
@@ -77,22 +96,16 @@ def example(folder):
             steps = {"start": start, "step": step}
             made.append(record(f"walk[{step}]", "pgs", 1e-3, left, **steps, **BUDGET))
             made.append(record(f"walk[{step}]", "auto", 2e-3 if start == "cold" else 1e-3, 1e-8, **steps))
-    found = records_of(*made, structure={EVIL: ("stack", "friction")}, law={EVIL: "coulomb"})
-    source = str(folder / "pile.npz")
-    change = {
-        "pile": {"source": source, "stored": 1e-4, "diagnostics": ("duplicate rows: two of <3>",)},
-        EVIL: {"source": "chains/one.npz", "guess": "answer"},
-        "idle": {"nothing_to_do": True},
-        **{f"walk[{k}]": {"sequence": "walk", "step": k, "structure": ("chain",)} for k in range(2)},
-    }
-    for case, values in change.items():
-        found.add(dataclasses.replace(found.cases[case], **values))
-    found.add(Skip("run", "torn", "", "did not load: torn: it is <empty>"))
-    found.add(Skip("run", "walk 3", "", "did not load: of another problem", sequence="walk"))
-    found.add(Skip("run", "pile", "sor", "takes laws linear"))
+    facts = {
+        "pile": {"source": str(folder / "pile.npz"), "stored": 1e-4, "diagnostics": ["duplicate rows: two of <3>"]},
+        EVIL: {"source": "chains/one.npz", "guess": "answer", "structure": "stack, friction", "law": "coulomb"},
+        "idle": {"nothing_to_do": True}, **{f"walk[{k}]": {"structure": "chain"} for k in range(2)},
+    }  # fmt: skip
+    skips = [skip("torn", "", "did not load: torn: it is <empty>"), skip("pile", "sor", "takes laws linear"),
+             skip("walk 3", "", "did not load: of another problem", "walk")]  # fmt: skip
+    lines = lines_of(*made, cases=facts, walk=True, more=skips)
     answer = {"file": "pile.npz", "rows": 8, "seconds": 5e-4, "relative": 1e-7, "solver": "NEWTON", "verdict": "wrong",
               "velocity": 0.1, "worst": "contact 2"}  # fmt: skip
     (folder / "engine.jsonl").write_text(json.dumps(answer) + "\n" + json.dumps({"left_out": 1}) + "\n")
-    old = records_of(record("pile", "auto", 0.3e-3, 1e-9), record("pile", "pgs", 1.0, 1e-1))
-    old.source = "earlier.jsonl"
-    return Report(found, old, [2e-4, 4e-3], read_engine_answers([], found))
+    old = lines_of(record("pile", "auto", 0.3e-3, 1e-9), record("pile", "pgs", 1.0, 1e-1))
+    return Report(lines, old, [2e-4, 4e-3], read_engine_answers([], lines))

@@ -1,7 +1,6 @@
 """Terminal, page, files and figures of one report in which every part has something to show."""
 
 import csv
-import dataclasses
 import html.parser
 import io
 import json
@@ -14,7 +13,7 @@ import pytest
 from rich.console import Console
 from worked import python
 
-from lavender.report import Report, Skip, write
+from lavender.report import write
 from lavender.report.figures import (
     PLUG_IN_COLORS,
     SOLVER_COLORS,
@@ -35,7 +34,7 @@ from lavender.report.render import (
     render_page,
     write_files,
 )
-from tests.report.synthetic import EVIL, FALSE_CLAIM, example, record, records_of, shown
+from tests.report.synthetic import EVIL, FALSE_CLAIM, example, record, report_of, shown, skip
 
 
 class Page(html.parser.HTMLParser):
@@ -134,12 +133,14 @@ def test_terminal_short_report_has_25_lines_within_the_width(cases, width):
         for j in range(8):
             more = {**FALSE_CLAIM, "status_conflict": "says CONVERGED " * 9} if j > 5 else {"load": 9.0}
             made.append(record(name, f"solver_{j}", 1e-3 * (1 + j), 1e-7, **more))
-    found = records_of(*made, structure={name: (f"structure {i}",) for i, name in enumerate(names)})
-    for name in names:
-        found.add(dataclasses.replace(found.cases[name], diagnostics=("something looks wrong",)))
-        found.add(Skip("run", name + "b", "", "did not load: " + "x" * 100))
-        found.add(Skip("run", name, "newton", "takes laws linear"))
-    lines = shown(Report(found), width).splitlines()
+    facts = {
+        name: {"structure": f"structure {i}", "diagnostics": ["something looks wrong"]}
+        for i, name in enumerate(names)
+    }
+    skips = [skip(name, "newton", "takes laws linear") for name in names]
+    skips += [skip(name + "b", "", "did not load: " + "x" * 100) for name in names]
+    report = report_of(*made, cases=facts, more=skips)
+    lines = shown(report, width).splitlines()
     assert len(lines) + COMMAND_LINES <= (
         MAX_LINES if width > 40 else 60
     )  # A sentence takes the lines that it needs.
@@ -192,7 +193,7 @@ def test_render_svg_has_texts_gaps_and_names_of_every_kind():
 def test_build_overall_figure_is_the_median_of_the_residuals_reached_by_each_time():
     made = [record(c, "pgs", t, x) for c, t, x in (("a", 1e-3, 1e-2), ("b", 1e-2, 1e-4), ("c", 1e-1, 1e-6))]
     made.append(record("a", "some", 1e-3, 1e-8))
-    figure = build_overall_figure(Report(records_of(*made)))
+    figure = build_overall_figure(report_of(*made))
     assert figure.title == "Error against time, median over 3 cases"
     by = {c.solver: c for c in figure.curves}
     # Two of three cases have a result from 10 ms on; the median is then the worse of the two.
@@ -244,27 +245,24 @@ def test_pandas_is_not_imported_by_a_solve(command):
 @pytest.mark.nightly
 @pytest.mark.skipif(sys.platform == "win32", reason="the peak of memory is read by the resource module")
 def test_report_of_100000_runs_needs_less_than_500_mb(tmp_path):
-    code = f"""import json, resource
-from pathlib import Path
-from lavender.report.records import to_json
-from tests.report.synthetic import record, records_of
-made = [record(f"c{{i}}", "auto", 1e-3, 1e-8) for i in range(1000)]
-found = records_of(*made)
-path = Path({str(tmp_path / "records.jsonl")!r})
-with path.open("w") as f:
-    for e in (*found.runs.values(), *found.cases.values()):
-        f.write(json.dumps(to_json(e)) + "\\n")
-    line = to_json(made[0])
+    code = f"""import json
+from lavender.report.store import to_jsonable
+from tests.report.synthetic import lines_of, record
+made = record("c0", "auto", 1e-3, 1e-8)
+cases = [record(f"c{{i}}", "auto", 1e-3, 1e-8) for i in range(1000)]
+with open({str(tmp_path / "records.jsonl")!r}, "w") as f:
+    for row in lines_of(*cases).iloc[:1001].to_dict("records"):
+        f.write(json.dumps(to_jsonable({{k: v for k, v in row.items() if v == v}})) + "\\n")
     for i in range(100_000):
         change = {{"case": f"c{{i % 1000}}", "sha": f"shac{{i % 1000}}", "solver": f"s{{i // 1000 % 20}}"}}
-        f.write(json.dumps(line | change | {{"tol": 10.0 ** -(1 + i // 20_000)}}) + "\\n")
+        f.write(json.dumps(to_jsonable(made | change | {{"tol": 10.0 ** -(1 + i // 20_000)}})) + "\\n")
 """
     python("-c", code)
     code = f"""import resource
 from lavender.report import Report, read, write
-found = read({str(tmp_path / "records.jsonl")!r})
-write(found, {str(tmp_path / "out")!r})
-print(len(found), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"""
+lines = read({str(tmp_path / "records.jsonl")!r})
+write(lines, {str(tmp_path / "out")!r})
+print(len(Report(lines).runs), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"""
     count, peak = map(int, python("-c", code).stdout.split())
     assert count == 100_000 and peak < 500 * 1024  # [KiB] on Linux
     assert re.search(r"auto|s\d+", (tmp_path / "out" / "tables" / "structures.csv").read_text())

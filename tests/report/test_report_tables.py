@@ -1,6 +1,5 @@
 """Tables and sentences of a report, from records that nothing solved."""
 
-import dataclasses
 import json
 import math
 
@@ -14,11 +13,12 @@ from lavender.report.recommendation import recommend
 from lavender.report.render import format_cells, format_markdown, list_number_heads
 from lavender.report.tables import read_engine_answers
 from lavender.report.text import format_percent
-from tests.report.synthetic import BUDGET, FALSE_CLAIM, record, records_of, shown
+from lavender.report.timing import add_times
+from tests.report.synthetic import BUDGET, FALSE_CLAIM, lines_of, record, report_of, shown
 
 
 def rank(*made, tolerance=1e-6, **more):
-    return tables.rank_solvers(Report(records_of(*made, **more)).frame, tolerance)
+    return tables.rank_solvers(report_of(*made, **more).frame, tolerance)
 
 
 def test_get_times_loose_tolerance_and_budgets_do_not_count():
@@ -27,7 +27,7 @@ def test_get_times_loose_tolerance_and_budgets_do_not_count():
         record("a", "pgs", 3e-5, 1e-7),
         record("a", "pgs", 1e-6, 1e-9, **BUDGET),
     ]
-    frame = Report(records_of(*made)).frame
+    frame = report_of(*made).frame
     assert tables.get_times(frame, 1e-6).loc["pgs", "a"] == 3e-5
     assert tables.get_times(frame, 1e-3).loc["pgs", "a"] == 1e-5
     assert math.isnan(tables.get_times(frame, 1e-9).loc["pgs", "a"])
@@ -50,7 +50,7 @@ def test_rank_solvers_solved_cases_come_before_time_and_false_claims_last():
 def test_rank_solvers_times_within_noise_are_ties_with_auto_first(ratio, first):
     """The repetitions of these records differ by 2 %, so noise is the minimum of 5 % or twice 2 %, plus the shift."""
     made = [x for c in "ab" for x in (record(c, "direct", 1.0, 1e-8), record(c, "auto", ratio, 1e-8))]
-    noisy = [dataclasses.replace(r, times=(r.time, 1.04 * r.time, 1.08 * r.time)) for r in made]
+    noisy = [add_times(r, [x * r["time"] for x in (1.0, 1.04, 1.08)]) for r in made]
     ranking = rank(*noisy)
     assert ranking.index[0] == first
     assert list(ranking["tie"]) == ([True, True] if first == "auto" else [True, False])
@@ -68,11 +68,9 @@ def test_rank_solvers_another_solver_changes_no_mean():
 
 def test_group_cases_by_structure_words_laws_and_sequences_are_groups():
     made = [record(c, "pgs", 1.0, 1e-8) for c in ("a", "b", "c", "walk[0]")]
-    words = {"a": ("stack",), "b": ("stack", "redundant"), "c": ("pile", "friction")}
-    found = records_of(*made, structure=words, law={"b": "coulomb", "c": "coulomb"})
-    found.add(dataclasses.replace(found.cases["walk[0]"], sequence="walk", step=0))
-    groups = Report(found).structures
-    assert groups == {
+    facts = {"b": {"structure": "stack, redundant", "law": "coulomb"},
+             "c": {"structure": "pile, friction", "law": "coulomb"}}  # fmt: skip
+    assert report_of(*made, cases=facts, walk=True).structures == {
         "stack, coulomb / redundant": ["b"], "stack, lcp": ["a"], "pile / friction": ["c"], "sequence walk": ["walk[0]"]
     }  # fmt: skip
 
@@ -80,7 +78,7 @@ def test_group_cases_by_structure_words_laws_and_sequences_are_groups():
 def test_tabulate_fastest_names_solver_share_ties_and_time():
     made = [record(c, s, t, 1e-8) for c in "ab" for s, t in (("newton", 1.0), ("auto", 1.001), ("pgs", 3.0))]
     made.append(record("c", "pgs", 1.0, 0.5))
-    table = tables.tabulate_fastest(Report(records_of(*made)))
+    table = tables.tabulate_fastest(report_of(*made))
     (row,) = table.to_dict("records")
     assert (row["structure"], row["cases"]) == ("stack", 3)
     assert row["to 1e-6"] == "auto (2/3) ≈ newton"
@@ -91,7 +89,7 @@ def test_tabulate_costs_exponent_of_a_power_law_is_fitted():
     rows = {f"c{n}": n for n in (10, 30, 100, 300, 1000)}
     made = [record(c, "pgs", 1e-6 * n**1.5, 1e-8) for c, n in rows.items()]
     made += [record(c, "few", 1e-6, 1e-8) for c in list(rows)[:3]]
-    table = tables.tabulate_costs(Report(records_of(*made, rows=rows)))
+    table = tables.tabulate_costs(report_of(*made, cases={c: {"rows": n} for c, n in rows.items()}))
     assert list(table["solver"]) == ["pgs"]  # Three cases are too few for a fit.
     (row,) = table.to_dict("records")
     assert (row["exponent of rows"], row["cases"], row["rows"], row["scatter [factor]"]) == (
@@ -107,7 +105,7 @@ def test_tabulate_claims_counts_contradicted_claims_and_deaths():
     made = [record("a", "pgs", 1.0, 1e-8), record("b", "pgs", 1.0, 0.5, **FALSE_CLAIM)]
     made.append(record("c", "pgs", 1.0, math.inf, status="KILLED", claims=False))
     made.append(record("c", "pgs", 1.0, 0.1, **BUDGET))
-    (row,) = tables.tabulate_claims(Report(records_of(*made))).to_dict("records")
+    (row,) = tables.tabulate_claims(report_of(*made)).to_dict("records")
     assert row == {
         "solver": "pgs", "runs": 4, "correct rate [%]": 50.0, "claims": 2, "contradicted": 1, "to a tolerance": 3,
         "reached": 1, "died": 1,
@@ -120,7 +118,7 @@ def test_tabulate_claims_counts_contradicted_claims_and_deaths():
 )
 def test_tabulate_claims_rounds_rates_and_keeps_0_and_100_for_exact_ones(runs, false, rate):
     made = [record(f"c{i}", "pgs", 1.0, 1e-8, **(FALSE_CLAIM if i < false else {})) for i in range(runs)]
-    assert list(tables.tabulate_claims(Report(records_of(*made)))["correct rate [%]"]) == [rate]
+    assert list(tables.tabulate_claims(report_of(*made))["correct rate [%]"]) == [rate]
 
 
 @pytest.mark.parametrize(
@@ -141,71 +139,96 @@ def test_tabulate_failures_lists_misses_above_the_floor_with_their_reason():
         record("a", "missed", 1.0, 1e-2, message="slow"), record("a", "liar", 1.0, 0.5, **FALSE_CLAIM),
         record("a", "proved", 1.0, 1.0, status="INFEASIBLE"), record("a", "budget", 1.0, 0.5, **BUDGET),
     ]  # fmt: skip
-    table = tables.tabulate_failures(Report(records_of(*made)))
+    table = tables.tabulate_failures(report_of(*made))
     assert dict(zip(table["solver"], table["reason"], strict=True)) == {
         "missed": "slow",
         "liar": "✗ says CONVERGED. ",
     }
 
 
-def test_tabulate_sequences_compares_cold_with_carried():
+def test_tabulate_sequences_compares_cold_with_carried_and_carrying_apart():
     made = []
     for step in range(4):
-        for start, t in (("cold", 2e-3), ("carried", 1e-3)):
-            made.append(record(f"walk[{step}]", "auto", t, 1e-8, start=start, step=step, iterations=3))
-    found = records_of(*made)
-    for step in range(4):
-        found.add(dataclasses.replace(found.cases[f"walk[{step}]"], sequence="walk", step=step))
-    report = Report(found)
-    (row,) = tables.tabulate_sequences(report).to_dict("records")
+        for start, t, carry in (("cold", 2e-3, math.nan), ("carried", 1e-3, 3e-4)):
+            more = {"start": start, "step": step, "iterations": 3, "carry_time": carry}
+            made.append(record(f"walk[{step}]", "auto", t, 1e-8, **more))
+    (row,) = tables.tabulate_sequences(report_of(*made, walk=True)).to_dict("records")
     assert (row["sequence"], row["steps, cold"], row["iterations, carried"]) == ("walk", 4, 12)
     assert row["time, cold [s]"] == pytest.approx(8e-3) and row["cold / carried"] == 2.0
+    assert row["carrying [s]"] == pytest.approx(1.2e-3)
+
+
+def sweep(step, start, n, velocity, solver="pgs", **more):
+    more = {"step": step, "start": start, "velocity": velocity, **more}
+    return record(f"walk[{step}]", solver, 1e-5, 10.0 * velocity, **{**BUDGET, "max_iter": n, **more})
+
+
+def test_recommend_sweeps_is_the_smallest_number_that_keeps_every_step_below_the_limit(tmp_path):
+    """The limit is 1 mm/s; three steps, of which the second is the hardest."""
+    errors = {("cold", 8): 3e-3, ("cold", 16): 9e-4, ("carried", 8): 9e-4, ("carried", 4): 1.1e-3}
+    made = [sweep(i, start, n, v if i == 1 else 1e-5, motion_error=2 * v) for (start, n), v in errors.items()
+            for i in range(3)]  # fmt: skip
+    made += [sweep(i, "carried", 2, 1e-6, "anderson") for i in range(3)]  # accelerated: only in the table
+    made += [sweep(0, "carried", 2, 1e-6, "sequential_impulses")]  # one step of three
+    lines = lines_of(*made, walk=True, cases={"walk[1]": {"source": str(tmp_path / "b.npz")}})
+    answer = {
+        "file": "b.npz",
+        "rows": 3,
+        "relative": 0.1,
+        "velocity": 2.5e-3,
+        "iterations": 8,
+        "solver": "PGS",
+    }
+    (tmp_path / "engine.jsonl").write_text(json.dumps(answer))
+    report = Report(lines, engines=read_engine_answers([], lines))
+    assert recommend(report)[0].text == (
+        "walk: 8 sweeps of pgs with warm starts keep every velocity error below 1 mm/s (9.0e-4 m/s; cold: 16 of pgs); "
+        "the engine's own 8 iterations (PGS): 2.5e-3 m/s."
+    )
+    table = tables.tabulate_sweeps(report).set_index(["solver", "sweeps"])
+    assert list(dict.fromkeys(table.index.get_level_values(0))) == ["sequential_impulses", "pgs", "anderson"]
+    row = table.loc["pgs", 8]
+    assert (row["velocity error, cold [m/s]"], row["velocity error, carried [m/s]"]) == (3e-3, 9e-4)
+    assert (row["residual, carried [-]"], row["motion error, cold [m/s]"], row["steps"]) == (9e-3, 6e-3, 3)
+    assert "8 sweeps of pgs" in shown(report, 80).splitlines()[0]
+    (statement,) = recommend(report_of(*made[:3], *made[9:12], walk=True))
+    assert (
+        "no measured number of sweeps keeps" in statement.text
+        and "1.1e-3 m/s, after 4 sweeps" in statement.text
+    )
 
 
 @pytest.mark.parametrize(("changes", "count"), [({}, 0), ({"iterations": 2}, 3), ({"solution_hash": "x"}, 3)])
 def test_recommend_counts_the_solves_that_a_carried_start_changed(changes, count):
     made = [record(f"walk[{k}]", "auto", 2e-3, 1e-8, step=k, iterations=3) for k in range(4)]
     made += [
-        dataclasses.replace(r, start="carried", times=(1e-3,), **(changes if r.step else {})) for r in made
+        add_times({**r, "start": "carried", "carry_time": 2e-5, **(changes if r["step"] else {})}, [1e-3])
+        for r in made
     ]
-    found = records_of(*made)
-    for step in range(4):
-        found.add(dataclasses.replace(found.cases[f"walk[{step}]"], sequence="walk", step=step))
-    assert recommend(Report(found))[0].text.startswith(
+    assert recommend(report_of(*made, walk=True))[0].text.startswith(
         "Use auto: it solves the 4 steps of walk in 1.00 ms on average, with the impulses of the previous recorded "
-        f"step as start (it changed {count} of 4 solves), down to"
+        f"step as start (mapping them takes 20.0 µs a step, not included; it changed {count} of 4 solves), down to"
     )
 
 
 def test_tabulate_in_time_counts_late_runs_as_misses():
     made = [record(c, "late", 1.0, 1e-9) for c in "ab"] + [record(c, "early", 1e-3, 1e-2) for c in "ab"]
-    (row,) = tables.tabulate_in_time(Report(records_of(*made), times=[1e-2])).to_dict("records")
+    (row,) = tables.tabulate_in_time(Report(lines_of(*made), times=[1e-2])).to_dict("records")
     assert (row["in 10.0 ms"], row["residual in 10.0 ms [-]"]) == ("early", 1e-2)
-    (row,) = tables.tabulate_in_time(Report(records_of(*made[:2]), times=[1e-2])).to_dict("records")
+    (row,) = tables.tabulate_in_time(Report(lines_of(*made[:2]), times=[1e-2])).to_dict("records")
     assert row["in 10.0 ms"] == "none"
 
 
 def test_tabulate_budgets_has_median_and_90th_percentile():
     made = [record(f"c{i}", "pgs", 1.0, x, **BUDGET) for i, x in enumerate(np.linspace(0.1, 1.0, 10))]
-    (row,) = tables.tabulate_budgets(Report(records_of(*made))).to_dict("records")
+    (row,) = tables.tabulate_budgets(report_of(*made)).to_dict("records")
     assert row["8 iterations, median [-]"] == pytest.approx(
         0.55
     )  # Between 0.5 and 0.6, as pandas interpolates.
     assert row["8 iterations, 90 % [-]"] == pytest.approx(0.91)
     made += [record(f"d{i}", "pgs", 1.0, np.inf, **BUDGET) for i in range(5)]
-    (row,) = tables.tabulate_budgets(Report(records_of(*made))).to_dict("records")
+    (row,) = tables.tabulate_budgets(report_of(*made)).to_dict("records")
     assert row["8 iterations, median [-]"] == pytest.approx(0.8) and row["8 iterations, 90 % [-]"] == np.inf
-
-
-def walk(*made, whole=True, solvers=None):
-    """Records of which all cases are steps of the sequence `walk`."""
-    found = records_of(*made, whole=whole)
-    for name, case in list(found.cases.items()):
-        found.add(dataclasses.replace(case, sequence="walk", step=int(name[5:-1])))
-    if solvers:
-        run = next(iter(found.runs.values()))
-        found.add(dataclasses.replace(run, plan={**run.plan, "solvers": solvers}))
-    return found
 
 
 def step_record(step, solver, relative, **more):
@@ -216,7 +239,7 @@ def test_recommend_steps_after_the_time_limit_of_a_pass_are_not_reached_and_have
     made = [step_record(i, "pgs", 1e-8) for i in range(3)] + [step_record(3, "pgs", 0.25)]
     made += [step_record(i, "pgs", 0.5, **BUDGET) for i in range(6)]
     made += [step_record(i, "pgs", 5e-4, tol=1e-3) for i in range(6)]
-    text = recommend(Report(walk(*made)))[0].text
+    text = recommend(report_of(*made, walk=True))[0].text
     assert "solves 3 of the 6 steps of walk" in text and "It misses walk[3] (residual 2.5e-1)." in text
     assert "Not reached within the time of a pass (--sequence-time-limit): 2 steps." in text
     assert "walk[4]" not in text and "walk[5]" not in text
@@ -227,11 +250,11 @@ def test_stopped_sequence_shows_finished_solvers_then_finished_passes():
     made = [step_record(i, "auto", 1e-8) for i in range(4)] + [
         step_record(i, "pgs", 0.5, **BUDGET) for i in range(4)
     ]
-    report = Report(walk(*made, whole=False, solvers=solvers))
+    report = report_of(*made, walk=True, whole=False, solvers=solvers)
     assert set(report.frame["solver"]) == {"auto"} and report.unfinished == ["pgs", "nncg"]
     assert "Stopped: auto solves the 4 steps of walk" in recommend(report)[0].text
     assert "Not measured to the end: pgs, nncg." in recommend(report)[0].text
-    report = Report(walk(*made[4:], step_record(0, "pgs", 1e-3), whole=False, solvers=solvers))
+    report = report_of(*made[4:], step_record(0, "pgs", 1e-3), walk=True, whole=False, solvers=solvers)
     assert (
         report.has_passes_only and len(report.frame) == 4 and set(report.sections) >= {"budgets", "sequences"}
     )
@@ -239,11 +262,7 @@ def test_stopped_sequence_shows_finished_solvers_then_finished_passes():
     assert "8 iterations" in shown(report)
     # A later sequence that is not finished changes nothing for cases on which all solvers were measured.
     cases = [record("a", s, 1e-3, 1e-8) for s in solvers]
-    found = records_of(*cases, *made, whole=False)
-    for name, case in list(found.cases.items()):
-        if name != "a":
-            found.add(dataclasses.replace(case, sequence="walk", step=int(name[5:-1])))
-    report = Report(found)
+    report = report_of(*cases, *made, walk=True, whole=False)
     assert set(report.frame["case"]) == {"a"} and report.unfinished == []
 
 
@@ -258,9 +277,9 @@ def test_stopped_sequence_shows_finished_solvers_then_finished_passes():
     ],
 )
 def test_tabulate_changes_names_changes_beyond_noise_and_drift(now, drift, change):
-    old = records_of(record("a", "pgs", 1e-3, 1e-8))
+    old = lines_of(record("a", "pgs", 1e-3, 1e-8))
     residual = 1e-2 if now is None else 1e-8
-    new = records_of(record("a", "pgs", now or 1e-3, residual, calibration_time=1e-4 * drift))
+    new = lines_of(record("a", "pgs", now or 1e-3, residual, calibration_time=1e-4 * drift))
     table = tables.tabulate_changes(Report(new, old))
     assert list(table["change"]) == [change] if change else "change" not in table
     assert list(table["compared"]) == [1]
@@ -272,35 +291,33 @@ def test_tabulate_changes_names_changes_beyond_noise_and_drift(now, drift, chang
 def test_recommend_names_worst_case_ties_misses_and_the_call():
     made = [record(c, s, t, 1e-8) for c in "abc" for s, t in (("auto", 1e-3), ("direct", 1.0001e-3))]
     made += [record("d", s, 1.0, 1e-2) for s in ("auto", "direct")]
-    (statement,) = recommend(Report(records_of(*made)))
+    (statement,) = recommend(report_of(*made))
     assert statement.text == (
         "Use auto: it solves 3 of your 4 stacks in 1.00 ms on average, cold, down to 1e-6 of the error of the zero "
         "impulse. As fast within the noise of the repetitions: direct (1.00 ms). It misses d (residual 1.0e-2)."
     )
     assert statement.call_line == 'lv.solve(problem, "auto", tol=1e-6)'
     slow = [record(c, "pgs", t, 1e-8) for c, t in (("a", 1e-4), ("b", 1e-4), ("c", 1e-1))]
-    assert "in 1.06 ms on average (100 ms at worst, c), cold" in recommend(Report(records_of(*slow)))[0].text
+    assert "in 1.06 ms on average (100 ms at worst, c), cold" in recommend(report_of(*slow))[0].text
 
 
 def test_recommend_stopped_run_counts_completely_measured_problems_only():
     made = [record(c, s, 1e-3, 1e-8) for c in "ab" for s in ("auto", "pgs")] + [
         record("c", "auto", 1e-3, 1e-8)
     ]
-    (statement,) = recommend(Report(records_of(*made, whole=False)))
+    (statement,) = recommend(report_of(*made, whole=False))
     assert statement.text.startswith(
         "Stopped: auto solves the 2 problems measured so far in 1.00 ms on average"
     )
-    (statement,) = recommend(Report(records_of(record("a", "auto", 1.0, 1.0), whole=False)))
+    (statement,) = recommend(report_of(record("a", "auto", 1.0, 1.0), whole=False))
     assert statement.text.startswith("Stopped: no solver brings the 1 problem measured so far")
-    found = records_of(*made[-1:], whole=False)
-    run = next(iter(found.runs.values()))
-    found.add(dataclasses.replace(run, plan={**run.plan, "solvers": ["auto", "pgs"]}))
-    assert recommend(Report(found))[0].text == "Stopped: no problem was measured with every solver."
+    report = report_of(*made[-1:], whole=False, solvers=["auto", "pgs"])
+    assert recommend(report)[0].text == "Stopped: no problem was measured with every solver."
 
 
 def test_recommend_plug_ins_are_named_with_place_and_time():
     made = [record("a", s, t, 1e-8) for s, t in (("auto", 1e-3), ("mine", 2e-3), ("other", 3e-3))]
-    text = recommend(Report(records_of(*made)))[0].text
+    text = recommend(report_of(*made))[0].text
     assert "Plug-in mine: place 2 of 3, 1 of 1 solved in 2.00 ms; other: place 3 of 3" in text
 
 
@@ -329,10 +346,9 @@ def test_recommend_engine_is_ranked_by_the_same_rule(tmp_path, answers, first):
     made = [
         record(f"c{i}", s, t * (1 + i), 1e-8) for i in range(2) for s, t in (("auto", 4e-5), ("pgs", 5e-4))
     ]
-    found = records_of(*made)
-    for i in range(2):
-        found.add(dataclasses.replace(found.cases[f"c{i}"], source=str(tmp_path / f"step_{i}.npz")))
-    report = Report(found, engines=read_engine_answers([], found))
+    facts = {f"c{i}": {"source": str(tmp_path / f"step_{i}.npz")} for i in range(2)}
+    lines = lines_of(*made, cases=facts)
+    report = Report(lines, engines=read_engine_answers([], lines))
     text = recommend(report)[0].text
     assert text.startswith("First is the engine's own Newton") == first
     solved = sum(x <= 1e-6 for _, x in answers)
@@ -375,7 +391,7 @@ def test_tables_of_200_cases_of_which_few_are_solved_are_complete():
         for i in range(200)
         for s in ("auto", "pgs")
     ]
-    report = Report(records_of(*made))
+    report = report_of(*made)
     assert len(report.sections["runs"].frames[0]) == 400
     assert report.sections["runs"].frames[0]["to 1e-3 [s]"].notna().sum() == 6
     assert len(report.sections["failures"].frames[0]) == 394

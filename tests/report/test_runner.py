@@ -20,7 +20,15 @@ from worked import python
 import lavender as lv
 from lavender import report, suite
 from lavender.report import cases, machine, runner, store, timing, workers
-from lavender.report.records import from_json, to_json
+from lavender.report.store import (
+    KEY,
+    RUN_COLUMNS,
+    make_lines,
+    select_cases,
+    select_runs,
+    select_skips,
+    to_jsonable,
+)
 from lavender.report.timing import format_call
 
 QUICK = report.Plan(tolerances=(1e-3, 1e-8), budgets=(2, 5), repeats=2, time_limit=60.0, orders=("reverse",))
@@ -29,8 +37,22 @@ NAMES = [*(f"random_spd(n=12, condition=100, seed={i})" for i in range(3)), *SEE
 CAMPAIGN = report.CampaignPlan(tolerances=(1e-3, 1e-6), budgets=(4, 8), orders=("random:1",))
 
 
-def lines(entries):
-    return [json.dumps(to_json(r)) for r in entries]
+def rows_of(lines):
+    """The runs of some lines as named tuples."""
+    return list(select_runs(lines).itertuples(index=False))
+
+
+def keys_of(lines):
+    return [(*(getattr(r, name) for name in KEY), r.relative) for r in rows_of(lines)]
+
+
+def skipped(lines):
+    return sorted(zip(select_skips(lines)["case"], select_skips(lines)["solver"], strict=True))
+
+
+def texts(lines):
+    """All columns of the runs as texts: nan equals nan, and no digit is lost."""
+    return list(map(str, select_runs(lines).drop(columns="started").itertuples(index=False)))
 
 
 # -- what is measured --------------------------------------------------------------------------------------
@@ -38,29 +60,24 @@ def lines(entries):
 
 def test_run_records_have_the_judged_result_of_each_target_and_its_times():
     p = stack(12)
-    found = report.run([p], ["pgs"], QUICK)
+    lines = report.run([p], ["pgs"], QUICK)
+    found = rows_of(lines)
     assert [(r.mode, r.tol, r.max_iter, r.order) for r in found] == [
         ("tol", 1e-3, 10_000_000, "given"), ("tol", 1e-8, 10_000_000, "given"),
         ("budget", 0.0, 2, "given"), ("budget", 0.0, 5, "given"), ("budget", 0.0, 5, "reverse"),
     ]  # fmt: skip
     for r in found:
         again = lv.solve(p, "pgs", tol=r.tol, max_iter=r.max_iter, order=r.order)
-        expected = (
-            again.residual.relative,
-            again.residual.energy,
-            again.residual.velocity,
+        error = again.residual
+        assert (r.relative, r.energy, r.velocity) == (error.relative, error.energy, error.velocity)
+        assert (r.status, r.worst_row, json.loads(r.work)) == (
             again.status.name,
-        )
-        assert (r.relative, r.energy, r.velocity, r.status) == expected
-        assert (r.worst_row, dict(r.work), r.success) == (
-            again.residual.worst_row,
+            error.worst_row,
             dict(again.work),
-            r.mode == "tol",
         )
-        assert 1 <= len(r.times) <= (1 if r.mode == "budget" else 2)
-        assert 0.0 < r.setup_time + r.solve_time <= max(r.times)
-    assert found.cases["stack"].structure == ("stack",) and found.cases["stack"].islands == 1
-    assert list(found.frame["time"]) == [r.time for r in found]
+        assert r.success == (r.mode == "tol") and 1 <= r.repetitions <= (1 if r.mode == "budget" else 2)
+        assert 0.0 < r.time <= r.time_median and r.setup_time + r.solve_time > 0.0
+        assert (r.structure, r.islands, r.rows) == ("stack", 1, 12)
 
 
 def test_run_timed_call_is_the_printed_line(monkeypatch):
@@ -74,10 +91,11 @@ def test_run_timed_call_is_the_printed_line(monkeypatch):
     monkeypatch.setattr(timing, "LONG_TIME", math.inf)
     plan = report.Plan(tolerances=(1.23456e-6,), budgets=(4,), repeats=2)
     found = report.run([stack(6, guess=np.ones(6))], ["pgs"], plan)
-    assert len(calls) == sum(len(r.times) for r in found) == 6
+    found = rows_of(found)
+    assert len(calls) == sum(r.repetitions for r in found) == 6
     for r in found:
         names = {"lv": lv, "problem": stack(6, guess=np.ones(6)), "dataclasses": dataclasses}
-        del calls[: len(r.times) - 1]  # Only the first call of a task has a time limit.
+        del calls[: r.repetitions - 1]  # Only the first call of a task has a time limit.
         solver, asked, guess = calls.pop(0)
         exec("\n".join(format_call(r, True)[:-1]), names)
         line = eval(format_call(r, True)[-1].replace("lv.solve(problem, ", "dict(solver="), {"dict": dict})
@@ -91,13 +109,13 @@ def test_run_near_best_solvers_are_timed_again_and_kept(tmp_path):
     plan = report.Plan(tolerances=(1e-6,), budgets=(), repeats=2)
     path = tmp_path / "records.jsonl"
     found = report.run([stack(6)], ["auto", "direct", "pgs"], plan, path)
-    first = min(found, key=lambda r: r.time)
-    near = [r for r in found if r.time <= runner.NEAR_TIME_RATIO * first.time]
-    assert len(near) < 2 or max(len(r.times) for r in near) == 5
+    best = min(r.time for r in rows_of(found))
+    near = [r for r in rows_of(found) if r.time <= runner.NEAR_TIME_RATIO * best]
+    assert len(near) < 2 or max(r.repetitions for r in near) == 5
     events = []
     again = report.run([stack(6)], ["auto", "direct", "pgs"], plan, path, watch=events.append)
-    assert lines(again) == lines(found) == lines(report.read(path))
-    assert all(e.reused for e in events if e.record is not None)
+    assert texts(again) == texts(found) == texts(report.read(path))
+    assert all(e.reused for e in events if e.row is not None)
 
 
 def test_run_answer_as_guess_is_not_a_start(tmp_path):
@@ -106,17 +124,18 @@ def test_run_answer_as_guess_is_not_a_start(tmp_path):
     for early in (False, True):
         guess = (0.99 if early else 1.0) * answer
         p.updated(guess=guess).save(tmp_path / "step.npz", impulse=guess if early else None)
-        found = report.run([tmp_path / "step.npz"], ["pgs"], QUICK)
-        assert {r.start for r in found} == {"cold"} and found.cases["step"].guess == "answer"
+        lines = report.run([tmp_path / "step.npz"], ["pgs"], QUICK)
+        found = rows_of(lines)
+        assert {r.start for r in found} == {"cold"} and select_cases(lines).loc["step", "guess"] == "answer"
         assert all(r.iterations > 5 for r in found if r.mode == "tol" and r.tol == 1e-8)
     warm = report.run([p.updated(guess=0.99 * answer)], ["pgs"], QUICK)
-    assert {r.start for r in warm} == {"cold", "warm"}
+    assert {r.start for r in rows_of(warm)} == {"cold", "warm"}
 
 
 def test_run_exact_solvers_run_once_and_hopeless_tolerances_are_left_out():
-    assert [(r.tol, r.success) for r in report.run([stack(8)], ["direct"], QUICK)] == [(1e-8, True)]
+    assert [(r.tol, r.success) for r in rows_of(report.run([stack(8)], ["direct"], QUICK))] == [(1e-8, True)]
     impossible = lv.Problem.lcp(np.array([[1.0, -1.0], [-1.0, 1.0]]), np.array([1.0, 1.0]), name="impossible")
-    assert [r.tol for r in report.run([impossible], ["pgs"], QUICK) if r.mode == "tol"] == [1e-3]
+    assert [r.tol for r in rows_of(report.run([impossible], ["pgs"], QUICK)) if r.mode == "tol"] == [1e-3]
 
 
 def test_run_solver_that_raises_costs_its_own_record(plug_in):
@@ -132,12 +151,11 @@ def test_run_solver_that_raises_costs_its_own_record(plug_in):
     found = report.run(
         [stack(4, "one"), stack(5, "two")], ["fake_raise", "fake_nan", "fake_lie", "pgs"], QUICK
     )
+    found = rows_of(found)
     by = {(r.case, r.solver): r for r in found}
     for case in ("one", "two"):
-        assert (by[case, "fake_raise"].status, by[case, "fake_raise"].message) == (
-            "ERROR",
-            "RuntimeError: of the backend",
-        )
+        failed = by[case, "fake_raise"]
+        assert (failed.status, failed.message) == ("ERROR", "RuntimeError: of the backend")
         assert (by[case, "fake_nan"].status, by[case, "fake_nan"].relative) == ("NUMERICAL_ERROR", 1.0)
         assert by[case, "fake_lie"].claim_check == "contradicted"
         assert by[case, "pgs"].status == "MAX_ITERATIONS"  # the last: a budget
@@ -157,7 +175,7 @@ def test_run_plug_in_that_tests_nothing_is_timed_with_its_default_budget(registe
     laws = {"coulomb", "lcp", "linear", "cone"}
     register(lv.SolverSpec("untested", Untested, laws=laws, summary="of a test", max_iter=200))
     plan = report.Plan(tolerances=(1e-3,), budgets=(), repeats=1)
-    (record,) = report.run([stack(2)], ["untested"], plan)
+    (record,) = rows_of(report.run([stack(2)], ["untested"], plan))
     assert (record.status, record.iterations) == ("CONVERGED", 200)
     assert format_call(record) == ('lv.solve(problem, "untested", tol=1e-3)',)
 
@@ -165,11 +183,11 @@ def test_run_plug_in_that_tests_nothing_is_timed_with_its_default_budget(registe
 def test_run_solver_of_free_rows_is_replaced_by_its_bounded_variant():
     free = lv.Problem.linear(np.diag([2.0, 3.0]), np.ones(2), name="free")
     found = report.run([stack(4), free], ["gauss_seidel"], QUICK)
-    assert {(r.case, r.solver) for r in found} == {("stack", "pgs"), ("free", "gauss_seidel")}
-    (moved,) = found.skips
-    assert moved.reason.startswith("gauss_seidel → pgs: takes laws linear, not 'lcp'")
+    assert {(r.case, r.solver) for r in rows_of(found)} == {("stack", "pgs"), ("free", "gauss_seidel")}
+    (reason,) = select_skips(found)["reason"]
+    assert reason.startswith("gauss_seidel → pgs: takes laws linear, not 'lcp'")
     both = report.run([stack(4)], ["gauss_seidel", "pgs"], QUICK)  # measured once if both are named
-    assert [r.key for r in both] == [r.key for r in report.run([stack(4)], ["pgs"], QUICK)]
+    assert keys_of(both) == keys_of(report.run([stack(4)], ["pgs"], QUICK))
 
 
 @pytest.mark.parametrize(
@@ -201,20 +219,20 @@ with limit_to_one_thread():
 # -- on disk -----------------------------------------------------------------------------------------------
 
 
-def test_store_has_each_record_when_it_is_made(tmp_path):
+def test_store_has_each_row_when_it_is_made(tmp_path):
     path, seen = tmp_path / "records.jsonl", []
 
     def watch(event):
-        if event.record is not None:
-            seen.append(from_json(json.loads(path.read_text().splitlines()[-1])) == event.record)
+        if event.row is not None:
+            seen.append(json.loads(path.read_text().splitlines()[-1]) == to_jsonable(event.row))
 
     found = report.run(
         [stack(6)], ["pgs", "direct"], dataclasses.replace(QUICK, repeats=1), path, watch=watch
     )
-    assert seen == [True] * len(found) and lines(report.read(path)) == lines(found)
+    assert seen == [True] * len(rows_of(found)) and texts(report.read(path)) == texts(found)
     # Files of an editor that marks UTF-8, put together: the mark is before each part.
     path.write_bytes(2 * (b"\xef\xbb\xbf" + path.read_bytes()))
-    assert lines(report.read(path)) == lines(found)
+    assert texts(report.read(path)) == texts(found)
 
 
 SEQUENCE = (report.make_sequence(moving_stack(5), "load"), ["pgs"], report.Plan((), budgets=(6,), repeats=1))
@@ -237,19 +255,24 @@ def test_run_killed_at_any_byte_continues(given, first, later, tmp_path):
         """Measure with n workers; return the records, and the number of records that were made now."""
         events.clear()
         found = report.run(*given, path, workers=n, watch=events.append)
-        return found, sum(e.record is not None and not e.reused for e in events)
+        return found, sum(e.row is not None and not e.reused for e in events)
 
     whole, made = measure(first)
     content = path.read_bytes()
     for cut in np.random.default_rng(0).integers(len(content) // 8, len(content) - 2, 3):
         path.write_bytes(content[:cut])
-        kept = len(report.read(path))
+        read = report.read(path)
+        assert read.attrs["dropped"] == (content[cut - 1 : cut] != b"\n")
+        kept = len(rows_of(read))
         again, more = measure(later)
-        assert [(r.key, r.relative) for r in again] == [(r.key, r.relative) for r in whole]
-        assert {(s.case, s.solver) for s in again.skips} == {(s.case, s.solver) for s in whole.skips}
-        assert kept + more >= len(whole) == len(report.read(path)) and more <= made
+        assert keys_of(again) == keys_of(whole) and skipped(again) == skipped(whole)
+        assert kept + more >= len(rows_of(whole)) == len(rows_of(report.read(path))) and more <= made
     again, more = measure(later)
-    assert len(again) == len(whole) == len(report.read(path)) and more == 0
+    assert (
+        keys_of(again) == keys_of(whole)
+        and len(rows_of(report.read(path))) == len(rows_of(whole))
+        and more == 0
+    )
 
 
 def test_run_process_killed_at_random_times_loses_nothing(tmp_path):
@@ -269,18 +292,22 @@ report.run({SEEDED[:6]}, ["pgs", "nncg"], plan, {str(path)!r})"""
         assert len(report.read(path)) >= 0
     python("-c", code)
     fresh = report.run(SEEDED[:6], ["pgs", "nncg"], report.Plan((1e-6,), budgets=(4, 8), repeats=1))
-    assert [(r.key, r.relative) for r in report.read(path)] == [(r.key, r.relative) for r in fresh]
+    assert keys_of(report.read(path)) == keys_of(fresh)
 
 
 def test_run_other_version_or_cpu_is_another_run(tmp_path, monkeypatch):
     path = tmp_path / "records.jsonl"
     first = report.run([stack(5)], ["direct"], QUICK, path)
-    ids = {r.run for r in first}
+    ids = {r.run for r in rows_of(first)}
     for name, value in (("__version__", "99"), ("get_cpu_name", lambda: "another")):
         monkeypatch.setattr(machine, name, value)
-        ids |= {r.run for r in report.run([stack(5)], ["direct"], QUICK, path)}
-    assert len(ids) == 3 and len(report.read(path)) == 3 * len(first)
-    assert len(report.read(path).latest_frame) == len(first)
+        ids |= {r.run for r in rows_of(report.run([stack(5)], ["direct"], QUICK, path))}
+    found = report.Report(report.read(path))
+    assert (
+        len(ids) == 3
+        and len(found.runs) == 3 * len(rows_of(first))
+        and len(found.newest) == len(rows_of(first))
+    )
 
 
 def test_run_ctrl_c_keeps_the_records_that_were_made(tmp_path, plug_in):
@@ -291,7 +318,8 @@ def test_run_ctrl_c_keeps_the_records_that_were_made(tmp_path, plug_in):
     path, into = tmp_path / "records.jsonl", []
     with pytest.raises(KeyboardInterrupt):
         report.run([stack(5)], ["pgs", "fake_interrupt", "direct"], QUICK, path, into=into)
-    assert {r.solver for r in report.read(path)} == {"pgs"} and lines(into[0]) == lines(report.read(path))
+    assert {r.solver for r in rows_of(report.read(path))} == {"pgs"}
+    assert texts(make_lines(into)) == texts(report.read(path))
     assert report.Report(report.read(path)).is_stopped
     report.run([stack(5)], ["pgs", "direct"], QUICK, path)
     assert not report.Report(report.read(path)).is_stopped
@@ -305,7 +333,7 @@ def test_store_removed_file_is_an_error(tmp_path, monkeypatch):
     with report.Store("sub/records.jsonl") as opened:
 
         def watch(event):
-            if event.solver == "direct" and event.record is None:
+            if event.solver == "direct" and event.row is None:
                 (tmp_path / "sub" / "records.jsonl").unlink()
 
         monkeypatch.chdir("/")  # A relative name refers to the folder in which it was given.
@@ -313,29 +341,33 @@ def test_store_removed_file_is_an_error(tmp_path, monkeypatch):
             report.run([stack(5)], ["pgs", "direct"], QUICK, opened, watch=watch)
 
 
-def test_frame_and_csv_have_a_row_for_each_run(tmp_path):
+def test_write_csv_has_a_row_for_each_run(tmp_path):
     found = report.run([stack(6), chain(4, guess=np.ones(4))], ["pgs", "direct"], QUICK)
     report.write(found, tmp_path, figures=False)
     with (tmp_path / "records.csv").open(newline="") as f:
         rows = list(csv.DictReader(f))
-    assert len(rows) == len(found) == len(found.frame)
-    for row, r in zip(rows, found, strict=True):
+    for row, r in zip(rows, rows_of(found), strict=True):
         assert (float(row["relative"]), float(row["time"]), row["cpu"]) == (
             r.relative,
             r.time,
             machine.get_cpu_name(),
         )
-        assert json.loads(row["work"]) == dict(r.work) and int(row["rows"]) == found.cases[r.case].rows
+        assert json.loads(row["work"]) == json.loads(r.work) and int(row["rows"]) == r.rows > 0
     assert f"numpy {np.__version__}" in rows[0]["versions"]
     with pytest.raises(lv.InputError, match="no records of solver 'nncg'; there are records of direct, pgs"):
-        found.select_solvers(["nncg"])
+        store.select_solvers(found, ["nncg"])
 
 
-def test_json_infinite_and_undefined_numbers_are_kept():
-    r = report.Record("r", "c", "s", "x", "cold", "tol", 1e-3, 1, 1.0, status="ERROR", message="é\n")
-    back = from_json(json.loads(json.dumps(to_json(r), allow_nan=False)))
+def test_read_infinite_and_undefined_numbers_are_kept_to_the_last_bit(tmp_path):
+    row = RUN_COLUMNS | {"kind": "run", "run": "r", "case": "stack", "tol": 0.1 + 0.2, "message": "é\n",
+                         "max_iter": 10_000_000, "worst_name": "a\n"}  # fmt: skip
+    case = cases.describe_case(report.resolve_sources([stack(5)])[0], "r")
+    with report.Store(tmp_path / "records.jsonl") as opened:
+        for entry in ({**machine.describe_run({}), "run": "r"}, case, row):
+            opened.add(entry)
+    (back,) = rows_of(report.read(tmp_path))
     assert back.relative == math.inf and math.isnan(back.time) and math.isnan(back.roundoff_floor)
-    assert (back.message, back.key) == ("é\n", r.key)
+    assert (back.message, back.tol, back.max_iter, back.worst_name) == ("é\n", 0.1 + 0.2, 10_000_000, "a\\n")
 
 
 # -- sequences ---------------------------------------------------------------------------------------------
@@ -345,11 +377,14 @@ def test_run_sequence_carries_each_solvers_own_impulses():
     problems = moving_stack(5)
     plan = report.Plan(tolerances=(1e-6,), budgets=(6,), repeats=1)
     found = report.run(report.make_sequence(problems, "load"), ["pgs"], plan)
+    found = rows_of(found)
     impulse, by = problems[0].start(), {(r.start, r.mode, r.step): r for r in found}
     for i, p in enumerate(problems):
         carried = lv.solve(p, "pgs", impulse=impulse, tol=0.0, max_iter=6)
         impulse = carried.impulse
-        assert by["carried", "budget", i].relative == carried.residual.relative
+        r = by["carried", "budget", i]
+        assert r.relative == carried.residual.relative and r.carry_time > 0.0
+        assert r.motion_error == lv.motion_error(p, impulse).rows
         cold = lv.solve(p, "pgs", impulse=p.start(), tol=0.0, max_iter=6)
         assert by["cold", "budget", i].relative == cold.residual.relative
     assert len(found) == 5 * 4
@@ -362,18 +397,19 @@ def test_run_sequence_pass_ends_at_its_time_limit_with_a_note(tmp_path, monkeypa
     # No solve takes less than a picosecond: each pass ends after its first step.
     plan = report.Plan(tolerances=(), budgets=(6,), repeats=1, sequence_time_limit=1e-12)
     found = report.run(items, ["pgs"], plan, tmp_path / "records.jsonl")
-    assert [(r.step, r.start) for r in found] == [(0, "cold"), (0, "carried")]
-    assert [s.case for s in found.skips] == ["load, 6 iterations, cold", "load, 6 iterations, carried"]
-    assert all("after 1 of 5 steps" in s.reason for s in found.skips)
+    assert [(r.step, r.start) for r in rows_of(found)] == [(0, "cold"), (0, "carried")]
+    skips = select_skips(found)
+    assert list(skips["case"]) == ["load, 6 iterations, cold", "load, 6 iterations, carried"]
+    assert all("after 1 of 5 steps" in reason for reason in skips["reason"])
     monkeypatch.setattr(runner, "measure_task", None)  # Nothing is solved again.
-    assert lines(report.run(items, ["pgs"], plan, tmp_path / "records.jsonl")) == lines(found)
+    assert texts(report.run(items, ["pgs"], plan, tmp_path / "records.jsonl")) == texts(found)
 
 
 def test_records_of_two_sequences_with_one_name_are_kept_apart(tmp_path):
     path, plan = tmp_path / "records.jsonl", report.Plan(tolerances=(), budgets=(6,), repeats=1)
     report.run(report.make_sequence(moving_stack(5), "load"), ["pgs"], plan, path)
     report.run(report.make_sequence(moving_stack(2, n=11), "load"), ["pgs"], plan, path)
-    frame = report.read(path).latest_frame
+    frame = report.Report(report.read(path)).newest
     assert sorted(frame.loc[frame["start"] == "cold", "step"]) == [0, 1]
 
 
@@ -383,12 +419,14 @@ def test_records_of_two_sequences_with_one_name_are_kept_apart(tmp_path):
 def test_campaign_one_worker_and_two_give_equal_bits_and_no_times(tmp_path):
     one = report.run(NAMES, ["pgs", "direct"], CAMPAIGN)
     two = report.run(NAMES, ["pgs", "direct"], CAMPAIGN, workers=2)
-    assert lines(one) == lines(two) and lines(one.cases.values()) == lines(two.cases.values())
-    assert [s.case for s in one.skips] == [s.case for s in two.skips]
-    assert all(r.times == () and math.isnan(r.setup_time) for r in one)
-    (r,) = (
-        r for r in one if r.case == NAMES[0] and r.solver == "pgs" and r.max_iter == 8 and r.order == "given"
+    assert (
+        texts(one) == texts(two)
+        and select_cases(one).equals(select_cases(two))
+        and skipped(one) == skipped(two)
     )
+    found = rows_of(one)
+    assert all(r.repetitions == 0 and math.isnan(r.time) and math.isnan(r.setup_time) for r in found)
+    (r,) = (r for r in found if (r.case, r.solver, r.max_iter, r.order) == (NAMES[0], "pgs", 8, "given"))
     again = lv.solve(suite.case(NAMES[0]).problem, "pgs", tol=0.0, max_iter=8)
     assert again.residual.relative == r.relative
     page = report.write(one, tmp_path)
@@ -405,7 +443,7 @@ def test_campaign_exception_of_the_watch_stops_workers_without_warnings(tmp_path
     path, stored = tmp_path / "records.jsonl", []
     with pytest.raises(OSError, match="no room"):
         report.run(NAMES, ["pgs", "direct"], CAMPAIGN, path, workers=2, watch=stop, into=stored)
-    assert not recwarn.list and lines(stored[0]) == lines(report.read(path))
+    assert not recwarn.list and texts(make_lines(stored)) == texts(report.read(path))
 
 
 def test_campaign_problems_files_and_local_solvers_are_sent_to_workers(tmp_path, plug_in):
@@ -414,12 +452,12 @@ def test_campaign_problems_files_and_local_solvers_are_sent_to_workers(tmp_path,
     lv.io.save(p, tmp_path / "file.npz")
     (tmp_path / "bad.npz").write_bytes(b"broken")
     found = report.run([p, tmp_path / "file.npz", tmp_path / "bad.npz"], ["direct"], short, workers=2)
-    assert [(r.case, r.success) for r in found] == [("mine", True), ("file", True)]
-    assert ["did not load" in s.reason for s in found.skips] == [True]
-    for name in ("here alone", "pgs"):  # also under the name of a solver of lavender
+    assert [(r.case, r.success) for r in rows_of(found)] == [("mine", True), ("file", True)]
+    assert ["did not load" in reason for reason in select_skips(found)["reason"]] == [True]
+    for name in ("here_alone", "pgs"):  # also under the name of a solver of lavender
         plug_in(lambda problem, impulse: lv.Claim(lv.Status.MAX_ITERATIONS, 1, {"mine": 1}), name)
-    found = report.run(["toy_stack"], ["here alone", "pgs"], short, workers=2)
-    assert [dict(r.work) for r in found] == 2 * [{"mine": 1}]
+    found = report.run(["toy_stack"], ["here_alone", "pgs"], short, workers=2)
+    assert [json.loads(r.work) for r in rows_of(found)] == 2 * [{"mine": 1}]
 
 
 def test_campaign_changed_file_is_measured_again(tmp_path):
@@ -427,7 +465,7 @@ def test_campaign_changed_file_is_measured_again(tmp_path):
     shas = []
     for factor in (1.0, 1.0, 2.0):
         lv.Problem.lcp(factor * np.eye(2), np.ones(2)).save(file)
-        shas.append({r.sha for r in report.run([file], ["pgs"], short, tmp_path / "records.jsonl")})
+        shas.append({r.sha for r in rows_of(report.run([file], ["pgs"], short, tmp_path / "records.jsonl"))})
     assert shas[0] == shas[1] != shas[2]
 
 
@@ -473,7 +511,7 @@ def test_campaign_cluster_that_loses_a_worker_loses_no_record():
         found = report.run(SEEDED[:16], ["pgs", "jacobi"], plan, backend="dask", watch=watch)
         while pids[0] in client.run(os.getpid, on_error="ignore").values():  # until the cluster has noticed
             time.sleep(0.1)
-    assert killed.is_set() and lines(found) == lines(expected)
+    assert killed.is_set() and texts(found) == texts(expected)
 
 
 # -- cases -------------------------------------------------------------------------------------------------

@@ -1,7 +1,6 @@
 """Backends behave as the table of `lavender/external/backends.py` records, and the adapters as it promises."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from reuse_probes import REUSE_PROBES, find_after_others, find_in_threads
 import lavender as lv
 from lavender.external import backends
 from lavender.report.check import compare_with_reference
-from lavender.report.timing import Task, make_record
+from lavender.report.timing import Task, make_row
 from lavender.solvers import registry
 
 OBSERVED = {b.name: b for b in backends.BACKENDS if b.behaviour is not None}
@@ -125,7 +124,7 @@ def test_note_of_a_contradicted_row_of_the_check_quotes_the_table():
     row = compare_with_reference(problem, "daqp", contradicted, None)
     assert "observed with daqp" in row.note and "x2 = 0.03" in row.note
     task = Task(run="", case="", sha="", solver="daqp", mode="tol", tol=1e-6, max_iter=0, time_limit=1.0)
-    times = SimpleNamespace(times=(1.0,), setup_time=0.0, solve_time=1.0, calibration_time=None)
+    times = {"times": [1.0], "setup_time": 0.0, "solve_time": 1.0, "calibration_time": 1e-3}
     for judged, is_quoted in ((contradicted, True), (solution, False)):
-        conflict = make_record(problem, task, judged, times).status_conflict
+        conflict = make_row(problem, task, judged, times)["status_conflict"]
         assert ("observed with daqp" in conflict and "x2 = 0.03" in conflict) == is_quoted
