@@ -405,8 +405,8 @@ def backends_page():
     from lavender.external import backends as b
 
     seen = [x for x in b.BACKENDS if x.behaviour is not None]
-    verdicts = ["version", "triangle", "start", "repeated", "contradictory", "unbounded", "singular"]
-    verdicts += ["convex_on_rows", "saddle"]
+    verdicts = ["version", "triangle", "start", "repeated", "dependent", "contradictory"]
+    verdicts += ["unbounded", "singular", "convex_on_rows", "saddle"]
     numbers = ["linear_term", "small_part", "smallest", "far_bound", "fixed_multiplier", "infeasible_x"]
     numbers += ["conflict", "offset"]
     numbers += ["second_solve", "time_limit"]

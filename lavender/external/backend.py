@@ -43,8 +43,8 @@ class Behaviour:
         Part of P that is used if P is not symmetric: "upper", "lower", "mean", "all", or "none" if P is rejected.
     start : str
         Arrays of a start that it uses; "" if it uses none.
-    repeated, contradictory, singular, convex_on_rows, saddle, unbounded : str
-        Verdicts.
+    repeated, dependent, contradictory, singular, convex_on_rows, saddle, unbounded : str
+        Verdicts; "" if the program was not run. Of the 20 programs *dependent*, the most frequent one.
     infeasible_x : str
         First entry of x after an infeasible program; "none" if no x is returned, "raises" after an exception.
     linear_term, small_part, offset : float or None
@@ -67,6 +67,7 @@ class Behaviour:
     triangle: str = "upper"
     start: str = ""
     repeated: str = "right"
+    dependent: str = "right"
     contradictory: str = "not found"
     singular: str = "right"
     convex_on_rows: str = "right"

@@ -55,7 +55,8 @@ def describe_behaviour(behaviour: Behaviour) -> dict[str, str]:
         "triangle": _PHRASES["triangles"][b.triangle],
         "start": f"A start is used: {b.start}." if b.start else "No start is used.",
     }
-    for name in ("repeated", "contradictory", "unbounded", "singular", "convex_on_rows", "saddle"):
+    verdicts = ("repeated", "dependent", "contradictory", "unbounded", "singular", "convex_on_rows", "saddle")
+    for name in verdicts:
         sentences[name] = f"The program {PROBE_PROGRAMS[name]} {_PHRASES['verdicts'][getattr(b, name)]}."
     values = ("linear_term", "x2", 1.0), ("small_part", "x3", 0.5), ("offset", "x1 - 1e8", 0.3)
     for name, symbol, right in values:
