@@ -212,6 +212,7 @@ def audit(
     runs, note = _choose_spread(runs, spread, watch)
     if watch is not None:
         watch(Event(0, 0, f"compiling {engine}", ""))
+    runs = runs.with_ignored_settings(engine)
     pieces = _audit_frames(iterate_frames(engine, runs, njmax), judging)
     return _collect(_make_empty_audit(runs, engine, common, note), pieces, judging, watch)
 

@@ -145,6 +145,18 @@ class Runs:
         """The module mujoco."""
         return import_mujoco()
 
+    def with_ignored_settings(self, engine: str) -> Runs:
+        """Return these runs with a note on settings of the model that MJX accepts and does not simulate."""
+        model = self.model
+        names = {
+            "noslip_iterations": model.opt.noslip_iterations > 0,
+            "surfacevel of geoms": np.any(getattr(model, "geom_surfacevel", 0.0)),
+            "delay of actuators": np.any(getattr(model, "actuator_delay", 0.0)),
+        }
+        ignored = [name for name, is_used in names.items() if is_used and engine == "mjx"]
+        note = f"MJX does not simulate these settings of the model: {', '.join(ignored)}."
+        return replace(self, notes=(*self.notes, note)) if ignored else self
+
     def with_start_states(self, states: Any) -> Runs:
         """Return these runs with start states from any source of `read_states`; None keeps the model's own."""
         if states is None:

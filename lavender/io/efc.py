@@ -14,6 +14,7 @@ judge uses the round-off floor of float32. MJX and Warp pad worlds with rows of 
 
 from __future__ import annotations
 
+import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -46,6 +47,7 @@ from lavender_ext.judge.measure import all_finite
 # Values of mjtConstraint: equality; friction loss of a joint and of a tendon; elliptic contact, the largest value.
 # Rows of all other types have impulses >= 0.
 EQUALITY, FRICTION, ELLIPTIC = 0, (1, 2), 7
+ONE_SIDED = (3, 4, 5, 6)  # Limits of joints and tendons, contacts without friction, edges of pyramids.
 MAX_CONTACT_ROWS = 6  # The largest condim: a contact has a normal and up to five friction rows.
 CHUNK_ENTRIES = 2**21  # Number of entries of J that are converted to float64 at a time.
 # Largest accepted difference of M a0 and the smooth force, relative to their size: 64 roundings in float64; more in
@@ -55,6 +57,10 @@ MASS_TOLERANCES = {"float64": MASS_TOLERANCE, "float32": 2.0**-14}
 
 # MuJoCo restarts a simulation at a larger acceleration (mjMAXVAL) [m/s^2, rad/s^2]; MJX and MuJoCo Warp continue.
 MAX_ACCELERATION = 1e10
+# [-] A force that differs by more from the force that follows from qacc is one of an earlier step. Differences of
+# one step are roundings, which `FORCE_ROUNDING` bounds relative to the terms of the force.
+OLD_FORCE_TOLERANCE, FORCE_ROUNDING = 0.1, 1e-4
+NEFC_ADVICE = "MuJoCo Warp leaves rows of earlier steps beyond nefc: pass nefc of the step"
 
 
 class Imported(NamedTuple):
@@ -108,7 +114,8 @@ def from_efc(
     efc_frictionloss : scalar, (n, m) or (m,)
         Read on rows of friction loss.
     nefc : (n,) int, optional
-        Number of rows in use, 0 to m; default m. The rows behind them are not read.
+        Number of rows in use, 0 to m; default m. The rows behind them are not read. MuJoCo Warp leaves rows of earlier
+        steps there.
     contacts : (world, efc_address, dim, friction), optional
         Arrays of the contacts: (c,), (c,), (c,) int and (c, 5). A contact is read if `efc_address` is an elliptic row
         in use, and ignored otherwise. The contacts that are read must cover each elliptic row exactly once.
@@ -130,6 +137,11 @@ def from_efc(
     Imported
         The batch, and `impulse` if `efc_force` was given.
 
+    Warns
+    -----
+    UserWarning
+        nefc is not given, and forces do not follow from qacc: they are of an earlier step, or of noslip iterations.
+
     Raises
     ------
     InputError
@@ -149,7 +161,8 @@ def from_efc(
         raise InputError(f"efc_J has shape {jac.shape}; (n, m, nv) is needed")
     n, m, nv = jac.shape
     inv_compliance = as_array("efc_D", efc_D, (n, m), finite=False)
-    target = dt * as_array("efc_aref", efc_aref, (n, m), finite=False)
+    aref = as_array("efc_aref", efc_aref, (n, m), finite=False)
+    target = dt * aref
     smooth = as_array("qacc_smooth", qacc_smooth, (n, nv), finite=False)
     row_type = _broadcast_numbers_to_rows("efc_type", efc_type, n, m)
     loss = _broadcast_numbers_to_rows("efc_frictionloss", efc_frictionloss, n, m)
@@ -194,11 +207,14 @@ def from_efc(
     batch.precision = precision
     if efc_force is None:
         return Imported(batch, None)
-    lam = np.where(used_rows, dt * as_array("efc_force", efc_force, (n, m), finite=False), 0.0)
+    force = as_array("efc_force", efc_force, (n, m), finite=False)
+    lam = np.where(used_rows, dt * force, 0.0)
     lam = lam if scale is None else lam / scale
     if qacc is not None:
-        size = np.abs(as_array("qacc", qacc, (n, nv), finite=False))
-        lam[~(size <= MAX_ACCELERATION).all(axis=1)] = np.nan
+        acceleration = as_array("qacc", qacc, (n, nv), finite=False)
+        lam[~(np.abs(acceleration) <= MAX_ACCELERATION).all(axis=1)] = np.nan
+        if nefc is None:
+            _warn_of_old_forces(jac, inv_compliance, aref, row_type, force, acceleration)
     return Imported(batch, lam if convert is None else convert(lam))
 
 
@@ -364,6 +380,24 @@ def _merge_lower_triangles(matrices: dict[int, Compressed], mass: FloatArray, tr
     return values, columns, np.searchsorted(rows, np.arange(nv + 1))
 
 
+def _warn_of_old_forces(
+    jac: Any, inv_compliance: Any, aref: Any, row_type: Any, force: Any, qacc: Any
+) -> None:
+    """Warn of forces of one-sided rows that do not follow from the acceleration: f = D max(0, aref - J qacc)."""
+    jac = jac.astype(float)
+    expected = inv_compliance * np.maximum(aref - np.einsum("nij,nj->ni", jac, qacc), 0.0)
+    terms = inv_compliance * (np.abs(aref) + np.einsum("nij,nj->ni", np.abs(jac), np.abs(qacc)))
+    allowed = OLD_FORCE_TOLERANCE * np.maximum(np.abs(force), expected) + FORCE_ROUNDING * terms
+    is_old = np.isin(row_type, ONE_SIDED) & (force > 0.0) & (np.abs(force - expected) > allowed)
+    if is_old.any():
+        i, row = np.argwhere(is_old)[0]
+        warnings.warn(
+            f"efc_force of world {i}, row {row} is {force[i, row]:g}, and {expected[i, row]:g} follows from qacc "
+            f"({is_old.sum()} such rows). {NEFC_ADVICE}. Forces of MuJoCo after noslip iterations differ, too",
+            stacklevel=3,
+        )
+
+
 def _broadcast_numbers_to_rows(name: str, values: Any, n: int, m: int) -> FloatArray:
     """Return the numbers of all rows (n, m), given as (n, m), (m,) or one number."""
     if len(get_shape(name, values)) == 2:
@@ -461,7 +495,7 @@ def _find_elliptic_contacts(contacts: Any, elliptic: Any) -> tuple[Any, ...]:
         raise InputError(
             f"row {row} of world {i} belongs to {named[i, row]} of the contacts, and by efc_type it is "
             f"{kind} elliptic row ({len(off)} such rows); each elliptic row must belong to exactly one "
-            "contact: give contacts and efc_type of the same step"
+            f"contact: give contacts and efc_type of the same step. {NEFC_ADVICE}"
         )
     return world, address, dim, rub
 

@@ -17,6 +17,7 @@ the last substep can be converted.
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from lavender.io.engine_step import Claims, EngineStep
 
 LIMIT, PYRAMIDAL = 3, 6  # Values of mjtConstraint: a joint limit, an edge of a pyramid.
 ROWS_OF_NORMAL_AND_TANGENTS = 3
+DEFAULT_FRICTION = 1.0  # [-] Coefficient of a geom whose material has none, such as that of `morphs.Plane()`.
 GENESIS_ADVICE = "genesis-world 1.4 is known"
 
 
@@ -45,6 +47,11 @@ def from_genesis(scene: Any) -> EngineStep:
         One world for each environment, in float32 or float64 as the engine computed. `claims.converged` is False for
         an environment that used up its iterations.
 
+    Warns
+    -----
+    UserWarning
+        A plane has the default friction of 1, and a body less: the engine uses the larger coefficient of a contact.
+
     Raises
     ------
     InputError
@@ -59,9 +66,29 @@ def from_genesis(scene: Any) -> EngineStep:
             f"scene is a {type(scene).__name__}; a built genesis.Scene with rigid bodies is needed"
         )
     try:
-        return _convert_solver_arrays(scene, solver)
+        step = _convert_solver_arrays(scene, solver)
+        hidden = _find_hidden_friction(scene)
     except AttributeError as error:
         raise CapabilityError(f"an attribute of this scene is missing: {error}. {GENESIS_ADVICE}") from None
+    if hidden is not None:
+        warnings.warn(
+            f"a body has friction {hidden:g}, and a plane the default of {DEFAULT_FRICTION:g}. Genesis uses the larger "
+            "coefficient, so contacts of both have the default: give the plane's material a friction",
+            stacklevel=2,
+        )
+    return step
+
+
+def _find_hidden_friction(scene: Any) -> float | None:
+    """Return the smallest coefficient of a material that is below the default one of a plane; None without one."""
+    coefficients, has_default_plane = [DEFAULT_FRICTION], False
+    for entity in getattr(scene, "entities", ()):
+        coefficient = getattr(entity.material, "friction", None)
+        if coefficient is not None:
+            coefficients.append(float(coefficient))
+        has_default_plane |= coefficient is None and type(entity.morph).__name__ == "Plane"
+    smallest = min(coefficients)
+    return smallest if has_default_plane and smallest < DEFAULT_FRICTION else None
 
 
 def _convert_solver_arrays(scene: Any, solver: Any) -> EngineStep:

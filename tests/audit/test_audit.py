@@ -567,3 +567,19 @@ def test_audit_counts_each_verdict_once(boxes):
     assert found.worst_rows["steps"].sum() == unconverged + wrong
     assert (found.totals["unconverged"], found.totals["wrong"]) == (unconverged + wrong, wrong)
     assert len(found.headline) <= 3
+
+
+def test_audit_by_mjx_names_the_settings_that_mjx_ignores(tmp_path):
+    path = tmp_path / "conveyor.xml"
+    path.write_text(
+        """<mujoco><option noslip_iterations="3"/><worldbody><geom type="plane" size="1 1 1" surfacevel="1 0 0 0 0 0"/>
+        <body><joint name="j" type="slide"/><geom size=".1" mass="1"/></body></worldbody>
+        <actuator><motor joint="j" delay="0.01" nsample="9"/></actuator></mujoco>"""
+    )
+    if not hasattr(mj.MjModel.from_xml_path(str(path)), "actuator_delay"):
+        pytest.skip("this MuJoCo has neither moving surfaces nor delays")
+    runs = Runs.of_model(path, 1, 1)
+    assert runs.with_ignored_settings("mujoco").notes == ()
+    (note,) = runs.with_ignored_settings("mjx").notes
+    assert note.endswith("noslip_iterations, surfacevel of geoms, delay of actuators.")
+    assert Runs.of_model(path_without_sleep(tmp_path), 1, 1).with_ignored_settings("mjx").notes == ()

@@ -111,3 +111,89 @@ def drake_friction_exceeds_its_bound_with_kLagged():
         impulse = after - before + np.array([0.0, 0.0, 9.81 * 0.01])
         ratios.append(abs(impulse[0]) / impulse[2])
     return ratios[0] > 1.2 and np.allclose(ratios[1:], FRICTION, atol=0.01)
+
+
+def make_drake_plant(dt=0.01):
+    """Return a builder, its plant and the plant's scene graph."""
+    from pydrake.all import AddMultibodyPlantSceneGraph, DiagramBuilder
+
+    builder = DiagramBuilder()
+    return builder, *AddMultibodyPlantSceneGraph(builder, dt)
+
+
+def simulate_drake(builder, plant, duration, actuation=None):
+    """Finalize a plant, simulate its diagram and return the context of the plant."""
+    from pydrake.all import Simulator
+
+    plant.Finalize()
+    diagram = builder.Build()
+    root = diagram.CreateDefaultContext()
+    context = plant.GetMyMutableContextFromRoot(root)
+    if actuation is not None:
+        plant.get_actuation_input_port().FixValue(context, actuation)
+    simulator = Simulator(diagram, root)
+    simulator.AdvanceTo(duration)
+    return simulator, context
+
+
+@fact(
+    *DRAKE,
+    "`penetration_allowance`",
+    "It changes nothing by default, because `point_stiffness` of SceneGraph's configuration, 1e6 N/m, has priority.",
+    "The problem is rigid, and contains neither of them.",
+)
+def drake_ignores_the_penetration_allowance():
+    from pydrake.all import CoulombFriction, HalfSpace, RigidTransform, SpatialInertia, Sphere
+
+    depths = []
+    for allowance, stiffness in ((None, None), (0.1, None), (None, 1e4)):
+        builder, plant, scene_graph = make_drake_plant()
+        friction = CoulombFriction(FRICTION, FRICTION)
+        plant.RegisterCollisionGeometry(plant.world_body(), RigidTransform(), HalfSpace(), "ground", friction)
+        body = plant.AddRigidBody("ball", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+        plant.RegisterCollisionGeometry(body, RigidTransform(), Sphere(0.1), "ball", friction)
+        plant.SetDefaultFloatingBaseBodyPose(body, RigidTransform([0.0, 0.0, 0.1]))
+        if allowance is not None:
+            plant.set_penetration_allowance(allowance)
+        if stiffness is not None:
+            config = scene_graph.get_config()
+            config.default_proximity_properties.point_stiffness = stiffness
+            scene_graph.set_config(config)
+        _simulator, context = simulate_drake(builder, plant, 1.0)
+        depths.append(0.1 - plant.EvalBodyPoseInWorld(context, body).translation()[2])
+    return depths[0] == depths[1] < depths[2] / 50.0
+
+
+@fact(
+    *DRAKE,
+    "effort limit",
+    "The limit of a joint actuator clamps its input also without gains of a controller: 10 N become 2 N.",
+    "`from_drake` reads the net actuation, after the clamp.",
+)
+def drake_clamps_feed_forward():
+    from pydrake.all import PrismaticJoint, SpatialInertia
+
+    builder, plant, _ = make_drake_plant(0.001)
+    body = plant.AddRigidBody("body", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+    joint = plant.AddJoint(PrismaticJoint("joint", plant.world_frame(), body.body_frame(), [1, 0, 0]))
+    plant.AddJointActuator("motor", joint, 2.0)
+    _simulator, context = simulate_drake(builder, plant, 1.0, [10.0])
+    return np.isclose(plant.GetVelocities(context)[0], 2.0, rtol=1e-6)
+
+
+@fact(
+    *DRAKE,
+    "reaction of a joint",
+    "The reaction contains the moment of the joint's limit, about its free axis.",
+    "The moment of a limit is the impulse of its own row, divided by the time step.",
+)
+def drake_reactions_contain_limits():
+    from pydrake.all import FixedOffsetFrame, RevoluteJoint, RigidTransform, SpatialInertia
+
+    builder, plant, _ = make_drake_plant(0.001)
+    body = plant.AddRigidBody("body", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+    arm = plant.AddFrame(FixedOffsetFrame("arm", body.body_frame(), RigidTransform([-0.3, 0.0, 0.0])))
+    plant.AddJoint(RevoluteJoint("joint", plant.world_frame(), arm, [0, 1, 0], -0.001, 0.001))
+    _simulator, context = simulate_drake(builder, plant, 1.0)
+    (reaction,) = plant.get_reaction_forces_output_port().Eval(context)
+    return np.isclose(abs(reaction.rotational()[1]), 0.3 * 9.81, rtol=1e-3)

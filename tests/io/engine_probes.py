@@ -204,6 +204,91 @@ def tips_have_tilted_repeated_contacts():
     )
 
 
+@fact(
+    *MUJOCO,
+    "rolling friction",
+    "It is viscous: at 1 m/s, a ball with the default coefficient gets 5 % of μ N from pyramidal cones and 11 % from "
+    "elliptic ones, and rolls down a slope on which Coulomb's law holds it.",
+    "The compliance of the rows is the cause: an exact solution of the problem creeps, too.",
+)
+def rolling_friction_is_viscous():
+    ratios = []
+    for cone in ("pyramidal", "elliptic"):
+        model, data = make_mujoco(
+            f"""<mujoco><option timestep="0.002" cone="{cone}"/><worldbody><geom type="plane" size="0 0 1" condim="6"/>
+            <body pos="0 0 .1"><freejoint/><geom type="sphere" size=".1" mass="1" condim="6"/></body></worldbody>
+            </mujoco>"""
+        )
+        data.qvel[[0, 4]] = 1.0, 10.0
+        step_mujoco(model, data, 100)
+        before = data.qvel[0]
+        step_mujoco(model, data, 100)
+        moment = 1.4 * 0.1 * (before - data.qvel[0]) / 0.2  # Of a solid sphere of 1 kg and 0.1 m, about the contact.
+        ratios.append(moment / (model.geom_friction[0, 2] * 9.81))
+    return np.allclose(ratios, [0.05, 0.113], rtol=0.1)
+
+
+@fact(
+    *MUJOCO,
+    "first friction coefficient",
+    "On a horizontal plane, the first of the two coefficients of sliding acts along the y axis of the world, because "
+    "`frame` of the contact begins with z, y, -x.",
+    "Blocks have the tangents of `frame`, and each its own coefficient.",
+)
+def first_friction_coefficient_acts_along_y():
+    speeds = []
+    for axis in (0, 1):
+        gravity = np.array([0.0, 0.0, -9.81])
+        gravity[axis] = 4.0
+        model, data = make_mujoco(
+            f"""<mujoco><option timestep="0.002" cone="elliptic" gravity="{gravity[0]} {gravity[1]} {gravity[2]}"/>
+            <worldbody><geom name="p" type="plane" size="0 0 1"/><body pos="0 0 .1"><freejoint/>
+            <geom name="b" type="box" size=".1 .1 .1" mass="1"/></body></worldbody><contact>
+            <pair geom1="p" geom2="b" condim="4" friction="0.9 0.1 0.005 0.0001 0.0001"/></contact></mujoco>"""
+        )
+        step_mujoco(model, data, 500)
+        speeds.append(data.qvel[axis])
+    return speeds[0] > 2.5 and abs(speeds[1]) < 0.01
+
+
+@fact(
+    *MUJOCO,
+    "`margin` of a joint limit",
+    "The joint rests at its range minus the margin, not at its range: at 0.95 m with a range of 1 m and 0.05 m.",
+    "The target velocity of the row contains the margin.",
+)
+def margin_moves_the_limit():
+    model, data = make_mujoco(
+        """<mujoco><worldbody><body><joint type="slide" axis="0 0 -1" range="-1 1" limited="true" margin="0.05"/>
+        <geom size=".1" mass="1"/></body></worldbody></mujoco>"""
+    )
+    step_mujoco(model, data, 4000)
+    return abs(data.qpos[0] - 0.95) < 0.001
+
+
+@fact(
+    *MUJOCO,
+    "mass changed at run time",
+    "Without `mj_setConst`, the compliance of contacts still belongs to the old mass: with 100 times the mass, a box "
+    "rests 45 times as deep.",
+    "Compliances are read as used, so call `mj_setConst` before `from_mujoco` after such a change.",
+)
+def compliance_belongs_to_the_old_mass():
+    depths = []
+    for is_updated in (True, False):
+        model, data = drop_box(">", height=0.1)
+        model.body_mass[1] *= 100.0
+        model.body_inertia[1] *= 100.0
+        if is_updated:
+            import mujoco
+
+            mujoco.mj_setConst(model, data)
+            mujoco.mj_resetData(model, data)
+        step_mujoco(model, data, 1500)
+        depths.append(0.1 - data.qpos[2])
+    return 40.0 < depths[1] / depths[0] < 50.0
+
+
 # -- MJX -----------------------------------------------------------------------------------------------
 
 MJX = "MJX", "mujoco.mjx", "3.17.0"
@@ -282,6 +367,36 @@ def mjx_has_no_forces_with_nan():
     return bool(np.isnan(data.qacc).any()) and not np.asarray(getattr(data, IMPLEMENTATION).efc_force).any()
 
 
+@fact(
+    *MJX,
+    "`surfacevel`, actuator `delay`, sleep flag",
+    "All three are accepted and not simulated: a moving surface is at rest, an actuator acts at once, and bodies "
+    "do not sleep.",
+    "`lavender audit --engine mjx` names the settings of the model that MJX does not simulate.",
+)
+def mjx_ignores_surfaces_delays_and_sleep():
+    import jax
+    from mujoco import mjx
+
+    model, _ = make_mujoco(
+        """<mujoco><option timestep="0.002"><flag sleep="enable"/></option><worldbody>
+        <geom type="plane" size="0 0 1" surfacevel="0.5 0 0 0 0 0"/><body pos="0 0 .0999"><freejoint/>
+        <geom type="box" size=".1 .1 .1" mass="1"/></body><body pos="0 0 1"><joint name="j" type="slide"/>
+        <geom size=".1" mass="1"/></body></worldbody>
+        <actuator><motor joint="j" delay="0.1" nsample="50"/></actuator></mujoco>"""
+    )
+    device_model = mjx.put_model(model)
+    data = mjx.make_data(device_model)
+    data = data.replace(ctrl=data.ctrl.at[0].set(1.0))
+    step = jax.jit(mjx.step)
+    forces = []
+    for _ in range(60):
+        data = step(device_model, data)
+        forces.append(float(data.actuator_force[0]))
+    normal = float(np.sum(np.asarray(getattr(data, IMPLEMENTATION).efc_force)))
+    return forces[0] == 1.0 and abs(float(data.qvel[0])) < 0.01 and abs(normal - 9.81) < 0.5
+
+
 # -- PyBullet and SAPIEN -------------------------------------------------------------------------------
 
 PYBULLET = "PyBullet", "pybullet", "3.2.7"
@@ -338,6 +453,26 @@ def pybullet_multiplies_friction():
         (point,) = bullet.getContactPoints(bodies[1])
         ratios.append(np.hypot(point[10], point[12]) / point[9])
     return np.allclose(ratios, [0.16, 0.25], rtol=1e-2)
+
+
+@fact(
+    *PYBULLET,
+    "`getConstraintState`",
+    "Point-to-point and fixed constraints have opposite signs: a body of 10 N that hangs below a fixed body has +10 N "
+    "along z with the first and -10 N with the second.",
+)
+def pybullet_constraint_forces_have_two_signs():
+    forces = []
+    for kind in ("JOINT_POINT2POINT", "JOINT_FIXED"):
+        bullet = make_pybullet()
+        shape = bullet.createCollisionShape(bullet.GEOM_SPHERE, radius=0.1)
+        upper, lower = (bullet.createMultiBody(mass, shape, basePosition=[0, 0, z]) for mass, z in ((0, 1.0), (1, 0.5)))
+        ends = [0, 0, -0.25], [0, 0, 0.25]
+        constraint = bullet.createConstraint(upper, -1, lower, -1, getattr(bullet, kind), [0, 0, 0], *ends)
+        for _ in range(240):
+            bullet.stepSimulation()
+        forces.append(bullet.getConstraintState(constraint)[2])
+    return np.allclose(forces, [10.0, -10.0], atol=0.01)
 
 
 SAPIEN = "SAPIEN", "sapien", "3.0.3"
@@ -431,6 +566,66 @@ def warp_applies_noslip():
     return speeds[1] < 1e-6 < 5e-4 < speeds[0]
 
 
+@fact(
+    *WARP,
+    "arrays beyond `nefc` and `nacon`",
+    "They hold the rows, forces and distances of earlier steps: 9.8 N for a box that has been lifted off the floor.",
+    "Pass `nefc` and the first `nacon` contacts to `from_efc`; without `nefc`, it rejects forces that do not belong to "
+    "`qacc`.",
+)
+def warp_leaves_old_rows():
+    import mujoco_warp
+    import warp
+
+    model, _, data = run_warp(n=20, nconmax=64, njmax=64)
+    position = data.qpos.numpy()
+    position[0, 2] = 5.0
+    with warp.ScopedDevice("cpu"):
+        data.qpos.assign(position)
+        mujoco_warp.step(mujoco_warp.put_model(model), data)
+    counts, force = [data.nefc.numpy()[0], data.nacon.numpy()[0]], data.efc.force.numpy()[0].sum()
+    return counts == [0, 0] and 8.0 < force < 12.0 and data.contact.dist.numpy()[0] < 0.0
+
+
+@fact(
+    *WARP,
+    "`tolerance`",
+    "A tolerance below 1e-6 is raised to 1e-6.",
+    "The judge reports the error of the impulses, whatever the tolerance.",
+)
+def warp_raises_the_tolerance():
+    import mujoco_warp
+    import warp
+
+    model, _ = drop_box('tolerance="1e-10">')
+    with warp.ScopedDevice("cpu"):
+        return np.isclose(mujoco_warp.put_model(model).opt.tolerance.numpy()[0], 1e-6)
+
+
+@fact(
+    *WARP,
+    "contacts of two boxes",
+    "A box that is turned by 45° on a box of the same size has 4 contacts, and 8 in MuJoCo.",
+    "Do not compare impulses of single contacts between the two.",
+)
+def warp_has_fewer_contacts_of_boxes():
+    import mujoco
+    import mujoco_warp
+    import warp
+
+    turn = np.pi / 8
+    model, data = make_mujoco(
+        f"""<mujoco><worldbody><geom type="box" size=".1 .1 .1"/><body pos="0 0 .1999"
+        quat="{np.cos(turn)} 0 0 {np.sin(turn)}"><freejoint/><geom type="box" size=".1 .1 .1" mass="1"/></body>
+        </worldbody></mujoco>"""
+    )
+    mujoco.mj_forward(model, data)
+    with warp.ScopedDevice("cpu"):
+        device_data = mujoco_warp.make_data(model, nconmax=64, njmax=256)
+        mujoco_warp.forward(mujoco_warp.put_model(model), device_data)
+    return data.ncon == 8 and device_data.nacon.numpy()[0] == 4
+
+
 # -- Pinocchio -----------------------------------------------------------------------------------------
 
 PINOCCHIO = "Pinocchio", "pinocchio", "4.1.0"
@@ -479,6 +674,33 @@ def pinocchio_tolerances_are_absolute():
     impulse, result = solve_pinocchio("ADMM", 1e6 * np.eye(3))
     velocity = 1e6 * impulse[2] - 1.0
     return result.converged and result.dual_feasibility < 1e-6 and velocity < -0.01
+
+
+@fact(
+    *PINOCCHIO,
+    "joint friction",
+    "`JointFrictionConstraintModel` bounds its impulse by limit times its own time step, which is 1 s until "
+    "`setTimeStep` is called, whatever the step of the simulation is.",
+    "`from_pinocchio` uses its argument `dt`: call `setTimeStep(dt)` before you compare impulses.",
+)
+def pinocchio_joint_friction_has_its_own_time_step():
+    import pinocchio
+
+    model = pinocchio.Model()
+    joint = model.addJoint(0, pinocchio.JointModelPX(), pinocchio.SE3.Identity(), "joint")
+    impulses = []
+    for dt in (None, 0.01):
+        models, datas = pinocchio.StdVec_ConstraintModel(), pinocchio.StdVec_ConstraintData()
+        friction = pinocchio.JointFrictionConstraintModel(model, [joint], np.array([-2.0]), np.array([2.0]))
+        if dt is not None:
+            friction.setTimeStep(dt)
+        models.append(pinocchio.ConstraintModel(friction))
+        datas.append(pinocchio.ConstraintData(friction.createData()))
+        settings, result = pinocchio.PGSSolverSettings(), pinocchio.PGSSolverResult()
+        matrix = pinocchio.DelassusOperatorDense(np.asfortranarray(np.eye(1)))
+        pinocchio.PGSConstraintSolver(1).solve(matrix, np.array([-100.0]), models, datas, settings, result)
+        impulses.append(result.retrieveConstraintImpulses()[0])
+    return np.allclose(impulses, [2.0, 0.02])
 
 
 # -- Genesis -------------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+import warnings
 
 import numpy as np
 import pytest
@@ -236,6 +237,27 @@ def contact(given, k, change):
 
 def contacts(given, change):
     return {"contacts": tuple(map(change, given["contacts"]))}
+
+
+@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+def test_rows_of_an_earlier_step_without_nefc_name_nefc(cone):
+    """MuJoCo Warp leaves rows beyond nefc: a box in the air has the rows and forces of its last contact."""
+    model = mj.MjModel.from_xml_string(scene(cone=cone))
+    states = states_of(model, 1)
+    given = stacked(model, states, np.float32)
+    (m,) = given.pop("nefc")
+    given = {name: x[:, :m] if name.startswith("efc_") else x for name, x in given.items()}
+    qacc = forwarded(model, states[0]).qacc[None].astype(np.float32)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # Forces of this step follow from its acceleration.
+        lv.io.from_efc(**given, qacc=qacc)
+    if cone == "pyramidal":
+        with pytest.warns(UserWarning, match="pass nefc"):
+            lv.io.from_efc(**given, qacc=qacc - np.float32(9.81))
+    else:  # Elliptic rows without a contact of this step.
+        given["contacts"] = tuple(x[:0] for x in given["contacts"])
+        with pytest.raises(lv.InputError, match="pass nefc"):
+            lv.io.from_efc(**given, qacc=qacc)
 
 
 #: A change of valid arrays, and the words of its refusal. Most were read as problems before.

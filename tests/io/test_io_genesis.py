@@ -172,3 +172,25 @@ def test_from_genesis_of_an_environment_with_a_bad_acceleration_has_no_answer(ba
     step = lv.io.from_genesis(load("convex", qacc=spoil))
     judged = lv.residual_many(step.batch, step.impulse, errors="status").velocity_error
     assert np.flatnonzero(~np.isfinite(judged)).tolist() == [1]
+
+
+class Plane:
+    """The morph of a ground plane."""
+
+
+class Box:
+    """The morph of a box."""
+
+
+@pytest.mark.parametrize(
+    ("plane", "box", "is_hidden"), [(None, 0.2, True), (0.3, 0.2, False), (None, 1.5, False), (None, None, False)]
+)
+def test_friction_below_the_default_of_a_plane_is_warned_of(plane, box, is_hidden):
+    scene = load("convex")
+    pairs = ((Plane(), plane), (Box(), box))
+    scene.entities = [SimpleNamespace(morph=m, material=SimpleNamespace(friction=x)) for m, x in pairs]
+    if is_hidden:
+        with pytest.warns(UserWarning, match=r"friction 0\.2, and a plane the default of 1"):
+            lv.io.from_genesis(scene)
+    else:
+        lv.io.from_genesis(scene)
