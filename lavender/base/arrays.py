@@ -68,6 +68,10 @@ def to_numpy(name: str, value: Any) -> np.ndarray:
             f"{name} requires a gradient, which would be lost: give {name}.detach(), or use lavender.torch to "
             "differentiate"
         )
+    if hasattr(
+        value, "resolve_neg"
+    ):  # PyTorch passes a view with the negative bit by DLPack with the wrong sign.
+        value = value.resolve_neg()
     reason: Exception | None = None
     for read in (
         np.from_dlpack,

@@ -127,3 +127,82 @@ def newton_drops_margins_in_mujoco():
         solver = run_newton("SolverMuJoCo", 1, height=0.105, margin=0.01, use_mujoco_contacts=is_mujoco)[0]
         rows.append(int(solver.mjw_data.nefc.numpy()[0]))
     return rows == [0, 16]
+
+
+def make_newton_boxes(name, heights, masses, has_plane):
+    """Return newton's model of one world with boxes of 0.2 m at the heights [m], with masses [kg], and a solver."""
+    import newton
+    import warp
+
+    warp.config.quiet = True
+    with contextlib.redirect_stdout(io.StringIO()):
+        builder, world = newton.ModelBuilder(), newton.ModelBuilder()
+        if has_plane:
+            builder.add_ground_plane()
+        for height, mass in zip(heights, masses, strict=True):
+            body = world.add_body(xform=warp.transform((0.0, 0.0, height), warp.quat_identity()))
+            shape = newton.ModelBuilder.ShapeConfig(density=mass / 0.2**3)
+            world.add_shape_box(body, hx=0.1, hy=0.1, hz=0.1, cfg=shape)
+        builder.add_world(world)
+        model = builder.finalize(device="cpu")
+        return model, getattr(newton.solvers, name)(model)
+
+
+@fact(
+    *NEWTON,
+    "SolverXPBD: mass ratios",
+    "Contacts of a light body yield to a heavy one: a box of 100 kg pushes a box of 1 kg, both 0.2 m high, 92 mm into "
+    "the plane within one second. With equal masses the depth is 2 mm.",
+    "Its steps are not solutions of a constraint problem, so no importer reads them.",
+)
+def xpbd_sinks_under_mass_ratios():
+    import newton
+
+    depths = []
+    for ratio in (1.0, 100.0):
+        model, solver = make_newton_boxes("SolverXPBD", (0.1, 0.3), (1.0, ratio), has_plane=True)
+        before, after, control = model.state(), model.state(), model.control()
+        pipeline = newton.CollisionPipeline(model)
+        contacts = pipeline.contacts()
+        for _ in range(200):
+            pipeline.collide(before, contacts)
+            before.clear_forces()
+            solver.step(before, after, control, contacts, DT)
+            before, after = after, before
+        depths.append(0.1 - before.body_q.numpy()[0, 2])
+    return depths[0] < 0.005 and depths[1] > 0.05
+
+
+@fact(
+    *NEWTON,
+    "`body_mass` changed after `finalize`",
+    "SolverXPBD does not read it: with 10 times the mass, a force accelerates the body as before. Change "
+    "`body_inv_mass`, too.",
+)
+def newton_reads_inverse_masses():
+    speeds = []
+    for factor in (1.0, 10.0):
+        model, solver = make_newton_boxes("SolverXPBD", (5.0,), (1.0,), has_plane=False)
+        model.body_mass.assign(factor * model.body_mass.numpy())
+        before, after = model.state(), model.state()
+        before.body_f.assign(np.array([[1.0, 0.0, 0.0, 0.0, 0.0, 0.0]], np.float32))
+        solver.step(before, after, model.control(), None, DT)
+        speeds.append(after.body_qd.numpy()[0, 0])
+    return speeds[0] == speeds[1] > 0.0
+
+
+@fact(
+    *NEWTON,
+    "MJCF: gravity",
+    "`add_mjcf` ignores gravity and time step of the file: gravity is -9.81 m/s² unless `ModelBuilder(gravity=...)` is "
+    "given.",
+    "The problem has the gravity that the solver used.",
+)
+def newton_ignores_gravity_of_mjcf():
+    import newton
+
+    builder = newton.ModelBuilder()
+    with contextlib.redirect_stdout(io.StringIO()):
+        body = '<body><joint type="slide"/><geom size=".1"/></body>'
+        builder.add_mjcf(f'<mujoco><option gravity="0 0 -3"/><worldbody>{body}</worldbody></mujoco>')
+    return np.allclose(builder.finalize(device="cpu").gravity.numpy()[0], [0.0, 0.0, -9.81])

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import lavender as lv
+from lavender.base.arrays import to_numpy
 
 MASS = np.array([1.0, 2.0, 3.0])
 ARRAYS = {
@@ -30,6 +31,13 @@ class HostArray:
 
     def __dlpack_device__(self):
         return self.array.__dlpack_device__()
+
+
+class NegativeView(HostArray):
+    """A view with the negative bit, such as `z.conj().imag` of PyTorch: DLPack passes it with the wrong sign."""
+
+    def resolve_neg(self):
+        return HostArray(-self.array)
 
 
 class DeviceArray:
@@ -190,3 +198,13 @@ def test_results_return_as_arrays_of_jax():
 def test_results_return_as_arrays_of_warp():
     warp = pytest.importorskip("warp")
     check_results(warp.zeros(1, dtype=warp.float32, device="cpu"), lambda x: x.numpy(), 1e-6)
+
+
+def test_view_with_a_negative_bit_is_read_with_its_sign():
+    assert to_numpy("x", NegativeView(np.array([1.0, -2.0]))).tolist() == [-1.0, 2.0]
+
+
+def test_imaginary_part_of_a_conjugated_tensor_is_read_with_its_sign():
+    torch = pytest.importorskip("torch")
+    view = torch.tensor([1.0 + 2.0j, 3.0 - 4.0j]).conj().imag
+    assert view.is_neg() and to_numpy("x", view).tolist() == [-2.0, 4.0]
