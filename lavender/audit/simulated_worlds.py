@@ -226,7 +226,7 @@ class Runs:
         if self.starts is None or self.starts.controls is None:
             return drive
         first = self.starts.controls[world % len(self.starts)]
-        # Draw the random controls of step 0, too, so that those of later steps do not depend on the start state.
+        # Draw the random controls of step 0, too, so that later controls do not depend on the start state.
         return lambda data, step: (drive(data, step), first)[step == 0]
 
 

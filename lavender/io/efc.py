@@ -231,7 +231,7 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
     states : (n, nq + nv), or (n, size) of mjSTATE_FULLPHYSICS or mjSTATE_INTEGRATION
         The results of `mj_getState`, or rows of qpos and qvel. MuJoCo's answer depends on its warm start and its
         controls, which only mjSTATE_INTEGRATION contains. With other states, both are zero, and the answer and its
-        error differ from those of the simulation.
+        error differ from the simulation.
     threads : int
         Number of threads; the results do not depend on it.
     errors : {"raise", "status"}

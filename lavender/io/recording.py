@@ -255,7 +255,7 @@ def _solve_step(
 
 
 def count_iterations(data: Any) -> int | None:
-    """Return MuJoCo's iterations in all islands, with those of noslip; None if it has not counted all islands."""
+    """Return MuJoCo's iterations in all islands, noslip included; None if it has not counted all islands."""
     return int(np.sum(data.solver_niter)) if data.nisland <= len(data.solver_niter) else None
 
 
