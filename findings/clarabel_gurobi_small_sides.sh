@@ -2,7 +2,7 @@
 # Clarabel 0.11.1 and Gurobi 13.0.3 called by qpsolvers 4.13.0, a small right-hand side
 # Behaviour: min x1^2/2 + x2^2 with x1 + x2 >= 1e-6 has the solution (2/3, 1/3) 1e-6. Both report a solution at their
 # default settings, which is 65 and 99 times as large. DAQP, ProxQP and QPALM report (0, 0). OSQP is right within 1 %.
-# Output: in 1e-6: clarabel (43.0, 21.5), gurobi (66.0, 33.0), daqp (0, 0), osqp (0.665, 0.332)
+# Output: in 1e-6: clarabel (43, 21.5), gurobi (66, 33), daqp (0, 0), osqp (0.665, 0.332)
 
 set -euo pipefail
 folder=$(mktemp -d)

@@ -3,7 +3,7 @@
 # Behaviour: HiGHS drops entries of a matrix below 1e-9. min -x1 with 5e-10 x1 + x2 <= 0, 0 <= x1 <= 1e10 and 0 <= x2
 # <= 1 has the solution 0. linprog reports success with x1 = 1e10, at which the row is violated by 5, and a slack of 0.
 # With the row multiplied by 1e6, it returns 0.
-# Output: success True, x1 = 1e+10, row 5 <= 0, slack 0; multiplied: x1 = 0
+# Output: success True, x1 = 1e+10, row 5 <= 0, slack 0; multiplied: x1 = -0
 
 set -euo pipefail
 folder=$(mktemp -d)

@@ -3,7 +3,7 @@
 # Behaviour: contacts are soft in proportion to the masses of both bodies. A box of 100 kg on a box of 1 kg, both 0.2 m
 # high, comes to rest with the two boxes 28 mm in each other, and the impulses of the contacts are the weights. With
 # equal masses the depth is below 1 mm.
-# Output: equal masses: 0.6 mm; mass ratio 100: 27.9 mm, impulse on the light box 10.00 N s of 10.00 N s
+# Output: equal masses: 0.6 mm; mass ratio 100: 28.4 mm, impulse on the light box 10.00 N s of 10.00 N s
 
 set -euo pipefail
 folder=$(mktemp -d)
