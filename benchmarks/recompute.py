@@ -298,6 +298,8 @@ def recompute_slip(model: Any, vectors: Any) -> dict[str, float]:
         velocity = data.qvel + model.opt.timestep * (data.qacc_smooth + solved[0])
         for name, speeds in compute_slips(model, vectors[i], velocity).items():
             points.setdefault(name, []).extend(speeds)
+    if not points:
+        return {}
     table = result.table.set_index("contact")
     gaps = {
         "slip: mean speed": max(compare(table.loc[n, "slip [m/s]"], np.mean(x)) for n, x in points.items()),

@@ -9,9 +9,7 @@
 An answer with an error that rounding explains, in the precision of the engine, is at its floor and did not stop before
 convergence (`Residual.verdict`). MuJoCo's problems are built by `lavender.io.from_mujoco_many` again from the
 state before each step with its warm start and controls: the engine's answer is reproduced to the bit.
-`noslip_iterations` are applied after the problem is solved; the answer before them is judged. An answer consists of
-forces: MuJoCo's Newton and CG move bodies by accelerations that they compute separately, which are more accurate after
-a stop before convergence (docs/mujoco.md).
+`noslip_iterations` are applied after the problem is solved; the answer before them is judged.
 
 A step is judged if its error is finite. When a world diverges, its later steps cannot be judged, and the step in which
 it diverged is judged only if the engine's answer is finite.
@@ -209,7 +207,7 @@ def audit(
     if engine == "mujoco":
         more = (keep_contact_states, workers, backend, folder, reuse, watch, common)
         return _audit_model(runs, judging, worlds, spread, *more)
-    runs, note = _choose_spread(runs, spread, watch)
+    runs, note = runs.choose_spread(spread, watch)
     if watch is not None:
         watch(Event(0, 0, f"compiling {engine}", ""))
     runs = runs.with_ignored_settings(engine)
@@ -299,7 +297,7 @@ def _audit_model(
                 duration = perf_counter() - begin
         if worlds is None:
             worlds = choose_world_count(duration, processes)
-        runs, note = _choose_spread(replace(one, worlds=worlds), spread, watch)
+        runs, note = replace(one, worlds=worlds).choose_spread(spread, watch)
         if keep_contact_states:
             share = min(1.0, MAX_CONTACT_STATES / (worlds * runs.steps))
             judging = judging._replace(contact_share=share)
@@ -388,17 +386,6 @@ def _make_empty_audit(runs: Runs, engine: str, common: dict[str, Any], *notes: s
             replace(runs, name=name, model=model, against=None), engine, **common
         )
     return result
-
-
-def _choose_spread(
-    runs: Runs, spread: float | None, watch: Callable[[Event], None] | None
-) -> tuple[Runs, str]:
-    """Return the runs with the given spread, or with the largest with which trial worlds do not diverge."""
-    if spread is not None:
-        return replace(runs, spread=spread), ""
-    if watch is not None:
-        watch(Event(0, 0, "simulating trial worlds to choose the spread", ""))
-    return runs.choose_spread()
 
 
 def _judge_first_steps(

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lavender.io.stored import format_json
 from lavender.report.render import Section, Statement, print_page, render_page, write_files
 
 if TYPE_CHECKING:
@@ -48,7 +49,8 @@ class ResultPage:
         page = render_page(
             self.title, statements, self.sections, warnings=notes, folder=Path(folder) / "figures"
         )
-        return write_files(Path(folder), {"index.html": page, "numbers.json": self.numbers}) / "index.html"
+        numbers = format_json(self.numbers, indent=1) + "\n"
+        return write_files(Path(folder), {"index.html": page, "numbers.json": numbers}) / "index.html"
 
     def print_short(self, console: Console) -> None:
         """Print the headline, the first rows of each section's first table, and the notes."""

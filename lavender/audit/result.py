@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 QUANTILES = (0.5, 0.9, 0.99, 0.999, 1.0)
+QUANTILE_NAMES = ("50 %", "90 %", "99 %", "99.9 %", "largest error")
 SAVED_KINDS = ("worst", "contact")
 MAX_CURVE_POINTS = 60  # Largest number of points of a curve over time.
 N_SHOWN_WORLDS = 5  # Up to this many numbers of worlds are written in a sentence.
@@ -391,9 +392,7 @@ class Audit:
     @property
     def errors(self) -> pd.DataFrame:
         """Quantiles of the errors over all steps judged, and over unconverged and wrong ones."""
-        columns: dict[str, Any] = {
-            "quantile": [*(f"{100.0 * q:g} %" for q in QUANTILES[:-1]), "largest error"]
-        }
+        columns: dict[str, Any] = {"quantile": QUANTILE_NAMES}
         for name, selected, x in (
             ("velocity [m/s]", self.is_judged, self.numbers[0]),
             ("impulse [N s]", self.is_judged, self.numbers[1]),
@@ -459,16 +458,13 @@ class Audit:
         """Errors and counts of this model and of the other one on the same states."""
         if self.against is None:
             return _make_frame({})
-        names = ["this model", "the other model"]
-        if self.runs.name != self.against.runs.name:
-            names = [self.runs.name, self.against.runs.name]
-        columns: dict[str, Any] = {
-            "quantile": [*(f"{100.0 * q:g} %" for q in QUANTILES[:-1]), "largest error"]
-        }
+        columns: dict[str, Any] = {"quantile": QUANTILE_NAMES}
         both = self.is_judged & self.against.is_judged
-        for name, one in zip(names, (self, self.against), strict=True):
+        for prefix, one in (("", self), ("against ", self.against)):
             if both.any():
-                columns[f"{name} [m/s]"] = np.quantile(one.numbers[0][both], QUANTILES, method="higher")
+                columns[f"{prefix}{one.runs.name} [m/s]"] = np.quantile(
+                    one.numbers[0][both], QUANTILES, method="higher"
+                )
         return _make_frame(columns if both.any() else {})
 
     @property

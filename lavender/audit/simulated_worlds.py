@@ -42,6 +42,7 @@ from lavender.io.start_states import (
     read_states,
     without_sleep,
 )
+from lavender.report.runner import Event
 
 ENGINES = ("mujoco", "mjx", "mujoco_warp")
 # Arrays of the state from which MJX and Warp start.
@@ -188,12 +189,16 @@ class Runs:
         """Number of worlds that start without noise."""
         return min(self.worlds, 1 if self.starts is None else len(self.starts))
 
-    def choose_spread(self) -> tuple[Runs, str]:
-        """Return these runs with the largest of `SPREADS` that the first worlds with noise survive in MuJoCo.
+    def choose_spread(self, fixed: float | None, watch: Any = None) -> tuple[Runs, str]:
+        """Return these runs with a fixed spread, or the largest of `SPREADS` that the first worlds with noise survive.
 
         The second result is a sentence about a choice that is not the largest; else it is empty. If these worlds
         diverge without noise, too, the largest is chosen.
         """
+        if fixed is not None:
+            return replace(self, spread=fixed), ""
+        if watch is not None:
+            watch(Event(0, 0, "simulating trial worlds to choose the spread", ""))
         trial = range(self.n_exact_worlds, min(self.worlds, self.n_exact_worlds + N_TRIAL_WORLDS))
         with count_engine_warnings(self.mj):
             for spread in SPREADS:

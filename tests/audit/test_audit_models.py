@@ -207,7 +207,7 @@ def test_against_judges_the_other_model_on_the_same_states(boxes, tmp_path):
         mj.mj_step(model, data)
     np.testing.assert_allclose(found.against.numbers[0, 0], expected, rtol=1e-6, atol=1e-13)
     table = found.comparison
-    assert table.columns.tolist()[1:] == [f"{path.name} [m/s]", "other.xml [m/s]"]
+    assert table.columns.tolist()[1:] == [f"{path.name} [m/s]", "against other.xml [m/s]"]
     assert table.iloc[-1, 1:].tolist() == [alone.numbers[0].max(), found.against.numbers[0].max()]
     assert "Against other.xml, on the same 60 states" in found.advice[0]
     found.write(tmp_path / "out")

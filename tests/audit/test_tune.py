@@ -1,5 +1,6 @@
 """Settings of MuJoCo: what is measured, what is chosen, and the line to copy."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -328,3 +329,47 @@ def test_a_setting_with_which_mujoco_ends_in_an_error_is_left_out(boxes, monkeyp
     monkeypatch.setattr(Stage, "judge_setting", lambda self, setting: measured(np.inf, np.inf))
     with pytest.raises(lv.InputError, match="diverge"):
         tune(boxes(), worlds=2, steps=10, repeats=1)
+
+
+def test_an_interrupted_tuning_reuses_the_settings_judged(boxes, monkeypatch, tmp_path):
+    fewer(monkeypatch)
+    path, judged, judge_setting = boxes(EARLY), [], Stage.judge_setting
+    monkeypatch.setattr(
+        Stage, "judge_setting", lambda self, setting: judged.append(setting) or judge_setting(self, setting)
+    )
+
+    def stop(event):
+        if event.case.startswith("timing"):
+            raise KeyboardInterrupt
+
+    same = {"worlds": 2, "steps": 20, "repeats": 1, "folder": tmp_path}
+    first = tune(path, **same, watch=stop)
+    n = len(judged)
+    assert first.stopped and n > 3
+    judged.clear()
+    second = tune(path, **same)
+    assert not second.stopped and f"The errors of {n - 1} settings are reused (--no-reuse)." in second.notes
+    judged_again = [setting for setting in judged if setting.options][: n - 1]
+    assert not {s.options for s in judged_again} & {m.setting.options for m in first.measured if m.setting.options}
+    judged.clear()
+    whole = tune(path, **same, reuse=False)
+    assert len(judged) >= n and not any("reused" in note for note in whole.notes)
+    for m in whole.measured:
+        for other in second.measured:
+            if other.setting == m.setting:
+                assert (other.error == m.error).all() and (other.motion == m.motion).all()
+    # Another model or parameter is not reused.
+    assert not any("reused" in note for note in tune(path, **same | {"seed": 3}).notes)
+
+
+def test_numbers_of_a_tuning_are_json_if_a_setting_diverges_on_the_worlds_held_back(tmp_path):
+    now, quick = measured(10.0, 1e-3), measured(8.0, 1e-3, iterations=9)
+    diverged = replace(quick, error=np.full(1, np.inf), motion=np.full(1, np.inf), times=np.full(1, np.inf))
+    found = chosen(now, quick, held=[now, diverged])
+    found.page.write(tmp_path)
+
+    def reject(word):
+        raise AssertionError(word)
+
+    numbers = json.loads((tmp_path / "numbers.json").read_text(), parse_constant=reject)
+    assert numbers["held"][1]["error"] is None

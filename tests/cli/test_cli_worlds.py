@@ -167,3 +167,20 @@ def test_a_problem_file_in_place_of_a_model_is_named(lavender, tmp_path, command
     (tmp_path / "here" / "a.npz").write_bytes(b"")
     code, _, err = lavender(command, "a.npz")
     assert code == 2 and "a.npz has the suffix of a problem file; a model of MuJoCo (MJCF) is needed" in err
+
+
+def test_a_model_changed_after_loading_is_read_as_mjb_by_each_command(lavender, boxes, tmp_path, monkeypatch):
+    keep_values(monkeypatch, tuning, "MUJOCO", {3}, {"CG"})
+    mujoco = pytest.importorskip("mujoco")
+    model = mujoco.MjModel.from_xml_path(str(boxes(EARLY)))
+    model.geom_friction[:] = 0.02
+    mujoco.mj_saveModel(model, str(tmp_path / "changed.mjb"))
+    words = ("--steps", 20, "--out", tmp_path / "out")
+    assert lavender("audit", tmp_path / "changed.mjb", "--worlds", 1, "--workers", 1, *words)[0] == 0
+    assert lavender("tune", tmp_path / "changed.mjb", "--worlds", 2, "--repeats", 1, *words)[0] == 0
+    assert lavender("slip", tmp_path / "changed.mjb", "--steps", 20)[0] == 0
+    assert lavender("record", tmp_path / "changed.mjb", "--steps", 20, "--out", tmp_path / "steps")[0] == 0
+    recorded = lv.load(next((tmp_path / "steps").glob("step_*.npz")))
+    assert recorded.m > 0
+    report = ("report", tmp_path / "changed.mjb", "--steps", 10, "--solvers", "newton", "--no-figures")
+    assert lavender(*report, "--out", tmp_path / "page")[0] == 0

@@ -222,7 +222,7 @@ def _run_tuning(
         # The first stretch of world 0, which starts without noise, gives an early result.
         first_stage = Stage.from_stretches_of_runs(replace(runs, steps=horizon), range(1), horizon)
         measure_early(first_stage, first_stage.judge_setting(MujocoSetting()))
-        runs, note = runs.choose_spread() if spread is None else (replace(runs, spread=spread), "")
+        runs, note = runs.choose_spread(spread)
         stage, held_back = (
             Stage.from_stretches_of_runs(runs, range(i, runs.worlds, 2), horizon) for i in (0, 1)
         )
