@@ -15,8 +15,8 @@ from lavender.base.lazy_import import sparse as sp
 from lavender.problem.builders import Builders
 from lavender.problem.cones import Cones
 from lavender.problem.derived import computed_once
+from lavender_ext.core.carry import carry_impulses_by_key
 from lavender_ext.core.checks import MIN_MAGNITUDE
-from lavender_ext.small.carry import carry_impulses_by_key
 
 
 @dataclass(frozen=True, eq=False)
