@@ -227,6 +227,10 @@ def _call_through_qpsolvers(
         box = np.ravel([] if solution.z_box is None else solution.z_box)
         of_bounds = program.join_multipliers(None, None, box if len(box) == n else np.full(n, np.nan))
         lam = np.where(program.variable >= 0, of_bounds, lam)
+    elif backend.finite:
+        lam = program.join_multipliers(
+            *program.split_multipliers(lam)
+        )  # Opposite bounds have one multiplier.
     iterations = _get_iterations(extras)
     message = text or (
         "solved" if solution.found else "not solved" + (", nothing returned" if x is None else "")

@@ -56,6 +56,7 @@ def call_clarabel(
     status = Status.INFEASIBLE if almost else classify_status(name)
     # There is one factorisation before the first step and one for each step.
     work = {"iterations": result.iterations, "factorisations": result.iterations + 1}
+    lam = program.join_multipliers(*program.split_multipliers(lam))  # Opposite bounds have one multiplier.
     return Answer(status, name, np.array(result.x), lam, work)
 
 
@@ -120,4 +121,5 @@ def call_osqp(
     lam = np.zeros(len(program.t))
     lam[rows] = -np.asarray(y)
     work = {"iterations": info.iter, "factorisations": 1 + info.rho_updates}
+    lam = program.join_multipliers(*program.split_multipliers(lam))
     return Answer(status, str(info.status), np.array(x), lam, work)

@@ -28,6 +28,8 @@ def find_infeasibility_proof(
     problem: Problem, program: ConvexProgram, multipliers: FloatArray | None, deadline: Deadline
 ) -> Proof | None:
     """Return a proof that no x satisfies the rows, from a backend's multipliers (m,) or a linear program, or None."""
+    if not len(program.t):
+        return None
     rows = program.without_cost()
     scaled, (_, e, _, _), is_equation = (
         rows.scaled.without_far_rows(),

@@ -198,6 +198,8 @@ class _Task:
                 break
             if self.runs[-1].status is Status.INTERRUPTED or self.deadline.has_passed():
                 break
+        if self.judge.x is None:  # Without a point, x = 0 is judged.
+            self.judge.keep(np.zeros(len(self.qp.q)), np.zeros(len(self.qp.target)))
         is_stopped = self.runs[-1].status is Status.INTERRUPTED
         # A point that only the allowance for rounding accepts is no solution if no solution exists.
         if not self.judge.raw <= self.judge.tol and not is_stopped and self._may_search():
@@ -206,11 +208,13 @@ class _Task:
 
     def _may_search(self) -> bool:
         """Return whether to search for proofs: not if the user's budget has ended the run."""
-        return self.max_iter is None and not self.deadline.has_passed()
+        return self.max_iter is None and not self.deadline.has_passed() and len(self.qp.q) > 0
 
     def _list_steps(self) -> Iterator[Any]:
         """Yield the runs to do, one after the other, until a point meets tol."""
         spec = self.spec
+        if not len(self.qp.q):  # Backends reject programs without variables.
+            self.start = np.zeros(len(self.qp.target))
         if self.start is not None and self.tol > 0.0 and (spec.delegates or spec.external):
             yield self._judge_start
         if spec.delegates and spec.builtin:
@@ -300,8 +304,8 @@ class _Task:
     def _make_answer(self, begun: float) -> QPSolution:
         """Build the answer, with the status that the judge confirms."""
         qp, judge = self.qp, self.judge
-        x = np.zeros(len(qp.q)) if judge.x is None else judge.x
-        lam = np.zeros(len(qp.target)) if judge.lam is None else judge.lam
+        x, lam = judge.x, judge.lam
+        assert x is not None and lam is not None
         impulse = mark_read_only(np.concatenate([x, lam]) if qp.is_singular else np.array(lam))
         y, z, box = qp.multipliers(impulse)
         last = min(self.runs, key=lambda run: run.error) if len(self.runs) > 1 else self.runs[-1]

@@ -86,3 +86,26 @@ def test_exact_answer_at_tol_zero_is_found_at_once():
     answer = lv.solve_qp(lv.Problem.from_qp(2.0 * np.eye(2), [-2.0, -4.0], ub=[0.5, 9.0]), tol=0.0)
     assert answer.error == 0.0 and answer.found and answer.solution.status is lv.Status.CONVERGED
     assert "ill-conditioned" not in str(answer.solution)
+
+
+EDGE_CASES = [
+    ("CONVERGED", {"P": np.zeros((0, 0)), "q": []}),
+    ("CONVERGED", {"P": np.zeros((2, 2)), "q": [0.0, 0.0]}),
+    ("CONVERGED", {"P": np.eye(2), "q": [1.0, 1.0], "lb": [1.0, 2.0], "ub": [1.0, 2.0]}),
+    ("CONVERGED", {"P": np.eye(3), "q": [1e12, -1e12, 1.0], "lb": [-1.0] * 3, "ub": [1.0] * 3}),
+    ("UNBOUNDED", {"P": np.zeros((2, 2)), "q": [1.0, 0.0]}),
+    ("UNBOUNDED", {"P": np.diag([1.0, 0.0]), "q": [1.0, 1.0]}),
+    ("INFEASIBLE", {"P": np.diag([1.0, 0.0]), "q": [1.0, -1.0], "G": [[1.0, 0.0], [-1.0, 0.0]], "h": [-1.0, -1.0]}),
+    ("INFEASIBLE", {"P": np.eye(2), "q": [1.0, 1.0], "G": [[0.0, 0.0]], "h": [-1.0]}),
+]
+
+
+@pytest.mark.parametrize(("status", "arrays"), EDGE_CASES)
+def test_programs_at_the_edges_have_one_verdict(status, arrays):
+    for name in (
+        "auto",
+        *installed("osqp", "clarabel", "piqp", "daqp", "quadprog", "highs", "scs", "qpalm", "cvxopt", "ecos"),
+    ):
+        answer = lv.solve_qp(**arrays, solver=name, tol=1e-6)
+        assert answer.solution.status.name == status, (name, str(answer))
+        assert answer.found == (status == "CONVERGED") == (answer.error <= 1e-6 and answer.ray is None), name
