@@ -86,12 +86,14 @@ def boxes(tmp_path):
 
 
 @pytest.fixture
-def register(monkeypatch):
+def register():
     """As `lavender.register`, for one test, and in the place of a solver of the same name."""
     from lavender import registry
 
-    monkeypatch.setattr(registry, "registered", registry.specs())
-    return partial(registry.register, replace=True)
+    before = registry.specs()
+    yield partial(registry.register, replace=True)
+    registry.registered.clear()  # In place, because the compiled front of `solve` holds this dict.
+    registry.registered.update(before)
 
 
 @pytest.fixture
