@@ -344,7 +344,7 @@ def _collect(
     saved = monotonic()
     if watch is not None:
         text = f"{format_count(result.runs.worlds, 'world')} of {format_count(result.runs.steps, 'step')}"
-        watch(Event(result.n_processed, result.verdict.size, text, ""))
+        watch(Event(result.n_processed, result.verdict.size, text, "", phase="judging"))
     try:
         for piece in pieces:
             result.add_piece(piece, judging.keep)
@@ -352,7 +352,7 @@ def _collect(
                 loads.append(machine.count_runnable_processes())
             if watch is not None:
                 text = f"steps, {int(result.is_unconverged.sum())} unconverged"
-                watch(Event(result.n_processed, result.verdict.size, text, ""))
+                watch(Event(result.n_processed, result.verdict.size, text, "", phase="judging"))
             if folder is not None and monotonic() > saved + SAVE_INTERVAL:
                 result.write(folder)
                 saved = monotonic()

@@ -137,7 +137,7 @@ def explain_slip_of_states(
     with count_engine_warnings(mj):
         for i, vector in enumerate(vectors):
             if watch is not None:
-                watch(Event(i, len(vectors), "explaining states", ""))
+                watch(Event(i, len(vectors), "", "", phase="explaining states"))
             data = _advance(mj, model, vector, steps)
             if data is None:
                 diverged.append(i)
@@ -218,7 +218,7 @@ def _simulate_remedies(
     for k, (text, changed) in enumerate(settings):
         if watch is not None:
             watch(
-                Event(k, len(settings), f"simulating settings from {format_count(len(chosen), 'state')}", "")
+                Event(k, len(settings), format_count(len(chosen), "state"), "", phase="simulating settings")
             )
         results = [_simulate_slip(mj, changed, state, pair) for state in chosen]
         steps = [step for *_, step in results]
