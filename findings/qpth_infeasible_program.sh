@@ -9,7 +9,7 @@ set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 "${PYTHON:-python3}" -m venv "$folder/venv"
-"$folder/venv/bin/pip" install --quiet --no-compile --disable-pip-version-check numpy==2.4.6 torch==2.13.0 qpth==0.0.18
+"$folder/venv/bin/pip" install --quiet --no-compile --disable-pip-version-check numpy==1.26.4 torch==2.13.0 qpth==0.0.18
 cd "$folder"
 venv/bin/python - << 'EOF'
 import sys

@@ -344,3 +344,27 @@ def newton_drops_limit_stiffness_in_mjcf():
         model = mujoco.MjModel.from_xml_path(path)
     used = solver.mjw_model.jnt_solref.numpy().reshape(-1, 2)[0]
     return np.allclose(model.jnt_solref[0], [0.02, 1.0]) and not np.allclose(used, [0.02, 1.0], rtol=0.1)
+
+
+@fact(
+    "newton",
+    "newton pxr urdf_usd_converter",
+    "1.8.0",
+    "URDF converted by urdf-usd-converter 0.3.4",
+    "`effort` of a joint is stored as `urdf:limit:effort`, which `add_usd` does not read: the limit is 1e6 in place of "
+    "5. `add_urdf` reads it.",
+    "The problem has the limits of the model, so compare `joint_effort_limit` with the file.",
+)
+def newton_loses_effort_limits_in_usd():
+    import newton
+    import urdf_usd_converter
+    from pxr import Usd
+
+    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
+        path = Path(folder, "robot.urdf")
+        path.write_text(write_urdf("revolute"))
+        converted = urdf_usd_converter.Converter().convert(str(path), str(Path(folder, "usd")))
+        by_usd, by_urdf = newton.ModelBuilder(), newton.ModelBuilder()
+        by_usd.add_usd(Usd.Stage.Open(converted.path))
+        by_urdf.add_urdf(write_urdf("revolute"))
+    return max(by_usd.joint_effort_limit) == 1e6 and max(by_urdf.joint_effort_limit) == 5.0
