@@ -198,4 +198,19 @@ def diagnose_conflict(p: Problem) -> Iterator[Diagnostic]:
         yield make_diagnostic(p, "conflict", law + proof.message, joints + contacts)
 
 
-CHECKS = (diagnose_friction, diagnose_keys, diagnose_row_order, diagnose_duplicate_contacts)
+def diagnose_immovable(p: Problem) -> Iterator[Diagnostic]:
+    """Yield a diagnostic for contacts that no impulse moves, and for other such rows with b != 0."""
+    rows = np.setdiff1d(p.metric.empty, np.flatnonzero(p.cones.friction_rows))
+    rows = rows[p.cones.contact_rows[rows] | (np.abs(p.b[rows]) > 2.0**-51 * np.abs(p.b).max(initial=0.0))]
+    if len(rows):
+        reason = "no impulse changes their velocity, as between immovable bodies: remove them, or give a body a mass"
+        yield make_diagnostic(p, "immovable", reason, [p.block_of(int(i)) for i in rows])
+
+
+CHECKS = (
+    diagnose_friction,
+    diagnose_keys,
+    diagnose_row_order,
+    diagnose_duplicate_contacts,
+    diagnose_immovable,
+)

@@ -356,7 +356,7 @@ def _compute_min_residual(problem: Problem, net: float, y: FloatArray, z: FloatA
 
     If b was computed, its rounding is the rounding of target and J v*.
     """
-    data, size = problem.metric, np.abs(problem.b)
+    data, size, rows = problem.metric, np.abs(problem.b), np.flatnonzero(y)
     get_zero_impulse_reference(problem)
     energy = net / (_compute_energy_norm(data, y * data.d) + _compute_energy_norm(data, z))
     velocity = 0.0 if np.any(z) else net / np.sum(data.d * np.abs(y) / data.weight)
@@ -365,11 +365,11 @@ def _compute_min_residual(problem: Problem, net: float, y: FloatArray, z: FloatA
     if problem.matrix is None:
         free = problem.generalized.v_free if problem.rows is None else problem.rows.v_free  # type: ignore[union-attr]
         size = size + 2.0 * (abs(problem.jacobian) @ np.abs(free.ravel()))
-    b_rounding = 4.0 * UNIT_ROUNDOFF * size
+    b_rounding = np.where(y != 0.0, 4.0 * UNIT_ROUNDOFF * size, 0.0)
     max_velocity = np.max(data.weight * b_rounding / data.d)
     return (
-        divide_by_reference(data, energy, velocity),
-        divide_by_reference(data, _compute_energy_norm(data, b_rounding), max_velocity),
+        divide_by_reference(data, energy, velocity, rows),
+        divide_by_reference(data, _compute_energy_norm(data, b_rounding), max_velocity, rows),
     )
 
 

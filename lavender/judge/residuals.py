@@ -326,16 +326,27 @@ def compute_verdict(
     return UNCONVERGED if relative < 1.0 else WRONG
 
 
-def divide_by_reference(data: Any, energy: float, velocity: float) -> float:
-    """Compute the relative residual of two errors [sqrt J, m/s]; inf if one is not finite or has no reference."""
-    return measure.make_relative_score(energy, velocity, data.reference_energy, data.reference_velocity)
+def divide_by_reference(data: Any, energy: float, velocity: float, rows: Any = None) -> float:
+    """Compute the relative residual of two errors [sqrt J, m/s]; inf if one is not finite or has no reference.
+
+    The references are those of the islands with the given rows (indices), by default of all islands.
+    """
+    references = data.reference_energy, data.reference_velocity
+    if rows is not None:
+        references = measure.combine_references(data, np.asarray(rows, np.int32))
+    return measure.make_relative_score(energy, velocity, *references)
 
 
 def get_zero_impulse_reference(problem: Problem) -> tuple[float, float]:
     """Return E0 [sqrt J] and V0 [m/s] over all rows; the references of all islands are computed once per problem."""
     data = problem.metric
     if data.reference_energy < 0.0:
-        start = measure.store_zero_impulse_residual(data)
+        rows, general, free = problem.rows, problem.generalized, None
+        if rows is not None:
+            free = rows.v_free.ravel()
+        elif general is not None:
+            free = general.v_free if general.order is None else general.v_free[general.order]
+        start = measure.store_zero_impulse_residual(data, free)
         if problem.derived.start is None:
             problem.derived.start = start
         if problem.generalized is not None and "csr_data" in problem.__dict__:
@@ -343,10 +354,11 @@ def get_zero_impulse_reference(problem: Problem) -> tuple[float, float]:
     return data.reference_energy, data.reference_velocity
 
 
-def replace_stale_start(problem: Problem, impulse: FloatArray) -> None:
-    """Set the impulse (m,) [N s] in place to zero, clipped to its bounds, in islands where that is better."""
+def choose_start(problem: Problem, impulse: FloatArray, tol: float) -> FloatArray:
+    """Return the start of a solve: an impulse (m,) [N s] within its bounds, or zero in islands that begin there."""
     get_zero_impulse_reference(problem)
-    measure.replace_stale_start(problem.metric, impulse)
+    start: FloatArray = measure.combine_best_islands(problem.metric, impulse, [], tol)[1]
+    return start
 
 
 def is_solved_by_zero(problem: Problem) -> bool:
@@ -370,22 +382,18 @@ def judge_impulse(problem: Problem, impulse: FloatArray) -> measure.Judged:
 
 def combine_best_islands(
     problem: Problem,
-    starts: Sequence[FloatArray],
+    start: FloatArray,
     impulses: Sequence[FloatArray],
     tol: float,
-    by_residual: bool = False,
+    by_energy: bool = False,
 ) -> FloatArray:
-    """Return the best of starts and impulses (m,) [N s] in each island (`lavender_ext/judge/best.pxd`).
+    """Return the best of a start and impulses (m,) [N s] in each island (`lavender_ext/judge/best.pxd`).
 
-    In each island, the best start is chosen first. An impulse replaces it if the impulse solves the island, if its
-    objective is lower (symmetric A, bounded rows or cones), or if its energy error is lower and its relative residual
-    not larger (Coulomb's law, asymmetric A). If `by_residual` is true, objectives are not compared: in an island
-    without a solution they have no minimum.
+    An impulse replaces the start if it solves the island, if its objective is lower (symmetric A, bounded rows or
+    cones), or if its energy error is lower (Coulomb's law, asymmetric A, or `by_energy`).
     """
     get_zero_impulse_reference(problem)
-    best: FloatArray = measure.combine_best_islands(
-        problem.metric, list(starts), list(impulses), tol, by_residual
-    )
+    best: FloatArray = measure.combine_best_islands(problem.metric, start, list(impulses), tol, by_energy)[0]
     return best
 
 

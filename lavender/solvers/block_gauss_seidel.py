@@ -35,7 +35,7 @@ class BlockGaussSeidel(Sweeping):
         return problem.rows is None and not is_sweep_over_jacobian_cheaper(problem)
 
     def _build_state(self, problem: Problem, order: Order, before: SweepState | None) -> SweepState:
-        return SweepState(problem, choose_sweep_data(problem), order, exact=True)
+        return SweepState(problem, choose_sweep_data(problem), order, keeps_last=True, exact=True)
 
     def _add_work_to_claim(self, state: SweepState, claim: Claim, fallbacks: int) -> Claim:
         return replace(claim, work={**claim.work, "fallbacks": fallbacks}, form=form_name(state.data))

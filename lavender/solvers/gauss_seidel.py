@@ -11,6 +11,7 @@ from lavender.solvers import sor
 class GaussSeidel(sor.SOR):
     """Gauss-Seidel; `order`, `ground` and `seed` as in `lavender.problem.ordering`."""
 
+    keeps_last = True
     omega: float = field(default=1.0, init=False)
 
 

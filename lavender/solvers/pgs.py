@@ -44,12 +44,12 @@ class PGS(Sweeping):
 
     def _build_state(self, problem: Problem, order: Order, before: Any) -> SweepState:
         if is_sweep_over_jacobian_cheaper(problem):
-            return SweepState(problem, problem.metric, order)
+            return SweepState(problem, problem.metric, order, keeps_last=True)
         data, (blocks, *rest) = problem.csr_data, make_order_plan(order)
         # In the given order, pass no order to the kernel: it then skips two lookups per row. The bits do not change.
         row_by_row = data.single_rows and order.is_given
         sweeps = serial.Sweeps(data, _NO_ORDER if row_by_row else blocks, *rest)
-        return SweepState(problem, data, order, sweeps)
+        return SweepState(problem, data, order, sweeps, keeps_last=True)
 
 
 SPEC = replace(

@@ -40,7 +40,7 @@ class ImpulseState(SweepState):
             self.layout = copy_problem_in_block_order(problem, order.blocks, layout)
             data = self.layout.data
             swept = replace(order, blocks=np.arange(problem.n_blocks, dtype=np.int32))
-        super().__init__(problem, data, swept, before=sweeps)
+        super().__init__(problem, data, swept, keeps_last=True, before=sweeps)
         self.plan = order
 
     @property

@@ -26,6 +26,7 @@ class SOR(Sweeping):
         Relaxation, 0 < omega < 2.
     """
 
+    keeps_last = False  # Whether a failed run returns its last iterate (`lavender_ext/judge/best.pxd`).
     omega: float = 1.5
 
     def __post_init__(self) -> None:
@@ -36,7 +37,9 @@ class SOR(Sweeping):
             )
 
     def _build_state(self, problem: Problem, order: Order, before: Any) -> SweepState:
-        return SweepState(problem, problem.csr_data, order, method=serial.SOR, omega=self.omega)
+        return SweepState(
+            problem, problem.csr_data, order, keeps_last=self.keeps_last, method=serial.SOR, omega=self.omega
+        )
 
 
 SPEC = replace(

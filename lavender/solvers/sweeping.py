@@ -33,10 +33,12 @@ STATUS = {
 SWEEP_PATIENCE = 64  # A run stops as STALLED after this many sweeps without a smaller residual at a check.
 
 
-def create_stopping_test(problem: Problem, data: Any, patience: int) -> StoppingTest:
+def create_stopping_test(
+    problem: Problem, data: Any, patience: int, keeps_last: bool = False
+) -> StoppingTest:
     """Create the stopping test of a run over `data`. If A was formed from J and M, the test is confirmed on J and M."""
     formed = problem.matrix is None and not (data.factored or data.is_general)
-    return StoppingTest(data, patience, problem.metric if formed else None)
+    return StoppingTest(data, patience, problem.metric if formed else None, keeps_last)
 
 
 class SweepState:
@@ -49,6 +51,7 @@ class SweepState:
         order: Order,
         sweeps: Any = None,
         patience: int = SWEEP_PATIENCE,
+        keeps_last: bool = False,
         **options: Any,
     ) -> None:
         self.problem = problem
@@ -58,7 +61,7 @@ class SweepState:
         if problem.metric.reference_energy < 0.0:
             get_zero_impulse_reference(problem)
         data.share_reference(problem.metric)  # Make residuals over `data` relative to the judge's reference.
-        self.watch = create_stopping_test(problem, data, patience)
+        self.watch = create_stopping_test(problem, data, patience, keeps_last)
         # lavender_ext.sweep.serial.Sweeps with these options; by default, relaxed updates of the blocks.
         self.sweeps = serial.Sweeps(data, *make_order_plan(order), **options) if sweeps is None else sweeps
 

@@ -763,7 +763,7 @@ class Auto(Solver):
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0, {}, "nothing to solve")
         if not deadline.fits(estimate_first_sweep_cost(problem)):
-            impulse[:] = combine_best_islands(problem, (impulse, problem._start), (), tol)
+            impulse[:] = combine_best_islands(problem, impulse, (), tol)
             return Claim(Status.TIME_LIMIT, 0, {}, NO_TIME_MESSAGE)
         log = SolveLog(problem, tol, max_iter, deadline)
         tree = DecisionTree(problem, deadline, log, state.first_stage)

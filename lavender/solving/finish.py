@@ -15,11 +15,11 @@ from lavender.base.errors import InputError
 from lavender.judge.certificates import format_lower_bound, prove_infeasibility
 from lavender.judge.residuals import (
     Residual,
+    choose_start,
     combine_best_islands,
     divide_by_reference,
     get_zero_impulse_reference,
     make_residual,
-    replace_stale_start,
     residual,
     reuse_or_judge_impulse,
 )
@@ -132,7 +132,7 @@ def finish(run: FinishedRun) -> Solution:
         # Project the impulse on its bounds, so that an engine that applies it does not pull at a contact.
         impulse = project_impulse(problem.cones, impulse)
         if tol > 0.0:
-            impulse = combine_best_islands(problem, (problem._start,), (impulse,), tol, by_residual=True)
+            impulse = combine_best_islands(problem, problem._start, (impulse,), tol, by_energy=True)
     # Solvers work in float64, whatever the precision of the data.
     judged = reuse_or_judge_impulse(problem, impulse, claim.judged).refine(tol)
     if claim is not run.claim or impulse is not run.impulse:
@@ -271,8 +271,7 @@ def judge_late_fields(
     disk = problem.disk
     start = problem.on_disk(impulse)
     if not keeps_start:
-        start = start.copy()
-        replace_stale_start(disk, start)
+        start = choose_start(disk, start, tol)
         if not are_bit_identical(start, problem.on_disk(impulse)):
             impulse = mark_read_only(start.copy() if problem is disk else problem.cones.stretch * start)
             message = (
@@ -394,7 +393,10 @@ def decide_empty_rows(
             impossible.append(i)
     if not impossible:
         return None
-    worst = max(impossible, key=lambda i: abs(problem.b[i]))
+    get_zero_impulse_reference(problem)
+    data, size = problem.metric, np.abs(problem.b)
+    energy, velocity = size / np.sqrt(data.d), data.weight * size / data.d
+    worst = max(impossible, key=lambda i: divide_by_reference(data, energy[i], velocity[i], [i]))
     y, b = np.zeros(problem.m), problem.b[worst]
     y[worst] = math.copysign(1.0, b)
     if prove_infeasibility(problem, y, tol).reason:

@@ -14,10 +14,10 @@ from lavender.base.deadline import NEVER, Deadline, Stopwatch
 from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import (
     MAX_EXCUSED_RESIDUAL,
+    choose_start,
     combine_best_islands,
     find_relative_at_zero,
     get_zero_impulse_reference,
-    replace_stale_start,
     residual,
     reuse_or_judge_impulse,
 )
@@ -25,7 +25,7 @@ from lavender.judge.solution import Claim, SolverStage, Status, sum_work_counts
 from lavender.problem import Problem
 from lavender.solvers.small import NO_TIME_MESSAGE, NO_WORK_MESSAGES, describe_stages
 from lavender.solving.loop import Loop, Record
-from lavender_ext.judge.measure import residuals_by_island
+from lavender_ext.judge.measure import are_bit_identical, residuals_by_island
 
 # Key in `Derived.cache` of the problem's convex relaxation.
 RELAXATION_KEY = "lavender.solving.log: relaxation"
@@ -67,17 +67,19 @@ class SolveLog:
         self.recorder: Recorder | None = None  # Writes the history if one is requested.
 
     def start_from_better_impulse(self, start: FloatArray) -> None:
-        """Begin from the better of `start` (m,) [N s] and the zero impulse in each island."""
+        """Store `start` (m,) [N s], and begin from the better of it and the zero impulse in each island."""
         get_zero_impulse_reference(self.problem)  # Then the zero impulse needs no pass of the judge.
-        start = start.copy()
-        replace_stale_start(self.problem, start)
-        self.judge_and_store_best(start, is_start=True)
+        if not are_bit_identical(start, self.problem._start):
+            self.result = combine_best_islands(self.problem, start, (), self.tol)
+            start = choose_start(self.problem, start, self.tol)
+        self.best, self.impulse = inf, start.copy()
+        relative = find_relative_at_zero(self.problem, start)
+        self.best = float(residual(self.problem, start).relative) if relative is None else relative
 
-    def judge_and_store_best(self, impulse: FloatArray, is_start: bool = False, judged: Any = None) -> None:
+    def judge_and_store_best(self, impulse: FloatArray, judged: Any = None) -> None:
         """Judge an impulse (m,) [N s] and store it in the islands in which it is the best.
 
-        `judged` is the judge's result if it is known. If `is_start` is true, the impulse also sets an upper bound of
-        the relative residual of each island of `result`.
+        `judged` is the judge's result if it is known.
         """
         relative = find_relative_at_zero(self.problem, impulse)
         is_known = relative is not None and self.result is self.problem._start
@@ -89,8 +91,7 @@ class SolveLog:
         if relative < self.best:
             self.best, self.impulse = relative, impulse.copy()
         if self.best > self.tol and not is_known:
-            starts, impulses = ((self.result, impulse), ()) if is_start else ((self.result,), (impulse,))
-            self.result = combine_best_islands(self.problem, starts, impulses, self.tol)
+            self.result = combine_best_islands(self.problem, self.result, (impulse,), self.tol)
 
     def compare_with_relaxation(self, impulse: FloatArray) -> float:
         """Return the residual of an impulse (m,) [N s] on the convex relaxation divided by that on Coulomb's law.

@@ -93,7 +93,7 @@ class Loop:
         except KeyboardInterrupt:
             claim = Claim(INTERRUPTED, 0, {}, "Ctrl-C")
         # After an error, the array may contain an intermediate result: choose the best of it and the start.
-        self.impulse[:] = combine_best_islands(self.problem, (start_point,), (self.impulse,), self.tol)
+        self.impulse[:] = combine_best_islands(self.problem, start_point, (self.impulse,), self.tol)
         return claim
 
     def call_solver(self, max_iter: int, time_limit: float | None) -> Claim:
@@ -168,15 +168,12 @@ class Loop:
         left = None if self.deadline is None else self.deadline.get_remaining_seconds()
         return CHUNK_TIME if left is None else min(CHUNK_TIME, CHUNK_TIME_FRACTION * left)
 
-    def replace_by_best_impulse(self, start: FloatArray, or_zero: bool = True) -> None:
-        """Replace a result that does not meet tol by the best of result, start and zero impulse in each island.
-
-        The zero impulse is considered only if `or_zero` is true.
-        """
+    def replace_by_best_impulse(self, start: FloatArray) -> None:
+        """Replace a result that does not meet tol by the best of result and start in each island."""
         problem = self.problem
         result = reuse_or_judge_impulse(problem, self.impulse, self.judged)
         if result.relative > self.tol:
-            result = select_best_impulse(problem, result, start, self.tol, or_zero)
+            result = select_best_impulse(problem, result, start, self.tol)
         self.judged = result
         self.impulse[:] = result.impulse
 
@@ -193,7 +190,7 @@ class Loop:
             return
         self.judged = reuse_or_judge_impulse(self.problem, self.impulse, self.judged)
         if self.judged.relative > self.tol:
-            self.impulse[:] = combine_best_islands(self.problem, (best[1],), (self.impulse,), self.tol)
+            self.impulse[:] = combine_best_islands(self.problem, best[1], (self.impulse,), self.tol)
 
     def _record_residual(self) -> bool:
         """Record the residual and call the callback; return whether the callback stops the solve."""
@@ -228,10 +225,8 @@ class Loop:
         )  # fmt: skip
 
 
-def select_best_impulse(
-    problem: Problem, result: Any, start: FloatArray | None, tol: float, or_zero: bool = True
-) -> Any:
-    """Return the judged best of `result`, the start (m,) and the zero impulse in each island.
+def select_best_impulse(problem: Problem, result: Any, start: FloatArray | None, tol: float) -> Any:
+    """Return the judged best of `result` and the start (m,) in each island.
 
     A result that meets tol, or is at its round-off floor, is returned unchanged. An impulse outside its bounds is
     projected first.
@@ -243,5 +238,5 @@ def select_best_impulse(
         inside = project_impulse(problem.cones, own)
     if not np.allclose(inside, own, rtol=BOUND_ROUNDING, atol=0.0):
         own = inside
-    best = combine_best_islands(problem, (first, problem._start) if or_zero else (first,), (own,), tol)
+    best = combine_best_islands(problem, first, (own,), tol)
     return result if are_bit_identical(best, result.impulse) else judge_impulse(problem, best)

@@ -21,11 +21,11 @@ from lavender.base.errors import BREAKDOWN, CapabilityError, InputError, InUse, 
 from lavender.judge.certificates import prove_infeasibility
 from lavender.judge.residuals import (
     Residual,
+    choose_start,
     combine_best_islands,
     convert_residual_from_disk,
     find_relative_at_zero,
     get_zero_impulse_reference,
-    replace_stale_start,
     residual,
 )
 from lavender.judge.solution import (
@@ -379,9 +379,8 @@ class Prepared:
         spec, problem, deadline = self.spec, self.problem, loop.deadline
         setup_time, self.setup_time = self.setup_time, 0.0
         is_foreign = spec.external or not spec.builtin
-        given_start, refutation, proof = loop.impulse, "", None
+        start, refutation, proof = loop.impulse.copy(), "", None
         if len(problem.metric.empty):
-            given_start = given_start.copy()
             proof = decide_empty_rows(problem, loop.impulse, loop.tol)
         if proof is not None:
             message, certificate, impossible = proof
@@ -406,8 +405,10 @@ class Prepared:
                 and not has_default_start
                 and not problem.has_singular_program
             ):
-                _replace_stale_islands(problem, given_start, loop.impulse)
-            start = loop.impulse.copy()
+                # The start is judged as given, as in compiled calls, but empty rows keep their bounds.
+                begin = choose_start(problem, start, loop.tol)
+                changed = (begin != start) & (loop.impulse == start)
+                loop.impulse[changed] = begin[changed]
             claim = loop.run(max_iter) if spec.resumable else loop.run_in_one_call(max_iter)
             # Own solvers claim only what the judge confirms.
             if loop.tol > 0.0 and (is_foreign or claim.status not in (CONVERGED, ROUNDOFF_LIMIT)):
@@ -454,7 +455,7 @@ class Prepared:
         keeps_best = spec.delegates and not problem.has_singular_program
         if not keeps_best and (claim.status is TIME_LIMIT or not has_checks):
             claimed = loop.impulse.copy()
-            loop.replace_by_best_impulse(start, or_zero=claim.status is TIME_LIMIT)
+            loop.replace_by_best_impulse(start)
             if claim.status is CONVERGED and not np.array_equal(claimed, loop.impulse):
                 relative = residual(problem, claimed).relative
                 if relative > loop.tol:
@@ -498,7 +499,7 @@ class Prepared:
             time_limit=None if deadline is None else deadline.get_remaining_seconds(MIN_TIME_LIMIT),
         )
         loop.impulse[:] = combine_best_islands(
-            self.problem, (loop.impulse,), (solution.impulse,), loop.tol, by_residual=True
+            self.problem, loop.impulse, (solution.impulse,), loop.tol, by_energy=True
         )
         loop.time += solution.setup_time + solution.solve_time
         work = sum_work_counts((claim.work, solution.work))
@@ -582,17 +583,6 @@ def check_arguments(
     return SolveArguments(
         impulse, tol, max_iter, deadline, history=bool(history), callback=callback, failed_call=failed_call
     )
-
-
-def _replace_stale_islands(problem: Problem, given_start: FloatArray, impulse: FloatArray) -> None:
-    """Set `impulse` (m,) in place to zero in islands in which the given start (m,) is worse than that.
-
-    The start is judged as given, as compiled calls do: without its empty rows it may be worse than zero.
-    """
-    kept = given_start.copy()
-    replace_stale_start(problem, kept)
-    is_stale = kept != given_start
-    impulse[is_stale] = kept[is_stale]
 
 
 def _make_callback_in_original_tangents(

@@ -19,6 +19,7 @@ from lavender_ext.core.problem cimport (DERIVED, bind_derived_row_arrays, comput
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.driver.driver cimport NEWTON, lav_workspace_size, lav_start, lav_step
 from lavender_ext.factor.factors cimport has_wide
+from lavender_ext.judge.best cimport project_on_bounds
 from lavender_ext.judge.measure cimport (refine_reported_view, residual_above_floor, set_zero_impulse, relative_floor_of_score,
                                          score_given_generalized_slack, judge_zero_impulse,
                                          relative_residual_of_score, count_judge_scratch)
@@ -93,7 +94,7 @@ cdef inline view_t make_judge_view(task_t* j) noexcept nogil:
 cdef inline bint judge_zero_impulse_of_task(task_t* j, workspace_t* islands, double* w) noexcept nogil:
     """Judge the zero impulse for E0, V0, its relative residual and the islands, unless they are known.
 
-    Returns False if memory is exhausted. w (3 m + `count_judge_scratch`) is scratch.
+    Returns False if memory is exhausted or if v* is needed (`compute_terms`). w (3 m + `count_judge_scratch`) is scratch.
     """
     cdef view_t v = make_judge_view(j)
     cdef ssize_t m = j.p.n_rows
@@ -101,7 +102,10 @@ cdef inline bint judge_zero_impulse_of_task(task_t* j, workspace_t* islands, dou
         return True
     if not grow_workspace_to(islands, island_workspace_integers(&v), 3 * <int64_t>j.p.n_blocks):
         return False
-    judge_zero_impulse(&v, islands.index, &j.islands, islands.real, w + 2 * m, w, w + m, w + 3 * m, j.zero_residual)
+    if judge_zero_impulse(&v, islands.index, &j.islands, islands.real, j.made.empty if j.made.n_empty > 0 else NULL, NULL, NULL,
+                          w + 2 * m, w, w + m, w + 3 * m, j.zero_residual):
+        j.zero_residual[0] = -1.0
+        return False
     j.p.islands = v.p.islands
     return True
 
@@ -132,10 +136,10 @@ cdef inline int32_t run_newton_within_cost(task_t* j, const view_t* v, const opt
     return code
 
 
-cdef inline bint set_impulse_of_empty_rows(const task_t* j, double tol) noexcept nogil:
+cdef inline bint set_impulse_of_empty_rows(const task_t* j) noexcept nogil:
     """Set empty rows of J to the bound that b requires, like `decide_empty_rows` of lavender/solving/finish.py.
 
-    Returns False if that bound is infinite and b alone is above tol, or if A_ii is 0 only by underflow.
+    Returns False if that bound is infinite, or if A_ii is 0 only by underflow.
     """
     cdef const blocks_t* p = &j.p
     cdef int32_t i, k, q
@@ -155,7 +159,7 @@ cdef inline bint set_impulse_of_empty_rows(const task_t* j, double tol) noexcept
             bound = p.upper[k] if p.b[k] > 0.0 else p.lower[k]
             if fabs(bound) < INFINITY:
                 j.lam[k] = bound
-            elif fabs(p.b[k]) * sqrt(p.nu[k] / p.d[k]) > tol * j.zero_residual[1]:
+            else:
                 return False
     return True
 
@@ -234,7 +238,9 @@ cdef inline void solve_task(task_t* j, workspace_t* workspace, workspace_t* isla
     o.e0, o.v0 = j.zero_residual[0], j.zero_residual[1]
     if j.cold:
         set_zero_impulse(&j.p, j.lam, j.slack_error)
-    if j.made.n_empty and not set_impulse_of_empty_rows(j, tol):
+    else:
+        project_on_bounds(&j.p, j.lam)
+    if j.made.n_empty and not set_impulse_of_empty_rows(j):
         return
     # steps, judgement
     lav_start(&v, &o, &r, j.lam)

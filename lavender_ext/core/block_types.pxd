@@ -35,7 +35,7 @@ cdef struct islands_t:          # partition of the blocks into islands (core/isl
     const int32_t* ptr          # (n + 1) first index in `order` of each island's blocks
     const int32_t* order        # (k) blocks sorted by island, ascending within each island
     double* reference           # (3 n) E0 [sqrt J] and V0 [m/s] of each island (judge/reference.pxd), then r of its zero impulse
-    double energy               # E0 of all rows, sqrt J: the scale of rows without one
+    const double* terms         # NULL, or (m) m/s, the terms of each row, negative on rows that no impulse moves
 
 
 cdef struct blocks_t:

@@ -126,23 +126,8 @@ cdef inline int32_t find_islands(const view_t* v, int32_t* index, islands_t* out
     number_components(k, parent, label)
     sort_blocks_by_level(k, label, count, ptr, order)
     out.n, out.label, out.ptr, out.order = count, label, ptr, order
+    out.terms = NULL
     return count
-
-
-cdef inline bint has_no_moving_body(const view_t* v, int32_t i) noexcept nogil:
-    """Return whether no impulse changes a slack of block i: its bodies are immovable, or its rows of J or A are zero."""
-    cdef int32_t q
-    if v.g != NULL:
-        for q in range(v.g.jptr[v.p.ptr[i]], v.g.jptr[v.p.ptr[i + 1]]):
-            if v.g.jval[q] != 0.0:
-                return False
-        return True
-    if v.r != NULL:
-        return get_moving_body(v.r, i, 0) < 0 and get_moving_body(v.r, i, 1) < 0
-    for q in range(v.a.indptr[v.p.ptr[i]], v.a.indptr[v.p.ptr[i + 1]]):
-        if v.a.data[q] != 0.0:
-            return False
-    return True
 
 
 cdef inline void list_one_island(int32_t k, int32_t* index, islands_t* out) noexcept nogil:
@@ -152,4 +137,5 @@ cdef inline void list_one_island(int32_t k, int32_t* index, islands_t* out) noex
         index[i] = 0
         index[k + i] = i
     index[2 * k], index[2 * k + 1] = 0, k
+    out.terms = NULL
     out.n, out.label, out.order, out.ptr = 1, index, index + k, index + 2 * k

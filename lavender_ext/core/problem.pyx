@@ -530,21 +530,24 @@ cdef class Data:
 
     cdef void store_reference(self, const islands_t* islands, const double* start):
         """Store a copy of the islands with their references (or NULL) and the start of `reference_of`, unless known."""
-        cdef Py_ssize_t k = self.blocks.n_blocks
+        cdef Py_ssize_t k = self.blocks.n_blocks, m = self.blocks.n_rows
         cdef Workspace numbers, marks
         cdef int32_t* at
         with cython.critical_section(self):
             if self.reference_energy >= 0.0:
                 return
             if islands != NULL:
-                numbers = allocate_bytes(3 * islands.n * sizeof(double))
+                numbers = allocate_bytes((3 * islands.n + (m if islands.terms != NULL else 0)) * sizeof(double))
                 marks = allocate_bytes((2 * k + islands.n + 1) * sizeof(int32_t))
                 memcpy(numbers.at, islands.reference, 3 * islands.n * sizeof(double))
                 at = <int32_t*>marks.at
                 memcpy(at, islands.label, k * sizeof(int32_t))
                 memcpy(at + k, islands.order, k * sizeof(int32_t))
                 memcpy(at + 2 * k, islands.ptr, (islands.n + 1) * sizeof(int32_t))
-                self.islands_at = islands_t(islands.n, at, at + 2 * k, at + k, <double*>numbers.at, islands.energy)
+                self.islands_at = islands_t(islands.n, at, at + 2 * k, at + k, <double*>numbers.at, NULL)
+                if islands.terms != NULL:
+                    memcpy(<double*>numbers.at + 3 * islands.n, islands.terms, m * sizeof(double))
+                    self.islands_at.terms = <double*>numbers.at + 3 * islands.n
                 self.keep += [numbers, marks]
                 self.blocks.islands = &self.islands_at
             self.reference_velocity, self.relative_at_zero = start[1], start[2]

@@ -26,8 +26,9 @@ cdef void score_given_generalized_slack(const blocks_t* p, const generalized_t* 
                                         double* e, double* x, score_t* out) noexcept nogil
 cdef void score_given_slack(const blocks_t* p, const double* lam, const double* w, double* e, score_t* out) noexcept nogil
 cdef void find_reference(blocks_t* p, const double* x, const double* w, const double* e, double* out) noexcept nogil
-cdef void judge_zero_impulse(view_t* v, int32_t* index, islands_t* islands, double* reference, double* x, double* w, double* e,
-                             double* scratch, double* out) noexcept nogil
+cdef bint judge_zero_impulse(view_t* v, int32_t* index, islands_t* islands, double* reference, const int32_t* empty,
+                             const double* free, double* terms, double* x, double* w, double* e, double* scratch,
+                             double* out) noexcept nogil
 
 
 # -- the zero impulse, and a pass over an impulse relative to it -----------------------------------------

@@ -8,24 +8,25 @@ import numpy as np
 from lavender_ext.core cimport validate
 from lavender_ext.core.arrays cimport as_double_pointer
 from lavender_ext.core.generalized cimport multiply_whitened_transpose
-from lavender_ext.core.islands cimport find_islands, has_no_moving_body, island_workspace_integers, list_one_island
+from lavender_ext.core.islands cimport find_islands, island_workspace_integers, list_one_island
 from lavender_ext.core.block_types cimport blocks_t, islands_t
 from lavender_ext.core.problem cimport Data, Workspace, allocate_bytes
-from lavender_ext.core.start cimport clip_zero_to_row_bounds
 from lavender_ext.core.velocity cimport compute_velocity_change
 from lavender_ext.core.view cimport generalized_t, view_t
 from lavender_ext.judge.best cimport (best_workspace_size, best_t, bind_best, count_islands, copy_score_without_islands,
-                                      replace_stale_islands, store_better_islands, store_better_start)
+                                      project_on_bounds, store_better_islands, store_start)
 from lavender_ext.judge.forms cimport (compute_csr_slack, judge_impulse_over_bodies, judge_impulse_over_csr,
                                        judge_impulse_over_generalized, score_generalized_slack)
 from lavender_ext.judge.measure cimport (residual_above_floor, set_zero_impulse, relative_floor_of_score,
                                          relative_residual_of_score, count_judge_scratch)
-from lavender_ext.judge.reference cimport reference_needs_islands, compute_reference
+from lavender_ext.judge.reference cimport (compute_reference, compute_terms, has_island_without_scale, has_unmoved_row,
+                                           reference_needs_islands)
 from lavender_ext.judge.refine cimport estimate_factor_loss, min_reported_loss, refine_generalized_slack
 from lavender_ext.judge.rounding cimport mass_t, relative_size_of_change, compute_squared_float32_rounding
 from lavender_ext.judge.score cimport is_at_floor, make_empty_score, relative_residual, score_t
 from lavender_ext.judge.slack cimport compute_generalized_slack, compute_body_slack
-from lavender_ext.judge.tally cimport compute_rhs_energy_norm, make_empty_tally, score_all_blocks, add_block_error, tally_t
+from lavender_ext.judge.tally cimport (add_block_error, compute_rhs_energy_norm, get_row_terms, make_empty_tally, score_all_blocks,
+                                       tally_t)
 
 
 cdef void judge_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, bint floor,
@@ -87,15 +88,18 @@ cdef void find_reference(blocks_t* p, const double* x, const double* w, const do
     compute_reference(p, x, w, e, out)
 
 
-cdef void judge_zero_impulse(view_t* v, int32_t* index, islands_t* islands, double* reference, double* x, double* w, double* e,
-                             double* scratch, double* out) noexcept nogil:
+cdef bint judge_zero_impulse(view_t* v, int32_t* index, islands_t* islands, double* reference, const int32_t* empty,
+                             const double* free, double* terms, double* x, double* w, double* e, double* scratch,
+                             double* out) noexcept nogil:
     """Judge the zero impulse, written to x (m), and write the results of `compute_reference` to out (3).
 
-    If there are several islands, v.p receives them with their references. index (`island_workspace_integers`), islands
-    and reference (3 k) must live as long as v. w, e (m) and scratch (as in `judge_view` without a floor) are scratch.
+    If there are several islands, v.p receives them with their references. index (`island_workspace_integers`), islands,
+    reference (3 k) and terms (m) must live as long as v. empty (m) marks the zero rows of A, free is v* (`compute_row_terms`);
+    either may be NULL. w, e (m) and scratch (as in `judge_view` without a floor) are scratch. If terms is NULL, return whether
+    a row needs it; the references are then not valid.
     """
     cdef score_t s = make_empty_score()
-    cdef int32_t i
+    cdef bint unmoved = has_unmoved_row(&v.p, empty)
     v.p.islands = NULL
     if set_zero_impulse(&v.p, x, w):
         judge_view(v, x, w, e, scratch, False, &s)
@@ -105,16 +109,18 @@ cdef void judge_zero_impulse(view_t* v, int32_t* index, islands_t* islands, doub
     if find_islands(v, index, islands) > 1:
         v.p.islands = islands
     compute_reference(&v.p, x, w, e, out)
-    if reference_needs_islands(&v.p, out):
+    if reference_needs_islands(&v.p, out) or (unmoved and v.p.islands == NULL):
         list_one_island(v.p.n_blocks, index, islands)
         v.p.islands = islands
         compute_reference(&v.p, x, w, e, out)
-    if v.p.islands != NULL:
-        for i in range(islands.n):
-            if has_no_moving_body(v, islands.order[islands.ptr[i]]):
-                if reference[2 * i] > 0.0 and reference[2 * islands.n + i] >= 0.5:
-                    reference[2 * islands.n + i] = relative_residual(reference[2 * i], reference[2 * i + 1], out[0], out[1])
-                reference[2 * i], reference[2 * i + 1] = out[0], out[1]
+    if not unmoved and not has_island_without_scale(&v.p, empty):
+        return False
+    if terms == NULL:
+        return True
+    compute_terms(v, empty, free, terms)
+    islands.terms = terms
+    compute_reference(&v.p, x, w, e, out)
+    return False
 
 
 def compute_slack(Data p, const double[::1] lam, double[::1] w):
@@ -277,6 +283,35 @@ def make_relative_score(double energy, double velocity, double reference_energy,
     return relative_residual(energy, velocity, reference_energy, reference_velocity)
 
 
+def combine_references(Data p, const int32_t[::1] rows):
+    """Return E0 [sqrt J] and V0 [m/s] over the islands with these ascending rows.
+
+    They are the norms of the rows' own terms if no impulse moves any of the rows, and in an island without E0 and V0.
+    """
+    cdef const islands_t* s = p.blocks.islands
+    cdef int32_t block = 0, i, k
+    cdef double energy = 0.0, fast = 0.0, own
+    cdef bint unmoved = True
+    if s == NULL:
+        return p.reference_energy, p.reference_velocity
+    seen = set()
+    for k in rows:
+        unmoved = unmoved and s.terms != NULL and s.terms[k] < 0.0
+    for k in rows:
+        while p.blocks.ptr[block + 1] <= k:
+            block += 1
+        i = s.label[block]
+        if unmoved or s.reference[2 * i] < 0.0:
+            own = get_row_terms(&p.blocks, k)
+            energy += own / p.blocks.d[k] * own
+            fast = max(fast, sqrt(p.blocks.nu[k] / p.blocks.d[k]) * own)
+        elif i not in seen:
+            seen.add(i)
+            energy += s.reference[2 * i] * s.reference[2 * i]
+            fast = max(fast, s.reference[2 * i + 1])
+    return sqrt(energy), fast
+
+
 def all_finite(const double[::1] x):
     """Return whether x holds neither NaN nor infinity."""
     return validate.all_finite(&x[0], x.shape[0]) if x.shape[0] else True
@@ -293,19 +328,27 @@ def are_bit_identical(const double[::1] x, const double[::1] y):
     return y.shape[0] == n and (n == 0 or memcmp(&x[0], &y[0], n * sizeof(double)) == 0)
 
 
-def store_zero_impulse_residual(Data p):
-    """Judge the zero impulse, store islands, references and its relative residual in the data, and return it (m,), read-only."""
+def store_zero_impulse_residual(Data p, const double[::1] velocity=None):
+    """Judge the zero impulse, store islands, references and its relative residual in the data, and return it (m,), read-only.
+
+    velocity is v*, (6 n,) over bodies and (n,) over J and M in the order of the factor.
+    """
     cdef Py_ssize_t m = p.blocks.n_rows, k = p.blocks.n_blocks
     cdef view_t v = p.get_pointers()
     cdef double[::1] x
     cdef double out[3]
     cdef islands_t islands
-    cdef Workspace workspace = allocate_bytes((2 * m + 3 * k + count_judge_scratch(&v)) * sizeof(double))
+    cdef Workspace workspace = allocate_bytes((3 * m + 3 * k + count_judge_scratch(&v)) * sizeof(double))
     cdef Workspace marks = allocate_bytes(island_workspace_integers(&v) * sizeof(int32_t))
     cdef double* w = <double*>workspace.at
+    cdef int32_t[::1] empty = None
     start = np.zeros(m)
     x = start
-    judge_zero_impulse(&v, <int32_t*>marks.at, &islands, w + 2 * m, &x[0] if m else NULL, w, w + m, w + 2 * m + 3 * k, out)
+    if len(p.empty):
+        empty = np.isin(np.arange(m), p.empty).astype(np.int32)
+    judge_zero_impulse(&v, <int32_t*>marks.at, &islands, w + 3 * m, &empty[0] if empty is not None else NULL,
+                       &velocity[0] if velocity is not None and velocity.shape[0] else NULL, w + 2 * m, &x[0] if m else NULL, w,
+                       w + m, w + 3 * m + 3 * k, out)
     start.setflags(write=False)
     p.store_reference(v.p.islands, out)
     return start
@@ -347,31 +390,11 @@ def residuals_by_island(Data p, const double[::1] lam):
     return label_, table_
 
 
-def replace_stale_start(Data p, double[::1] lam):
-    """Set lam (m,) [N s] to zero, clipped to its bounds, in islands in which that has a lower relative residual, in place.
+def combine_best_islands(Data p, impulse, list impulses, double tol, bint by_energy=False):
+    """Return two new impulses (m,) [N s]: the best of a start and the impulses (m,) in each island, and where the start begins.
 
-    The references of the zero impulse must be set in the data.
+    By judge/best.pxd. The references of the zero impulse must be set in the data.
     """
-    cdef int32_t m = p.blocks.n_rows, n = count_islands(&p.blocks), k = 0
-    cdef view_t v = p.get_pointers()
-    cdef score_t s = make_empty_score()
-    cdef Workspace workspace
-    cdef double* w
-    while k < m and lam[k] == clip_zero_to_row_bounds(&p.blocks, k):
-        k += 1
-    if k == m:
-        return
-    workspace = allocate_bytes((2 * (<Py_ssize_t>m + n) + count_judge_scratch(&v)) * sizeof(double))
-    w = <double*>workspace.at
-    s.by_island = w + 2 * m
-    judge_view(&v, &lam[0], w, w + m, s.by_island + 2 * n, False, &s)
-    if p.blocks.islands == NULL:
-        s.by_island[0] = relative_residual_of_score(&s, w, m, p.reference_energy, p.reference_velocity)
-    replace_stale_islands(&p.blocks, s.by_island, p.relative_at_zero, &lam[0])
-
-
-def combine_best_islands(Data p, list starts, list impulses, double tol, bint by_residual=False):
-    """Return a new impulse (m,) [N s]: for each island the best of the starts and the impulses (m,), by judge/best.pxd."""
     cdef Py_ssize_t m = p.blocks.n_rows
     cdef view_t v = p.get_pointers()
     cdef best_t best
@@ -381,20 +404,25 @@ def combine_best_islands(Data p, list starts, list impulses, double tol, bint by
     cdef double* w = &x[workspace]
     cdef double now
     cdef const double* lam
+    start = np.array(impulse, float)
+    cdef double[::1] begin = start
+    if m == 0:
+        return start, start
     bind_best(&best, &p.blocks, &x[0])
-    best.by_residual = by_residual
-    for impulse in [*starts, *impulses] if m else []:
-        lam = as_double_pointer(impulse, m)
+    best.by_energy = by_energy
+    project_on_bounds(&p.blocks, &begin[0])
+    for iterate in [start, *impulses]:
+        lam = as_double_pointer(iterate, m)
         s = make_empty_score()
         s.by_island = best.now
         judge_view(&v, lam, w, w + m, w + 2 * m, False, &s)
         now = relative_residual_of_score(&s, w, <int32_t>m, p.reference_energy, p.reference_velocity)
         copy_score_without_islands(&best, &p.blocks, &s, now)
-        if best.seen < len(starts):
-            store_better_start(&best, &v, lam, w, w + m)
+        if best.seen == 0:
+            store_start(&best, &v, w, p.reference_energy, p.relative_at_zero, tol, &begin[0])
         else:
-            store_better_islands(&best, &v, lam, w, w + m, tol)
-    return np.array(x[:m])
+            store_better_islands(&best, &v, lam, w, tol)
+    return np.array(x[:m]), start
 
 
 def write_velocity_change(Data p, const double[::1] lam, double[:, ::1] v):

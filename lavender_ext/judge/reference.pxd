@@ -1,7 +1,7 @@
 """Reference errors E0 [sqrt J] and V0 [m/s] of an island, the denominators of its relative residual.
 
 They are E and V (score.pxd) of the zero impulse x = Pi(0), slack w = A x - b, error e, unless the zero impulse solves the island.
-It does if no row's error is more than the rounding of the row's own terms, s_k = |b_k|:
+It does if no row's error is more than the rounding of the row's right-hand side, s_k = |b_k|:
 
     d_k |e_k| <= 2^-48 s_k                                  for each row k of the island                   (1)
 
@@ -16,18 +16,25 @@ If (2) is zero, no row acts: each row is compared with its own terms, a contact 
 
     relative = max d_k |e_k| / s_k,   of a contact sqrt(d_n sum d_k e_k^2) / s_n       (3) `relative_residual_by_rows`
 
-A row that does not act therefore does not change the residual of rows that do, however large its b is. Two kinds of rows
-have no scale of their own and are compared with all rows, sqrt(sum E0_i^2) and max V0_i: blocks that no impulse moves, and,
-in (3), rows with b = 0 (there sqrt(d) |e| is divided by the former).
+A row that does not act therefore does not change the residual of rows that do, however large its b is. In two kinds of rows
+s_k is the sum of the terms of b = target - J v*, because b may be their rounding:
+
+    s_k = |target_k| + sum_j |J_kj v*_j|, or |b_k| if A is given      rows that no impulse moves, and in (3) rows with b = 0     (4)
+
+The residual of an island is at least max d_k |e_k| / s_k over its rows that no impulse moves; (3) applies if it has no others.
+A b of such a row of at most 2^-51 max |b| is the rounding of a computation that ended in 0 (s_k = infinity).
 """
-from libc.math cimport fabs, sqrt
+from libc.math cimport INFINITY, fabs, sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport euclidean_norm
 from lavender_ext.core.block_types cimport (CONE, blocks_t, get_row_groups, has_independent_rows, islands_t,
                                             get_friction_components, friction_components_t)
-from lavender_ext.judge.score cimport relative_residual
-from lavender_ext.judge.tally cimport get_block_in_order, make_empty_tally, relative_residual_by_rows, add_block_error, tally_t
+from lavender_ext.core.rows cimport get_block_jacobian
+from lavender_ext.core.view cimport get_block_bodies, view_t
+from lavender_ext.judge.score cimport relative_residual, unit_roundoff
+from lavender_ext.judge.tally cimport (add_block_error, get_block_in_order, make_empty_tally, relative_residual_by_rows,
+                                       relative_residual_of_unmoved_rows, tally_t)
 
 
 cdef inline double max_rounding_ratio() noexcept nogil:
@@ -118,14 +125,14 @@ cdef inline double compute_island_reference(const blocks_t* p, const int32_t* or
         return 1.0 / 0.0
     if not rest:
         out[0], out[1] = s.energy, s.fast
-        return relative_residual(s.energy, s.fast, out[0], out[1])
+        return max(relative_residual(s.energy, s.fast, out[0], out[1]), relative_residual_of_unmoved_rows(p, order, first, end, e))
     for a in range(first, end):
         add_block_terms(p, get_block_in_order(order, a), x, w, &energy, &fast)
     if energy > 0.0:
         out[0], out[1] = sqrt(energy), sqrt(fast)
         return relative_residual(s.energy, s.fast, out[0], out[1])
     out[0] = out[1] = -1.0
-    return relative_residual_by_rows(p, order, first, end, e, 0.0)   # This is 0, or small because of (1).
+    return relative_residual_by_rows(p, order, first, end, e)    # This is 0, or small because of (1).
 
 
 cdef inline void compute_reference(blocks_t* p, const double* x, const double* w, const double* e, double* out) noexcept nogil:
@@ -143,13 +150,111 @@ cdef inline void compute_reference(blocks_t* p, const double* x, const double* w
     out[1] = out[2] = 0.0
     for i in range(s.n):
         r = compute_island_reference(p, s.order, s.ptr[i], s.ptr[i + 1], x, w, e, s.reference + 2 * i)
-        s.reference[2 * s.n + i] = r
-        out[2] = r if r > out[2] else out[2]
         if s.reference[2 * i] > 0.0:
             sum_ += s.reference[2 * i] * s.reference[2 * i]
             if s.reference[2 * i + 1] > out[1]:
                 out[1] = s.reference[2 * i + 1]
-    out[0] = s.energy = sqrt(sum_)
+            if is_island_unmoved(p, i):
+                s.reference[2 * i] = s.reference[2 * i + 1] = -1.0
+                r = relative_residual_by_rows(p, s.order, s.ptr[i], s.ptr[i + 1], e)
+        s.reference[2 * s.n + i] = r
+        out[2] = r if r > out[2] else out[2]
+    out[0] = sqrt(sum_)
+
+
+# -- terms of rows ----------------------------------------------------------------------------------------------------
+
+
+cdef inline bint is_row_unmoved(const blocks_t* p, const int32_t* empty, int32_t i, int32_t k) noexcept nogil:
+    """Return whether no impulse moves row k of block i, and it is not a friction row of a contact with a normal that moves.
+
+    empty (m) marks zero rows of A; NULL if there are none.
+    """
+    return empty != NULL and empty[k] and (has_independent_rows(p, i) or empty[p.ptr[i]])
+
+
+cdef inline bint has_unmoved_row(const blocks_t* p, const int32_t* empty) noexcept nogil:
+    """Return whether a row with b != 0 `is_row_unmoved`."""
+    cdef int32_t i, k
+    if empty == NULL:
+        return False
+    for i in range(p.n_blocks):
+        for k in range(p.ptr[i], p.ptr[i + 1]):
+            if is_row_unmoved(p, empty, i, k) and p.b[k] != 0.0:
+                return True
+    return False
+
+
+cdef inline bint has_island_without_scale(const blocks_t* p, const int32_t* empty) noexcept nogil:
+    """Return whether (3) applies to a row with b = 0 that impulses move."""
+    cdef int32_t a, i, island, k
+    for island in range(p.islands.n if p.islands != NULL else 0):
+        if p.islands.reference[2 * island] < 0.0:
+            for a in range(p.islands.ptr[island], p.islands.ptr[island + 1]):
+                i = p.islands.order[a]
+                for k in range(p.ptr[i], p.ptr[i + 1] if has_independent_rows(p, i) else p.ptr[i] + 1):
+                    if p.b[k] == 0.0 and not (empty != NULL and empty[k]):
+                        return True
+    return False
+
+
+cdef inline bint is_island_unmoved(const blocks_t* p, int32_t island) noexcept nogil:
+    """Return whether no impulse moves a row of the island, by the signs of its terms."""
+    cdef int32_t a, i, k
+    if p.islands.terms == NULL:
+        return False
+    for a in range(p.islands.ptr[island], p.islands.ptr[island + 1]):
+        i = p.islands.order[a]
+        for k in range(p.ptr[i], p.ptr[i + 1]):
+            if not p.islands.terms[k] < 0.0:
+                return False
+    return True
+
+
+cdef inline double compute_row_terms(const view_t* v, const double* free, int32_t i, int32_t k) noexcept nogil:
+    """Return (4) for row k of block i; free is v* (6 n over bodies, n over J and M), NULL if it is not known."""
+    cdef double x, velocity = 0.0, size = 0.0
+    cdef double scratch[72]
+    cdef const double* row
+    cdef int32_t q, body
+    if free != NULL and v.g != NULL:
+        for q in range(v.g.jptr[k], v.g.jptr[k + 1]):
+            x = v.g.jval[q] * free[v.g.jidx[q]]
+            velocity += x
+            size += fabs(x)
+    elif free != NULL and v.r != NULL:
+        row = get_block_jacobian(&v.p, v.r, i, scratch) + 12 * (k - v.p.ptr[i])
+        for q in range(12):
+            body = get_block_bodies(v.r, i)[q // 6]
+            if body >= 0:
+                x = row[q] * free[6 * <ssize_t>body + q % 6]
+                velocity += x
+                size += fabs(x)
+    return fabs(v.p.b[k] + velocity) + size
+
+
+cdef inline void compute_terms(const view_t* v, const int32_t* empty, const double* free, double* terms) noexcept nogil:
+    """Compute `islands_t.terms` (m): (4) on rows with b = 0 and, negative, on rows that no impulse moves, otherwise |b|.
+
+    Rows of a contact that no impulse moves share their largest terms.
+    """
+    cdef const blocks_t* p = &v.p
+    cdef int32_t i, k
+    cdef double largest, all_rows = 0.0
+    for k in range(p.n_rows):
+        all_rows = max(all_rows, fabs(p.b[k]))
+    for i in range(p.n_blocks):
+        largest = 0.0
+        for k in range(p.ptr[i], p.ptr[i + 1]):
+            terms[k] = fabs(p.b[k])
+            if p.b[k] == 0.0 or is_row_unmoved(p, empty, i, k):
+                terms[k] = compute_row_terms(v, free, i, k)
+            largest = max(largest, terms[k])
+        for k in range(p.ptr[i], p.ptr[i + 1]):
+            if is_row_unmoved(p, empty, i, k):
+                terms[k] = -terms[k] if has_independent_rows(p, i) else -largest
+                if fabs(p.b[k]) <= 4.0 * unit_roundoff() * all_rows:
+                    terms[k] = -INFINITY
 
 
 cdef inline bint reference_needs_islands(const blocks_t* p, const double* out) noexcept nogil:

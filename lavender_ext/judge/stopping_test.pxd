@@ -1,7 +1,7 @@
 """Stopping test of sweep solvers: the judge's arithmetic, at sweep counts that depend only on the residuals.
 
-The first checks are at the start and after the first sweep. At the start, islands with a larger residual than the zero
-impulse begin from the zero impulse. From the residuals r0, r of the last two checks, k sweeps apart,
+The first checks are at the start and after the first sweep. The start is projected on its bounds, and islands may begin from
+the zero impulse instead (best.pxd). From the residuals r0, r of the last two checks, k sweeps apart,
 the end is predicted after n more sweeps, r (r/r0)^(n/k) <= tol. The next check is after n/2 sweeps, but at least an eighth
 of the sweeps done so far, and at most as many again or, from 64 sweeps on, a quarter of them. If the residual does not
 fall, it is after that eighth. The relative
@@ -19,14 +19,14 @@ residual r decides:
         progress predicted (judge/progress.pxd)     STALLED
 
 "Better": r is lower than ever, or E of an island that is not solved fell by 1 % since the last better check. Except at
-CONVERGED by r, the best impulse of each island is restored. A check costs about one sweep. Checks are compiled once, in
+CONVERGED by r, the impulse of best.pxd is restored. A check costs about one sweep. Checks are compiled once, in
 `stopping_test.pyx`; `run_until_stop` is called by pointer.
 """
 from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport view_t
-from lavender_ext.judge.best cimport best_workspace_size, best_t, bind_best
+from lavender_ext.judge.best cimport best_workspace_size, best_t, bind_best, restore_best_islands
 from lavender_ext.judge.progress cimport begin_progress, progress_t
 
 
@@ -39,6 +39,7 @@ cpdef enum:
 
 
 cdef enum:
+    LONG_RUN_SWEEPS = 64        # After so many sweeps, impulses that still grow may grow without end (best.pxd).
     N_EARLY_SWEEPS = 8          # Residuals of these sweeps may rise, because the zero impulse is nearly a solution.
 
 
@@ -48,6 +49,8 @@ cdef struct stopping_test_t:
     int32_t last_at             # sweeps at the last check
     int32_t best_at             # sweeps at the last better check, -1 before any
     int32_t patience            # minimum number of sweeps without a better check before a run stalls
+    int32_t keeps_last          # the last iterate is returned by (2) of best.pxd
+    int32_t has_failed          # the run has diverged or stalled
     int32_t again_at            # value of best_at at the last restart, 0 before any restart
     double start                # largest relative residual of checks in the first N_EARLY_SWEEPS sweeps
     double last                 # relative residual at the last check
@@ -79,7 +82,7 @@ cdef inline void begin_stopping_test(stopping_test_t* s, const blocks_t* p, doub
     s.start = 0.0
     s.last = s.best_relative = s.lowest = 1.0 / 0.0
     s.best_at = -1
-    s.again_at = 0
+    s.again_at = s.keeps_last = s.has_failed = 0
     s.patience = patience
     s.reference_energy = reference_energy
     s.reference_velocity = reference_velocity
@@ -100,6 +103,11 @@ cdef inline bint restart_if_stalled(stopping_test_t* s, int32_t patience) noexce
     s.again_at = s.best_at
     s.patience = s.total - 32 * s.best_at + patience
     return True
+
+
+cdef inline void restore_at_end(stopping_test_t* s, const view_t* v, double* lam, double tol) noexcept nogil:
+    """Replace lam (m), scored in `best.now` with slack `w`, by the impulse of best.pxd after the end of a run."""
+    restore_best_islands(&s.best, v, s.w, lam, tol, s.keeps_last, s.has_failed or s.total >= LONG_RUN_SWEEPS)
 
 
 cdef int32_t check_start(stopping_test_t* s, const view_t* v, const view_t* confirm, double* lam, double tol) noexcept nogil

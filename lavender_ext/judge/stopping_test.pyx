@@ -8,14 +8,15 @@ import numpy as np
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport view_t
-from lavender_ext.judge.best cimport (count_islands, copy_score_without_islands, relative_residual_of_best,
-                                      replace_stale_islands, store_better_islands, store_zero_if_better)
+from lavender_ext.judge.best cimport (count_islands, copy_score_without_islands, project_on_bounds, relative_residual_of_best,
+                                      restore_best_islands, store_better_islands, store_start)
 from lavender_ext.judge.measure cimport (residual_above_floor, relative_floor_of_score, judge_view, refine_view,
                                          relative_residual_of_score, count_judge_scratch)
 from lavender_ext.judge.progress cimport residual_envelope_slope, record_impulse, has_stalled, record_residual
 from lavender_ext.judge.score cimport make_empty_score, relative_residual, score_t, take_smallest_island_reference
 from lavender_ext.judge.stopping_test cimport (AT_FLOOR, CONVERGED, DIVERGED, N_EARLY_SWEEPS, RUNNING, STALLED,
-                                               begin_stopping_test, sweep_t, stopping_test_workspace_size, stopping_test_t)
+                                               begin_stopping_test, restore_at_end, sweep_t, stopping_test_workspace_size,
+                                               stopping_test_t)
 
 
 cdef inline double relative_residual_of_check(const stopping_test_t* s, const score_t* x) noexcept nogil:
@@ -104,11 +105,13 @@ cdef inline int32_t perform_residual_check(stopping_test_t* s, const view_t* v, 
     cdef bint refined = False, lost
     cdef int32_t end
     x.by_island = s.best.now
+    if s.total == 0:
+        project_on_bounds(p, lam)
     judge_view(v, lam, s.w, s.e, s.v, False, &x)
     now = relative_residual_of_check(s, &x)
     if s.total == 0:                                    # Begin from the better of the start and the zero impulse.
         copy_score_without_islands(&s.best, p, &x, now)
-        if replace_stale_islands(p, s.best.now, s.relative_at_zero, lam):
+        if store_start(&s.best, v, s.w, s.reference_energy, s.relative_at_zero, tol, lam):
             x = make_empty_score()
             x.by_island = s.best.now
             judge_view(v, lam, s.w, s.e, s.v, False, &x)
@@ -131,11 +134,9 @@ cdef inline int32_t perform_residual_check(stopping_test_t* s, const view_t* v, 
         end = status_after_refinement(s, &x, now, tol)
         if end != RUNNING:
             return end
-    if not lost or s.best.seen > 0:
-        store_better_islands(&s.best, v, lam, s.w, s.e, tol)
-        if s.best.seen == 1:
-            store_zero_if_better(&s.best, v, s.reference_energy, s.relative_at_zero)
-        s.best_relative = relative_residual_of_best(&s.best)
+    if s.total > 0 and (not lost or s.best.seen > 0):
+        store_better_islands(&s.best, v, lam, s.w, tol)
+    s.best_relative = relative_residual_of_best(&s.best)
     if s.best_relative <= tol:                          # The islands were solved at different checks.
         x = make_empty_score()
         last = judge_with_refinement(s, v, s.best.impulse, tol, &x, &refined)
@@ -148,8 +149,8 @@ cdef inline int32_t perform_residual_check(stopping_test_t* s, const view_t* v, 
         record_impulse(&s.progress, s.total, lam, p.n_rows)
         return RUNNING
     if lost or 1e6 * (s.start if s.start > 1.0 else 1.0) < now < inf:
-        if s.best_at >= 0:
-            memcpy(lam, s.best.impulse, p.n_rows * sizeof(double))
+        s.has_failed = True
+        restore_best_islands(&s.best, v, s.w, lam, tol, False, True)
         return DIVERGED
     if s.best_at >= 0 and s.best_relative <= 1e-6:
         x = make_empty_score()
@@ -158,7 +159,8 @@ cdef inline int32_t perform_residual_check(stopping_test_t* s, const view_t* v, 
             memcpy(lam, s.best.impulse, p.n_rows * sizeof(double))
             return AT_FLOOR
     if s.total > 32 * <double>s.best_at + s.patience and has_stalled(&s.progress, p, lam, s.total, s.lowest):
-        memcpy(lam, s.best.impulse, p.n_rows * sizeof(double))
+        s.has_failed = True
+        restore_at_end(s, v, lam, tol)
         return STALLED
     record_impulse(&s.progress, s.total, lam, p.n_rows)
     return RUNNING
@@ -235,9 +237,11 @@ cdef class StoppingTest:
         Minimum number of sweeps without a better check before a run stalls.
     confirm : Data, optional
         The same problem in another form, in which a status must also hold.
+    keeps_last : bool
+        Whether the last iterate is returned in unsolved islands under Coulomb's law or with an asymmetric A.
     """
 
-    def __init__(self, Data data, int patience=64, Data confirm=None):
+    def __init__(self, Data data, int patience=64, Data confirm=None, bint keeps_last=False):
         cdef Py_ssize_t m = data.blocks.n_rows, workspace
         cdef double[::1] scratch
         self.view = self.other = data.get_pointers()
@@ -249,6 +253,7 @@ cdef class StoppingTest:
         self.keep = data, confirm, scratch
         begin_stopping_test(&self.state, &self.view.p, data.reference_energy, data.reference_velocity, data.relative_at_zero,
                             patience, &scratch[0])
+        self.state.keeps_last = keeps_last
         self.state.w = &scratch[workspace]
         self.state.e = &scratch[workspace + m]
         self.state.v = &scratch[workspace + 2 * m]
@@ -280,9 +285,9 @@ cdef class StoppingTest:
                 now = judge_with_floor(s, &self.view, &lam[0], &x)
             copy_score_without_islands(&s.best, &self.view.p, &x, now)
             if not now <= tol:
-                store_better_islands(&s.best, &self.view, &lam[0], s.w, s.e, tol)
+                store_better_islands(&s.best, &self.view, &lam[0], s.w, tol)
                 s.best_relative = relative_residual_of_best(&s.best)
-                memcpy(&lam[0], s.best.impulse, lam.shape[0] * sizeof(double))
+                restore_at_end(s, &self.view, &lam[0], tol)
 
     @property
     def sweeps_per_decade(self):

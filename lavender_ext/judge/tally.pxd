@@ -18,7 +18,7 @@ cdef struct tally_t:
 cdef struct floor_t:            # norms of F, the rounding of a slack
     double energy               # sum (F / d) F
     double fast                 # max nu (F / d) F
-    double own                  # with islands: max F / |b|; rows of a contact use b of its normal
+    double own                  # with islands: max F / s; rows of a contact use s of its normal
 
 
 cdef inline int32_t get_block_in_order(const int32_t* order, int32_t a) noexcept nogil:
@@ -26,17 +26,30 @@ cdef inline int32_t get_block_in_order(const int32_t* order, int32_t a) noexcept
     return a if order == NULL else order[a]
 
 
-cdef inline double ratio_to_row_terms(double size, double own, double scale) noexcept nogil:
-    """Return the size of an error [m/s] over the terms of its row; if these are 0, `scale`: sqrt(d) |e| over E0 of all rows."""
-    return ratio_to_reference(size, own) if own > 0.0 or size == 0.0 else scale
+cdef inline double get_row_terms(const blocks_t* p, int32_t k) noexcept nogil:
+    """Return s_k of judge/reference.pxd, the terms of row k [m/s]."""
+    return fabs(p.b[k]) if p.islands == NULL or p.islands.terms == NULL else fabs(p.islands.terms[k])
+
+
+cdef inline double relative_residual_of_unmoved_rows(const blocks_t* p, const int32_t* order, int32_t first, int32_t end,
+                                                     const double* e) noexcept nogil:
+    """Return the largest d_k |e_k| / s_k over the rows of blocks order[first:end] that no impulse moves; 0 without such rows."""
+    cdef int32_t a, i, k
+    cdef double r, worst = 0.0
+    if p.islands == NULL or p.islands.terms == NULL:
+        return 0.0
+    for a in range(first, end):
+        i = get_block_in_order(order, a)
+        for k in range(p.ptr[i], p.ptr[i + 1]):
+            if p.islands.terms[k] < 0.0:
+                r = ratio_to_reference(p.d[k] * fabs(e[k]), -p.islands.terms[k])
+                worst = r if r > worst else worst
+    return worst
 
 
 cdef inline double relative_residual_by_rows(const blocks_t* p, const int32_t* order, int32_t first, int32_t end,
-                                             const double* e, double total_energy) noexcept nogil:
-    """Return (3) of judge/reference.pxd over blocks order[first:end]; if order is NULL, over blocks [first, end).
-
-    total_energy is E0 of all rows.
-    """
+                                             const double* e) noexcept nogil:
+    """Return (3) of judge/reference.pxd over blocks order[first:end]; if order is NULL, over blocks [first, end)."""
     cdef int32_t a, i, j, k
     cdef double r, worst = 0.0, s
     for a in range(first, end):
@@ -44,14 +57,13 @@ cdef inline double relative_residual_by_rows(const blocks_t* p, const int32_t* o
         j = p.ptr[i]
         if has_independent_rows(p, i):
             for k in range(j, p.ptr[i + 1]):
-                r = ratio_to_row_terms(p.d[k] * fabs(e[k]), fabs(p.b[k]),
-                                       ratio_to_reference(sqrt(p.d[k]) * fabs(e[k]), total_energy))
+                r = ratio_to_reference(p.d[k] * fabs(e[k]), get_row_terms(p, k))
                 worst = r if r > worst else worst
             continue
         s = 0.0
         for k in range(j, p.ptr[i + 1]):
             s += (p.d[k] * e[k]) * e[k]
-        r = ratio_to_row_terms(sqrt(p.d[j]) * sqrt(s), fabs(p.b[j]), ratio_to_reference(sqrt(s), total_energy))
+        r = ratio_to_reference(sqrt(p.d[j]) * sqrt(s), get_row_terms(p, j))
         worst = r if r > worst else worst
     return worst
 
@@ -153,8 +165,7 @@ cdef inline void add_slack_rounding(const blocks_t* p, int32_t k, int32_t first,
     if t > s.fast:
         s.fast = t
     if p.islands != NULL:
-        t = ratio_to_row_terms(f * sqrt(p.d[first] / p.d[k]), fabs(p.b[first]),
-                               ratio_to_reference(f / sqrt(p.d[k]), p.islands.energy))
+        t = ratio_to_reference(f * sqrt(p.d[first] / p.d[k]), get_row_terms(p, first))
         if t > s.own:
             s.own = t
 
@@ -254,9 +265,9 @@ cdef inline double relative_residual_of_island(const blocks_t* p, int32_t island
     if not energy + velocity < 1.0 / 0.0:
         return 1.0 / 0.0
     if reference[0] < 0.0:
-        return relative_residual_by_rows(p, p.islands.order, p.islands.ptr[island], p.islands.ptr[island + 1], e,
-                                p.islands.energy)
-    return relative_residual(energy, velocity, reference[0], reference[1])
+        return relative_residual_by_rows(p, p.islands.order, p.islands.ptr[island], p.islands.ptr[island + 1], e)
+    return max(relative_residual(energy, velocity, reference[0], reference[1]),
+               relative_residual_of_unmoved_rows(p, p.islands.order, p.islands.ptr[island], p.islands.ptr[island + 1], e))
 
 
 cdef inline double relative_floor_of_island(const blocks_t* p, int32_t island, const floor_t* f) noexcept nogil:

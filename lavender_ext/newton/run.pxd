@@ -252,7 +252,7 @@ cdef inline void bind_judge_arrays(newton_t* n, arena_t* a) noexcept nogil:
     n.problem.x = take_doubles(a, m + (12 * <int64_t>o.r.n_bodies if o.r != NULL else o.g.n if o.g != NULL else 0))
     if has_memory(a):
         bind_best(&n.island_best, &n.problem.p, best)
-        n.island_best.by_residual = 1                   # Only solved islands are combined.
+        n.island_best.by_energy = 1                   # Only solved islands are combined.
 
 
 cdef inline void bind_indices(newton_t* n, arena_t* a) noexcept nogil:
@@ -408,8 +408,7 @@ cdef inline double judge_and_keep_best_point(newton_t* n, const double* z) noexc
     if residual < n.best:
         n.best = residual
         copy_vector(n, n.best_z, z)
-    if (store_better_islands(&n.island_best, &v, n.lam, n.problem.w, n.problem.error, n.tol) and n.island_best.n > 1
-            and not n.best <= n.tol):
+    if store_better_islands(&n.island_best, &v, n.lam, n.problem.w, n.tol) and n.island_best.n > 1 and not n.best <= n.tol:
         combined = relative_residual_of_best(&n.island_best)
         if combined <= n.tol:
             n.best = combined

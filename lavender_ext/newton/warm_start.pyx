@@ -1,6 +1,7 @@
 """First phase of Newton's method from a warm start; `warm_start.pxd` has the equations."""
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
+from libc.string cimport memcpy
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from lavender_ext.core.start cimport is_zero_impulse
 from lavender_ext.core.velocity cimport compute_velocity_change
 from lavender_ext.core.view cimport rows_t
 from lavender_ext.factor.linear cimport analyse_band, factor_linear_system_matrix, solve_linear_system, linear_t
-from lavender_ext.judge.best cimport replace_stale_islands
+from lavender_ext.judge.best cimport begin_at_better_point, project_on_bounds
 from lavender_ext.judge.measure cimport score_given_slack
 from lavender_ext.judge.score cimport make_empty_score, relative_residual, score_t
 from lavender_ext.judge.slack cimport compute_body_slack
@@ -215,7 +216,7 @@ cdef int32_t solve_from_warm_start(const blocks_t* p, const rows_t* r, warm_t* s
                                int32_t has_velocity) noexcept nogil:
     """Solve in place from lam (m) [N s], which is not zero, to the relative residual tol; return the result code.
 
-    Islands with a larger residual than the zero impulse begin from the zero impulse.
+    The start is projected on its bounds, and islands may begin at the zero impulse instead (judge/best.pxd).
 
     v (n_bodies, 6) receives M^-1 J^T lam; with has_velocity it holds this product of the start on entry.
     """
@@ -226,6 +227,10 @@ cdef int32_t solve_from_warm_start(const blocks_t* p, const rows_t* r, warm_t* s
     s.n_traced = 0
     if is_zero_impulse(p, lam) or p.n_rows > MAX_WARM_ROWS or p.law != COULOMB or not zero_impulse_errors(p, &e0, &v0):
         return UNDECIDED
+    memcpy(s.given, lam, p.n_rows * sizeof(double))
+    project_on_bounds(p, lam)
+    for j in range(p.n_rows):
+        has_velocity = has_velocity and s.given[j] == lam[j]
     if not has_velocity:
         compute_velocity_change(p, r, lam, v)
     s.relative = score_impulse(p, r, s, lam, v, e0, v0)
@@ -233,9 +238,7 @@ cdef int32_t solve_from_warm_start(const blocks_t* p, const rows_t* r, warm_t* s
         return JUDGED
     if p.islands == NULL:
         s.by_island[0] = s.relative
-    for j in range(p.n_rows):
-        s.given[j] = lam[j]
-    if replace_stale_islands(p, s.by_island, 1.0, lam):
+    if begin_at_better_point(p, s.by_island, 1.0, s.slack, True, tol, lam):
         compute_velocity_change(p, r, lam, v)
         s.relative = score_impulse(p, r, s, lam, v, e0, v0)
         if s.relative <= tol:

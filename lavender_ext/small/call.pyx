@@ -31,6 +31,7 @@ from lavender_ext.small.call cimport (N_COUNTS, RESULT_FAILED, RESULT_IS_START, 
 from lavender_ext.small.friction cimport friction_run_t, subproblem_t, solve_subproblem, subproblem_work_size
 from lavender_ext.small.limits cimport has_only_free_rows
 from lavender_ext.small.workspace cimport fits_workspace, free_workspace, grow_workspace_to, grow_workspace_to_arena
+from lavender_ext.judge.best cimport project_on_bounds
 from lavender_ext.judge.measure cimport (set_zero_impulse, relative_floor_of_score, judge_view, make_judged,
                                          relative_residual_of_score, count_judge_scratch)
 from lavender_ext.judge.score cimport make_empty_score
@@ -109,14 +110,17 @@ cdef bint set_start_of_small_problem(small_problem_t* s, const small_rules_t* ru
                                      double* both, double* scratch) noexcept nogil:
     """Set the start `own` (m) [N s], the zero impulse if `cold`; return whether it is a solution, which is then judged.
 
-    The residual is checked only if another method follows. A start with a residual above that of the zero impulse, or above
-    `warm` for pivots, is replaced by the zero impulse. scratch: m numbers plus those of `judge_view`.
+    The start is projected on its bounds. Its residual is checked only if another method follows. A start with a residual
+    above that of the zero impulse, or above `warm` for pivots, is replaced by the zero impulse. scratch: m numbers plus
+    those of `judge_view`.
     """
     cdef int32_t m = s.v.p.n_rows
     cdef double residual = s.zero_residual[2]
     set_zero_impulse(&s.v.p, scratch, both)
     if cold:
         memcpy(own, scratch, m * sizeof(double))
+    else:
+        project_on_bounds(&s.v.p, own)
     if not rules.follows:
         return False
     cold = memcmp(own, scratch, m * sizeof(double)) == 0

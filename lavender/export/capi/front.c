@@ -42,6 +42,7 @@ struct lav_solver {
   double *impulse, *v_free, *score_workspace, *compare;
   double start[3]; /* Reference energy E0 [sqrt J] and velocity V0 [m/s], relative residual of the zero impulse. */
   struct core_block_types_islands_t islands;
+  double *terms;     /* Terms of each row, for rows without another reference. */
   double *reference; /* E0 and V0 of each island, then the relative residual of its zero impulse. */
   int32_t *order, *empty, *marks, *island_marks;
   int32_t split, mode;

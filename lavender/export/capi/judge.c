@@ -31,33 +31,29 @@ static double judge(lav_solver *s, const double *impulse, int32_t floor, double 
   return first;
 }
 
-/* Return the relative residual of an impulse, and store it in `best` for the islands that it improves. A negative tol marks a
- * start. */
-static double see(lav_solver *s, struct judge_best_best_t *best, const double *impulse, double tol) {
+/* Return the relative residual of an impulse, and keep it in the islands that it improves. -tol marks the start, which
+ * becomes the zero impulse in islands that begin there; the result is then whether it changed. */
+static double see(lav_solver *s, double *impulse, double tol) {
+  struct judge_best_best_t *best = &s->stopping_test.best;
   score_t t = judge_score_make_empty_score();
   double relative;
   t.by_island = best->now;
   judge_measure_judge_view(&s->read, impulse, s->stopping_test.w, s->stopping_test.e, s->stopping_test.v, 0, &t);
   relative = judge_measure_relative_residual_of_score(&t, s->stopping_test.w, s->p.n_rows, s->start[0], s->start[1]);
   judge_best_copy_score_without_islands(best, &s->p, &t, relative);
-  if (tol < 0.0) judge_best_store_better_start(best, &s->read, impulse, s->stopping_test.w, s->stopping_test.e);
-  else judge_best_store_better_islands(best, &s->read, impulse, s->stopping_test.w, s->stopping_test.e, tol);
+  if (tol < 0.0) return judge_best_store_start(best, &s->read, s->stopping_test.w, s->start[0], s->start[2], -tol, impulse);
+  judge_best_store_better_islands(best, &s->read, impulse, s->stopping_test.w, tol);
   return relative;
 }
 
 #ifndef LAV_SWEEPS_ONLY
-/* Begin from the zero impulse in islands in which it has a smaller residual than the start; sweeps do so at their first check. */
-static void replace_stale_start(lav_solver *s) {
-  score_t t = judge_score_make_empty_score();
-  double *now = s->stopping_test.best.now;
+/* Keep the start, and begin at the better of it and the zero impulse; sweeps do so at their first check. */
+static void begin_at_start(lav_solver *s, double tol) {
   int32_t i = 0;
   while (i < s->p.n_rows && s->impulse[i] == core_start_clip_zero_to_row_bounds(&s->p, i)) i++;
   if (i == s->p.n_rows) return;
-  t.by_island = now;
-  judge_measure_judge_view(&s->read, s->impulse, s->stopping_test.w, s->stopping_test.e, s->stopping_test.v, 0, &t);
-  judge_best_copy_score_without_islands(&s->stopping_test.best, &s->p, &t,
-      judge_measure_relative_residual_of_score(&t, s->stopping_test.w, s->p.n_rows, s->start[0], s->start[1]));
-  if (judge_best_replace_stale_islands(&s->p, now, s->start[2], s->impulse)) s->driven = 0;
+  judge_best_project_on_bounds(&s->p, s->impulse);
+  if (see(s, s->impulse, -tol) != 0.0) s->driven = 0;
 }
 #endif
 

@@ -105,8 +105,8 @@ static void run_sweeps(lav_solver *s, const lav_budget *budget, lav_result *out)
   if (s->mode == core_order_SYMMETRIC && is_accelerated(&s->options)) out->sweeps *= 2;
 #endif
   if (budget->tol > 0.0 && s->stopping_test.best_at >= 0 && out->outcome != LAV_CONVERGED) { /* The residual may have risen: return the best iterate. */
-    if (see(s, &s->stopping_test.best, s->impulse, budget->tol) > budget->tol) {
-      COPY(s->impulse, s->stopping_test.best.impulse, s->p.n_rows);
+    if (see(s, s->impulse, budget->tol) > budget->tol) {
+      judge_stopping_test_restore_at_end(&s->stopping_test, &s->read, s->impulse, budget->tol);
       sweep_serial_compute_sweep_velocities(&s->swept.context, s->impulse);
     }
   }
@@ -186,15 +186,13 @@ static int32_t start_newton(lav_solver *s) {
   return LAV_OK;
 }
 
-/* After a run that did not converge, keep in each island the best of its result, its start and the zero impulse. */
-static void keep_better(lav_solver *s, const double *begin, double tol) {
-  struct judge_best_best_t best;
-  judge_best_bind_best(&best, &s->p, s->score_workspace);
-  double *zero = s->compare + s->p.n_rows; /* `begin` is stored before it. */
-  judge_measure_set_zero_impulse(&s->p, zero, s->stopping_test.w);
-  see(s, &best, begin, -1.0);
-  see(s, &best, zero, -1.0);
-  if (see(s, &best, s->impulse, tol) > tol) COPY(s->impulse, best.impulse, s->p.n_rows);
+/* After a run that did not converge, keep in each island the best of its result and its start. */
+static void keep_better(lav_solver *s, double tol) {
+  if (s->stopping_test.best.seen == 0) {
+    judge_measure_set_zero_impulse(&s->p, s->compare, s->stopping_test.w);
+    see(s, s->compare, -tol);
+  }
+  if (see(s, s->impulse, tol) > tol) COPY(s->impulse, s->stopping_test.best.impulse, s->p.n_rows);
 }
 
 static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out) {
@@ -202,7 +200,6 @@ static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out)
   double closer = 1.0;
   int32_t how = core_method_MORE, before = 0;
   lav_verdict now;
-  COPY(s->compare, s->impulse, s->p.n_rows);
   if (!s->driven || budget->tol != s->newton_options.tol || budget->iterations != s->newton_options.budget)
     how = begin_newton(s, budget->tol, budget->iterations);
   s->driven = 0;
@@ -223,7 +220,7 @@ static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out)
     else if (how != core_method_MORE && how != core_method_CERTIFICATE) out->outcome = LAV_STALLED;
     else if (is_late(s, budget)) out->outcome = LAV_TIME_LIMIT;
   }
-  if (out->outcome != LAV_CONVERGED && out->outcome != LAV_ROUNDOFF_LIMIT) keep_better(s, s->compare, budget->tol);
+  if (out->outcome != LAV_CONVERGED && out->outcome != LAV_ROUNDOFF_LIMIT) keep_better(s, budget->tol);
   s->newton_options.tol = budget->tol;
   s->newton_options.budget = budget->iterations;
   out->restarts = out->iterations;

@@ -45,6 +45,7 @@ static void take_blocks(lav_solver *s, const lav_problem *q) {
   s->marks = TAKE(s, int32_t, 4 * ((int64_t)s->kept.most_blocks + k) + m + 2 * n + 4 * nv + 16); /* Scratch. */
   s->island_marks = TAKE(s, int32_t, 4 * k + 1 + (q->form == LAV_VELOCITIES ? 2 * nv : q->form == LAV_BODIES ? n : m));
   s->reference = TAKE(s, double, 3 * k);
+  s->terms = TAKE(s, double, m);
   s->score_workspace = TAKE(s, double, judge_stopping_test_stopping_test_workspace_size(m, k + 1));
   s->stopping_test.w = TAKE(s, double, m);
   s->stopping_test.e = TAKE(s, double, m);

@@ -251,8 +251,8 @@ static int32_t set_problem(lav_solver *s, const lav_problem *q) {
   if (q->form == LAV_MATRIX) s->read.a = &s->a;
   else if (q->form == LAV_BODIES) s->read.r = &s->r;
   else s->read.g = general_of(s);
-  judge_measure_judge_zero_impulse(&s->read, s->island_marks, &s->islands, s->reference, s->impulse, s->stopping_test.w, s->stopping_test.e,
-                              s->stopping_test.v, s->start);
+  judge_measure_judge_zero_impulse(&s->read, s->island_marks, &s->islands, s->reference, s->empty, q->form == LAV_MATRIX ? NULL : s->v_free,
+                              s->terms, s->impulse, s->stopping_test.w, s->stopping_test.e, s->stopping_test.v, s->start);
   s->p.islands = s->read.p.islands;
   if (q->impulse) COPY(s->impulse, q->impulse, q->n_rows);
   else carry(s);
@@ -302,9 +302,13 @@ static int32_t run(lav_solver *s, const lav_budget *requested, lav_result *out) 
   out->outcome = LAV_MAX_ITERATIONS;
   out->iterations = out->sweeps = out->restarts = 0;
   s->deadline = is_timed(budget) ? budget->clock(budget->clock_data) + budget->seconds : 0.0;
-  if (!s->begun) judge_stopping_test_begin_stopping_test(&s->stopping_test, &s->p, s->start[0], s->start[1], s->start[2], row->patience, s->score_workspace);
+  if (!s->begun) {
+    judge_stopping_test_begin_stopping_test(&s->stopping_test, &s->p, s->start[0], s->start[1], s->start[2], row->patience, s->score_workspace);
+    s->stopping_test.keeps_last = s->options.method == LAV_PGS || s->options.method == LAV_SEQUENTIAL_IMPULSES
+                                  || s->options.method == LAV_BLOCK_GAUSS_SEIDEL || s->options.method == LAV_GAUSS_SEIDEL;
+  }
 #ifndef LAV_SWEEPS_ONLY
-  if (!s->begun && budget->tol > 0.0 && row->step != run_sweeps) replace_stale_start(s);
+  if (!s->begun && budget->tol > 0.0 && row->step != run_sweeps) begin_at_start(s, budget->tol);
 #endif
   s->begun = 1;
   if (s->p.n_rows == 0) {

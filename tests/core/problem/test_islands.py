@@ -213,6 +213,57 @@ def test_a_row_that_nothing_moves_has_no_scale_of_its_own():
         assert lv.solve(lv.Problem.lcp(np.diag([1.0, 0.0]), [1.0, b])).status is status
 
 
+def unmoved_row_beside(b, form, target=1.0):
+    """Row 0 asks for b [m/s]; row 1, which is zero, asks for `target`, and nothing can meet it."""
+    if form == "A":
+        return lv.Problem.lcp(np.diag([1.0, 0.0]), [b, target])
+    if form == "A, one block":
+        cones = lv.Cones([0, 2], [0], [0.0, 0.0], [np.inf, np.inf], [0.0], [0.0])
+        return lv.Problem([b, target], cones, np.diag([1.0, 0.0]))
+    if form == "A, coupled":  # Row 1 moves row 0, but no impulse moves row 1.
+        return lv.Problem.lcp(np.array([[1.0, 0.1], [0.0, 0.0]]), [b, target])
+    if form == "J and M":
+        cones = lv.Cones.bounded([0.0, 0.0], [np.inf] * 2)
+        return lv.Problem.from_jacobian(np.diag([1.0, 0.0]), np.eye(2), [-b, 0.0], target=[0.0, target], cones=cones)
+    rows = lv.Rows(
+        inv_mass=[1.0, 0.0, 0.0], inv_inertia=[np.eye(3), np.zeros((3, 3)), np.zeros((3, 3))],
+        v_free=[[0.0, 0.0, -b] + [0.0] * 3, [0.1 * target] + [0.0] * 5, [0.3 * target] + [0.0] * 5],
+        contact_body=[(-1, 0), (1, 2)],
+        normal=[(0.0, 0.0, 1.0), (1.0, 0.0, 0.0)], tangent=[(1.0, 0.0, 0.0), (0.0, 1.0, 0.0)], arm_a=np.zeros((2, 3)),
+        arm_b=np.zeros((2, 3)),
+    )  # fmt: skip
+    return lv.Problem.from_rows(rows, target=[0.0, 1.2 * target], tangents=0)
+
+
+@pytest.mark.parametrize("form", ["A", "A, one block", "A, coupled", "J and M", "bodies"])
+def test_residual_row_that_no_impulse_moves_does_not_depend_on_other_rows(form):
+    for b, tol, target in ((1e6, 1e-6, 1.0), (1e9, 1e-8, 1.0), (1e9, 1e-3, 1e3), (1e-9, 1e-6, 1e-9), (1e3, 1e-3, 1.0)):
+        problem = unmoved_row_beside(b, form, target)
+        worlds = [lv.solve(problem, "pgs" if form.startswith("A") else "auto", tol=tol), lv.solve(problem, tol=tol)]
+        for solution in [*worlds, *lv.solve_many([problem] * 2, "newton", tol=tol)]:
+            assert solution.status is lv.Status.INFEASIBLE and not solution.success, (form, b, tol)
+        assert worlds[1].claim_check == "confirmed" and problem.row_name(1).split(",")[0] in worlds[1].message
+        assert worlds[1].residual.relative == pytest.approx(1.0 / 1.6 if form == "bodies" else 1.0, rel=1e-6)
+        assert any(s.kind == "immovable" and s.blocks for s in lv.diagnose(problem))
+
+
+def test_residual_row_with_zero_b_at_rest_is_compared_with_its_own_terms():
+    """Row 1 is at rest; an impulse of 0.5 N s on it moves it by 0.5 m/s, however large b of row 0 is."""
+    assert not lv.residual(lv.Problem.lcp(np.eye(2), [1e9, 0.0]), [1e9, 0.5]).relative <= 1.0
+    cones = lv.Cones.bounded([-np.inf] * 2, [np.inf] * 2)
+    rolls = lv.Problem.from_jacobian(np.eye(2), np.eye(2), [-1e9, 3.0], target=[0.0, 3.0], cones=cones)
+    # |target| + |J v*| is 6 m/s.
+    assert lv.residual(rolls, [1e9, 0.5]).relative == pytest.approx(0.5 / 6.0)
+    assert lv.solve(rolls, tol=1e-9).success
+
+
+def test_residual_rounding_of_moving_immovable_bodies_is_satisfied():
+    """b = 0.2 - (0.3 - 0.1) of two immovable bodies is rounding of its terms, so that no impulse is needed."""
+    problem = unmoved_row_beside(1e-3, "bodies", 1.0).updated(b=[1e-3, 2.8e-17])
+    solution = lv.solve(problem, tol=1e-6)
+    assert solution.success and solution.residual.relative < 1e-15
+
+
 def test_bodies_that_share_nothing_are_islands_in_every_form():
     problem = random_contact_problem(3, tangents=2, spin=False)
     both, _ = rows_side_by_side(problem, random_contact_problem(4, tangents=2, spin=False))

@@ -1,10 +1,11 @@
-"""Which impulse a solve returns: the lowest objective, no worse than its start, and inside its bounds."""
+"""Tests of the impulse that a solve returns (`lavender_ext/judge/best.pxd`), and that it is inside its bounds."""
 
 import numpy as np
 import pytest
 from random_problems import random_contact_problem, random_lcp, without_solution
 
 import lavender as lv
+from lavender.problem.cones import project_impulse
 from lavender.solvers.islands import find_islands
 
 DT = 1.0 / 60.0
@@ -87,16 +88,70 @@ def test_sweeps_asymmetric_matrix_with_motor_holds_the_free_rows():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_solve_many_stale_starts_are_never_worse_than_zero_impulses(seed):
+def test_solve_many_stale_starts_have_no_larger_energy_error_than_zero_impulses(seed):
     problems = [random_contact_problem(seed + i) for i in range(4)]
     rng = np.random.default_rng(seed)
     starts = [10.0**i * rng.normal(size=p.m) for i, p in enumerate(problems)]
-    for name in ("sequential_impulses", "newton", "auto"):
-        for problem, world in zip(
-            problems, lv.solve_many(problems, name, impulses=starts, tol=1e-13, max_iter=1), strict=True
-        ):
-            relative = lv.residual(problem, world.impulse).islands.relative
-            assert (relative <= 1.0 + 1e-9).all(), name
+    for name in ("newton", "auto", "anderson"):
+        for world in lv.solve_many(problems, name, impulses=starts, tol=1e-13, max_iter=1):
+            islands = world.residual.islands
+            assert (islands.energy <= islands.energy_at_zero * (1.0 + 1e-9)).all(), name
+
+
+def gear_train(contact, force=1e5, ratio=3.0, wheels=7):
+    """Wheels on hinges, each driving the next `ratio` times as fast, and a motor of `force` N m on the first."""
+    dt, nv = 1.0 / 60.0, 3 * wheels
+    unit = np.eye(nv)
+    hinges = [unit[3 * i + k] for i in range(wheels) for k in (0, 1)]
+    gears = [
+        ratio * unit[3 * i + 2] - unit[3 * i + 5] + 0.1 * (unit[3 * i + 1] - unit[3 * i + 4]) for i in range(wheels - 1)
+    ]
+    free = len(hinges) + len(gears)
+    limit = np.r_[np.full(free, np.inf), force * dt]
+    rows, target, cones = [*hinges, *gears, unit[2]], [0.0] * free + [1.0], lv.Cones.bounded(-limit, limit)
+    if contact:  # The last wheel rests on the ground, and may roll on it.
+        rows, target = [*rows, unit[-2], unit[-3], unit[-1]], [*target, 0.0, 0.0, 0.0]
+        cones = cones + lv.Cones.contacts([0.5])
+    v = np.zeros(nv)
+    v[1::3] = -9.81 * dt
+    return lv.Problem.from_jacobian(np.array(rows), np.diag([1.0, 1.0, 0.01] * wheels), v, target=target, cones=cones)
+
+
+@pytest.mark.parametrize("contact", [False, True])
+@pytest.mark.parametrize("name", ["pgs", "block_gauss_seidel", "anderson"])
+def test_sweeps_that_stop_at_a_strong_gear_train_hold_the_hinges(name, contact):
+    problem = gear_train(contact)
+    for sweeps in (10, 64, 1000):
+        solution = lv.solve(problem, name, max_iter=sweeps)
+        # Without impulses the hinges fall with 0.16 m/s; ten sweeps of a loop by hand leave 3e-4 m/s.
+        assert np.abs(problem.velocity(solution.impulse).reshape(-1, 3)[:, :2]).max() < 1e-3, sweeps
+
+
+@pytest.mark.parametrize("name", ["pgs", "block_gauss_seidel", "sequential_impulses"])
+def test_sweeps_under_coulomb_law_return_the_last_iterate(name):
+    for seed in range(10):
+        problem = random_contact_problem(seed)
+        for sweeps in (1, 3, 10):
+            solution, last = (lv.solve(problem, name, tol=tol, max_iter=sweeps) for tol in (1e-13, 0.0))
+            if find_islands(problem)[0] == 1 and not solution.success:
+                np.testing.assert_array_equal(solution.impulse, last.impulse)
+
+
+@pytest.mark.parametrize("name", ["pgs", "block_gauss_seidel", "nncg", "anderson"])
+def test_sweeps_result_passed_on_as_start_never_raises_the_objective(name):
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        n = int(rng.integers(3, 9))
+        scale = 10.0 ** rng.uniform(-2, 2, n)  # kg^-1/2: masses of 0.1 g to 10 t
+        factor = rng.normal(size=(n, n)) * scale[:, None]
+        limit = np.where(rng.random(n) < 0.4, np.inf, 10.0 ** rng.uniform(-2, 1, n))
+        problem = lv.Problem(rng.normal(size=n), lv.Cones.bounded(-limit, limit), factor @ factor.T)
+        impulse, value = np.zeros(n), 0.0
+        for _ in range(20):
+            solution = lv.solve(problem, name, tol=1e-6, max_iter=8, impulse=impulse)
+            impulse, before = solution.impulse, value
+            value = objective(problem, impulse)
+            assert value <= before + 1e-9 * abs(before), seed
 
 
 # -- starts ------------------------------------------------------------------------------------------------------------
@@ -106,7 +161,7 @@ def test_solve_many_stale_starts_are_never_worse_than_zero_impulses(seed):
 @pytest.mark.parametrize(
     "name", [*SWEEPS, "newton", "direct", "lemke", "jacobi", "gauss_seidel", "sor", "admm", "auto"]
 )
-def test_solve_stale_start_is_never_worse_than_zero_impulses(name, form):
+def test_solve_stale_start_is_never_behind_its_start_or_zero_impulses(name, form):
     for seed in range(6):
         problem = random_lcp(seed) if form == "A" else random_contact_problem(seed)
         if name not in lv.available(problem):
@@ -114,14 +169,19 @@ def test_solve_stale_start_is_never_worse_than_zero_impulses(name, form):
         rng = np.random.default_rng(seed)
         for size in (0.3, 30.0, 1e4):
             start = size * rng.normal(size=problem.m)
-            islands = lv.residual(problem, start).islands.relative
+            inside = project_impulse(problem.cones, start)
             solution = lv.solve(problem, name, impulse=start, tol=1e-12, max_iter=1)
-            found = solution.residual.islands.relative
-            # An island that does not improve ends where it began: at the better of start and zero.
-            worst = np.minimum(islands, 1.0) * (1.0 + 1e-9)
-            allowed = (found <= worst) | (found <= solution.residual.roundoff_floor * 2.0)
-            lower = objective(problem, solution.impulse) <= 1e-12
-            assert allowed.all() or (lower and problem.law != "coulomb"), (seed, size)
+            found = solution.residual.islands
+            np.testing.assert_allclose(project_impulse(problem.cones, solution.impulse), solution.impulse, rtol=1e-12)
+            if problem.law != "coulomb":
+                worst = min(objective(problem, inside), 0.0)
+                assert objective(problem, solution.impulse) <= worst + 1e-9 * abs(worst) or solution.success, (
+                    seed,
+                    size,
+                )
+            elif name not in ("pgs", "sequential_impulses", "block_gauss_seidel", "gauss_seidel"):
+                worst = np.minimum(lv.residual(problem, inside).islands.energy, found.energy_at_zero)
+                assert (found.energy <= worst * (1.0 + 1e-9)).all(), (seed, size)
 
 
 def test_sweeps_stale_start_begin_at_zero_in_that_island_alone():
