@@ -192,6 +192,8 @@ def solve_new_generalized_problem(Data p, start, double tol, Limits limits, doub
     return make_task_result(&j, p, impulse, results)
 
 
+# [s] A limit of at least this does not end the call of few rows, which `solve_general` may repeat if the call fails.
+cdef double MIN_LONG_LIMIT = 0.1
 cdef tuple NO_CALL = (None, None, None, None), LAWS_OF_ROWS = ("linear", "lcp")
 cdef object Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, read_clock
 
@@ -265,12 +267,17 @@ def make_solve(solve_general, solve_after_call, dict registered):
     """
     def solve(problem, solver="auto", *surplus, impulse=None, tol=1e-6, velocity_tol=None, max_iter=None, time_limit=None,
               history=False, callback=None, **options):
-        if (velocity_tol is None and max_iter is None and time_limit is None and callback is None and history is False
-                and not options and not surplus and type(problem) is Problem and type(tol) is float and type(solver) is str):
+        if (velocity_tol is None and max_iter is None and callback is None and history is False and not options
+                and not surplus and type(problem) is Problem and type(tol) is float and type(solver) is str):
             spec = registered.get(solver)
-            if spec is not None:
+            if time_limit is None and spec is not None:
                 solution, _, counts, _ = solve_compiled(problem, spec, impulse, tol)
                 return solution if solution is not None else solve_after_call(problem, spec, impulse, tol, counts)
+            if spec is not None and type(time_limit) is float and time_limit >= MIN_LONG_LIMIT and spec.small is not None \
+                    and len(problem.b) <= (<Rules>spec.small.rules).at.rows:
+                solution = solve_compiled(problem, spec, impulse, tol)[0]
+                if solution is not None:
+                    return solution
         return solve_general(problem, solver, *surplus, impulse=impulse, tol=tol, velocity_tol=velocity_tol, max_iter=max_iter,
                              time_limit=time_limit, history=history, callback=callback, **options)
 
