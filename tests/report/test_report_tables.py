@@ -9,7 +9,7 @@ import pytest
 
 from lavender.base.deadline import format_seconds
 from lavender.report import Report, tables
-from lavender.report.recommendation import recommend
+from lavender.report.findings import recommend
 from lavender.report.render import format_cells, format_markdown, list_number_heads
 from lavender.report.tables import read_engine_answers
 from lavender.report.text import format_percent
