@@ -372,7 +372,7 @@ class Contents:
         A stopped run has the cases on which every solver was measured. If it was stopped in its first sequence, it has
         the solvers before the one that was measured then, or, without any, the passes before the last.
         """
-        frame = select_newest_runs(self.lines)
+        frame = select_newest_runs(self.runs, self.cases, self.machine)
         if not (self.is_stopped and len(frame)):
             return frame, []
         last, solvers = frame.iloc[-1], self.machine["plan"].get("solvers", ())
@@ -401,7 +401,8 @@ class Contents:
     def earlier_frame(self) -> pd.DataFrame:
         """The newest of the earlier runs."""
         assert self.earlier is not None
-        return select_newest_runs(self.earlier)
+        earlier = Contents(self.earlier)
+        return select_newest_runs(earlier.runs, earlier.cases, earlier.machine)
 
     @cached_property
     def tolerances(self) -> tuple[float, ...]:
@@ -437,14 +438,13 @@ class Contents:
         return f"{busy} The times are invalid; measure again with --no-reuse." if busy else ""
 
 
-def select_newest_runs(lines: Frame) -> Frame:
+def select_newest_runs(runs: Frame, cases: Frame, machine: Row) -> Frame:
     """Return the runs of the machine that wrote last, of cases with unchanged numbers.
 
     Times are compared only within one run, and a file that has changed is another problem.
     """
-    runs, cases = select_runs(lines), select_cases(lines)
     same = runs["sha"].astype(str) == runs["case"].astype(object).map(cases["sha"].astype(str).to_dict())
-    return runs[same & (runs["run"] == next(reversed(select_machines(lines)), ""))]
+    return runs[same & (runs["run"] == machine.get("run", ""))]
 
 
 # -- tables ------------------------------------------------------------------------------------------------
