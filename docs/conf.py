@@ -50,11 +50,11 @@ pygments_dark_style = "github-dark"
 # Caption -> pages, in the order of the contents.
 CONTENTS = {
     "Start": "install quickstart concepts residual sweep",
-    "Solve": "choose deadlines solvers backends failures diagnose quadratic-programs",
+    "Solve": "choose solvers failures quadratic-programs",
     "Your data": "own-engine c formats derivatives",
-    "Judge engines": "audit tune mujoco worlds engines engine-arrays report method cross-check commands",
+    "Judge engines": "audit mujoco worlds engines report commands",
     "LavenderSim and the course": "engine chapter chapter-answers generated/examples",
-    "Background": "methods motion comparison guarantees generated/cases generated/measured",
+    "Background": "methods comparison guarantees generated/cases generated/measured generated/engine-arrays",
     "Project": "plugin architecture generated/api",
 }
 

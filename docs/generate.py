@@ -1,7 +1,7 @@
 """Pages made from what the package says of itself: SPECs, docstrings, examples, scenes, cases, and a small benchmark.
 
     python docs/generate.py            write docs/generated/, as the Sphinx build does
-    python docs/generate.py --pages    rewrite solvers.md, backends.md, engine-arrays.md and a table of engine.md
+    python docs/generate.py --pages    rewrite solvers.md and the tables of facts in engine.md and engines.md
     python docs/generate.py --tables   measure; rewrite the tables of docs/choose.md, and the
                                        figures in docs/static/examples/
 
@@ -85,21 +85,27 @@ ADVICE = (
 )
 # Paragraphs of docs/solvers.md.
 INTRODUCTION = """\
-This page lists every name that `lavender.solve` accepts, and the options of each solver. [How to choose a
-solver](choose.md) recommends a solver for a problem, and `lv.available(problem)` lists the solvers that accept it.
-If you [build the documentation](install.md#builds-for-development), it has a page for each solver with its method
-and its measured times.
-
-The columns of the table are
-
-- *laws*: the friction models that the solver accepts ([laws](concepts.md#laws)),
-- *reads*: the forms of a problem that the solver reads. The form *rows* has body velocities, *generalized* has J and
-  M, and *matrix* has A. If a solver reads only A, A is computed from the other forms,
-- *exact*: the solver ends after finitely many steps with the exact solution, up to rounding,
-- *resumable*: n₁ iterations followed by n₂ iterations give the same bits as n₁ + n₂ iterations."""
+`lavender.solve` accepts these names. [How to choose a solver](choose.md) recommends one, and `lv.available(problem)`
+lists the solvers that accept a problem. The columns: *laws*, the [friction models](concepts.md#laws) that the solver
+accepts; *reads*, the forms of a problem that it reads (*rows*: body velocities, *generalized*: J and M, *matrix*: A,
+which is computed from the other forms); *exact*, a solver that ends after finitely many steps with the exact
+solution, up to rounding; *resumable*, a solver with the same bits after n₁ and then n₂ iterations as after n₁ + n₂."""
 BACKENDS_LISTED = """\
-*Backends* are solvers of other packages ([their behaviour](backends.md)). They accept the laws linear and lcp,
-`clarabel_cone` also cone, and read matrices and rows:"""
+A *backend* is a solver of another package. Backends accept the laws linear and lcp (`clarabel_cone` also cone), and
+read matrices and rows. The table shows results on small programs with known solutions, for each backend alone, at its
+default settings, in the given version. The programs are: the same row twice (*repeated*), dependent equalities
+(*dependent*), *contradictory* equalities, an *unbounded* objective, a *singular* P, an indefinite P that is convex on
+the rows (*convex on rows*), and an indefinite P with a *saddle*. The first four columns also have the arrays of a
+start that the backend uses. *Wrong* names programs that are reported as solved although the answer is wrong; *fails*
+names solvable programs without an answer."""
+BACKENDS_CALLED = """\
+lavender judges every answer, so a wrong one is marked as a contradicted claim. It scales programs to numbers near 1,
+removes the error of the backend's tolerance by a Newton step, passes both triangles of P, and counts a claim of
+infeasibility only with a certificate. A start is passed to osqp, proxqp and daqp. `lavender solvers NAME` prints all
+observations of a backend and the measures against them. ECOS, OSQP and SCS replace the handler of Ctrl-C, so they run
+one solve at a time, also on several threads.
+
+Each backend takes these options:"""
 ORDERS = """\
 Options are keywords of `lavender.solve`. The option `order=` selects the [sweep order](sweep.md#sweep-orders),
 `seed=` the seed of random orders. If a problem is given as a matrix, `ground=` lists the blocks that touch the
@@ -342,7 +348,6 @@ def solver_overview():
         for s in specs
         if not s.external
     ]
-    backends = [f"`{s.name}` ({s.summary.removesuffix(' (QP backend)')})" for s in specs if s.external]
     own = [(f"`{s.name}`", f"`{n}`", text) for s in specs if not s.external for n, text in s.options.items()]
     others = next(s for s in specs if s.external and s.options).options
     takes_order = ", ".join(f"`{s.name}`" for s in specs if s.order)
@@ -352,27 +357,37 @@ def solver_overview():
             "<!-- Written by `python docs/generate.py --pages`. -->",
             INTRODUCTION,
             table(("name", "laws", "reads", "exact", "resumable", "method"), rows),
-            f"{BACKENDS_LISTED}\n{'; '.join(backends)}.",
             "## Options",
             f"{ORDERS}\n{takes_order}.",
             table(("solver", "option", "meaning"), own),
-            "## Options of backends",
-            "Each backend of another package takes these options:",
+            "## Backends",
+            BACKENDS_LISTED,
+            tabulate_backends(s for s in specs if s.external),
+            BACKENDS_CALLED,
             table(("option", "meaning"), [(f"`{n}`", text) for n, text in others.items()]),
         )
     )
 
 
-# Paragraphs of docs/backends.md.
-BACKENDS_INTRODUCTION = """\
-This page shows the behaviour of each QP *backend* on small programs with known solutions. A backend is a solver of
-another package that [lavender calls](solvers.md#options-of-backends). Each was called alone by
-[qpsolvers](https://github.com/qpsolvers/qpsolvers), at its default settings, in the version of the table. A test
-repeats each program with the installed version, and fails if the behaviour has changed. `lavender solvers NAME` prints
-the same in sentences, and [`lavender check`](cross-check.md) quotes them if it contradicts a claim.
+def tabulate_backends(specs):
+    """Return the table of backends: method, version, start, and the programs that a backend does not solve."""
+    from lavender.external import backends as b
 
-A cell of the first table has one of these results: *right* (reported as solved, within 1 %), *wrong* (reported as
-solved, but not right), *not found*, or *raises* (an exception)."""
+    programs = "repeated", "dependent", "contradictory", "unbounded", "singular", "convex_on_rows", "saddle"
+    solvable = "repeated", "dependent", "singular", "convex_on_rows"
+    behaviours, rows = {x.name: x.behaviour for x in b.BACKENDS}, []
+    for spec in specs:
+        method, seen = spec.summary.removesuffix(" (QP backend)"), behaviours.get(spec.name)
+        if seen is None:
+            rows.append((f"`{spec.name}`", method, "", "", "not observed"))
+            continue
+        wrong = [n.replace("_", " ") for n in programs if getattr(seen, n) == "wrong"]
+        fails = [n.replace("_", " ") for n in solvable if getattr(seen, n) in ("not found", "raises")]
+        rows.append((f"`{spec.name}` {seen.version}", method, seen.start, ", ".join(wrong), ", ".join(fails)))
+    return table(("backend", "method", "start", "wrong", "fails"), rows)
+
+
+# Paragraphs of the page of backends in the built documentation.
 BACKENDS_VERDICTS = """\
 *Triangle* is the part of P that is used if P is not symmetric: *all* gives a wrong answer, *none* rejects P. *Start*
 has the arrays of a start that the backend uses. The program *contradictory* has no solution, *unbounded* has no
@@ -400,8 +415,8 @@ built from their sources, did not end within 100 s on the program *convex on row
 package either, and were observed with builds of their sources."""
 
 
-def backends_page():
-    """Return the text of docs/backends.md: observed behaviour of backends."""
+def backend_observations():
+    """Return the parts of the page of backends that list their observed behaviour."""
     from lavender.external import backends as b
 
     seen = [x for x in b.BACKENDS if x.behaviour is not None]
@@ -424,49 +439,53 @@ def backends_page():
     notes = [
         f"- `{x.name}` {x.behaviour.version}: {text}" for x in seen for text in x.behaviour.notes.values()
     ]
-    return "\n\n".join(
-        (
-            "# Backends: what they really do",
-            "<!-- Written by `python docs/generate.py --pages`. -->",
-            BACKENDS_INTRODUCTION,
-            "## Solvable and unsolvable programs",
-            observed(verdicts),
-            BACKENDS_VERDICTS,
-            "## Accuracy",
-            observed(numbers),
-            BACKENDS_NUMBERS,
-            BACKENDS_REPEATED,
-            "## Programs",
-            texts(("name", "program"), b.PROBE_PROGRAMS),
-            "## Other observations",
-            "\n".join(notes),
-            "## Remedies in lavender",
-            texts(("observation", "lavender"), b.ADAPTER_REMEDIES),
-            BACKENDS_MISSING,
-        )
-    )
+    return [
+        "## Solvable and unsolvable programs",
+        observed(verdicts),
+        BACKENDS_VERDICTS,
+        "## Accuracy",
+        observed(numbers),
+        BACKENDS_NUMBERS,
+        BACKENDS_REPEATED,
+        "## Programs",
+        texts(("name", "program"), b.PROBE_PROGRAMS),
+        "## Other observations",
+        "\n".join(notes),
+        "## Remedies in lavender",
+        texts(("observation", "lavender"), b.ADAPTER_REMEDIES),
+        BACKENDS_MISSING,
+    ]
 
 
-ENGINES_INTRODUCTION = """\
-This page lists facts about other engines that are easily guessed wrong: which numbers their arrays hold, and how they
-read the same file. [The importers](engines.md) of lavender take them into account. Each fact was found with the version
-in the table. A test runs the engine, if it is installed, and fails if the fact has changed."""
-
-
-def engine_arrays_page():
-    """Return the text of docs/engine-arrays.md: facts about engines."""
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "io"))
+def load_engine_facts():
+    """Return the facts about engines that tests check."""
+    sys.path.insert(0, str(ROOT / "tests" / "io"))
     from engine_facts import load_facts
 
-    parts = ["# Engines: what their arrays mean", "<!-- Written by `python docs/generate.py --pages`. -->"]
-    parts.append(ENGINES_INTRODUCTION)
-    for engine, group in itertools.groupby(load_facts(), lambda f: f.engine):
+    return load_facts()
+
+
+def tabulate_facts():
+    """Return the table of docs/engines.md: facts about the engines of that page, and their handling."""
+    rows = [
+        (f.engine, f.subject, f.text, f.handling)
+        for f in load_engine_facts()
+        if f.handling and f.engine in ("newton", "MuJoCo Warp", "Genesis")
+    ]
+    return table(("engine", "subject", "fact", "in lavender"), rows)
+
+
+def engine_arrays_page(site):
+    """Write the page of all facts about engines."""
+    parts = [
+        "# Engines: what their arrays mean",
+        "Facts that are easily guessed wrong, each found with the version in its heading and checked by a test.",
+    ]
+    for engine, group in itertools.groupby(load_engine_facts(), lambda f: f.engine):
         facts = list(group)
-        has_handling = any(f.handling for f in facts)
-        rows = [(f.subject, f.text, *[f.handling] * has_handling) for f in facts]
-        head = ("subject", "fact", *["lavender"] * has_handling)
-        parts += [f"## {engine} {facts[0].version}", table(head, rows)]
-    return "\n\n".join(parts)
+        rows = [(f.subject, f.text, f.handling) for f in facts]
+        parts += [f"## {engine} {facts[0].version}", table(("subject", "fact", "lavender"), rows)]
+    site.write("engine-arrays.md", "\n\n".join(parts))
 
 
 def solver_pages(site, report, figures):
@@ -489,6 +508,7 @@ def solver_pages(site, report, figures):
         parts += [f"## {s.name}", f"{s.summary[:1].upper() + s.summary[1:]}.", abilities(s)]
         if (report.frame["solver"] == s.name).any():
             parts.append(standing(report, s.name))
+    parts += backend_observations()
     site.write("solvers/backends.md", "\n\n".join(parts))
 
 
@@ -748,16 +768,18 @@ def write(source, cache):
     measured_page(site, report, figures)
     example_page(site, cache)
     suite_page(site)
+    engine_arrays_page(site)
     api_page(site)
     site.forget_others()
 
 
 def committed_pages():
     """Return the texts of the pages that are checked in, by file name."""
-    pages = {"solvers.md": solver_overview(), "backends.md": backends_page()}
-    engine = (Path(__file__).resolve().parent / "engine.md").read_text(encoding="utf-8")
-    pages["engine.md"] = fill_tables(engine, {"scenes": tabulate_scenes()})
-    pages["engine-arrays.md"] = engine_arrays_page()
+    pages = {"solvers.md": solver_overview()}
+    tables = {"scenes": tabulate_scenes, "engine_facts": tabulate_facts}
+    for name, place in (("engine.md", "scenes"), ("engines.md", "engine_facts")):
+        text = (Path(__file__).resolve().parent / name).read_text(encoding="utf-8")
+        pages[name] = fill_tables(text, {place: tables[place]()})
     return {name: text.rstrip() + "\n" for name, text in pages.items()}
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from worked import ROOT, after
+from worked import after
 
 import lavender as lv
 
@@ -146,7 +146,7 @@ def kinds(problem, **state):
 
 
 @pytest.mark.nightly
-def test_the_page_has_the_share_of_each_mistake_that_is_found(scenes):
+def test_diagnose_with_state_finds_every_planted_mistake(scenes):
     """The mistake is found if something is reported that is not reported without it."""
     found = {}
     for form, form_of in (("bodies", lambda s: s), ("J and M", lambda s: replace(s, rows=None))):
@@ -161,9 +161,12 @@ def test_the_page_has_the_share_of_each_mistake_that_is_found(scenes):
                     cell[1] += 1
                     if has_state and mistake in SHOWN_BY_STATE:
                         assert SHOWN_BY_STATE[mistake] in reported
-    page = (ROOT / "docs" / "diagnose.md").read_text(encoding="utf-8")
     for mistake, cells in found.items():
-        assert f"| {mistake} | {' | '.join('{} of {}'.format(*cell) for cell in cells.values())} |" in page
+        for (form, has_state), (count, total) in cells.items():
+            if mistake == NONE:
+                assert count == 0, (form, has_state)
+            elif has_state:
+                assert count == total, (mistake, form)  # the state of the engine reveals every planted mistake
 
 
 @pytest.mark.parametrize("has_round_inertia", [True, False])

@@ -220,7 +220,7 @@ def test_planar_velocities_of_a_problem_in_space_get_the_conversion():
 
 @pytest.mark.parametrize(("mass", "size"), [(100.0, 1.0), (1000.0, 2.0)])
 def test_masses_in_place_of_inverse_masses_are_found_in_space_only(mass, size):
-    """Check the statement of docs/diagnose.md."""
+    """Check the statement of docs/failures.md."""
     inertia, dt, corners = mass * size**2 / 6, 1 / 60, (-size / 2, size / 2)
     plane = lv.RowBuilder([mass], [inertia], [(0.0, -9.81 * dt, 0.0)], dt, [(0.0, size / 2)])
     space = lv.RowBuilder(

@@ -1,6 +1,6 @@
 """Facts about arrays and files of other engines, each with a function that runs the engine and checks the fact.
 
-docs/engine-arrays.md is written from this table by `python docs/generate.py --pages`.
+The table of docs/engines.md is written from these facts by `python docs/generate.py --pages`.
 """
 
 import importlib

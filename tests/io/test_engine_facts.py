@@ -1,4 +1,4 @@
-"""Engines behave as the table of docs/engine-arrays.md states."""
+"""Engines behave as the facts behind the table of docs/engines.md state."""
 
 import pytest
 from engine_facts import load_facts
