@@ -74,14 +74,11 @@ PLAN = Plan(TOLERANCES, budgets=(4, 16, 64), repeats=2, time_limit=0.1, warm=Fal
 BACKENDS = ("osqp", "scs", "piqp", "clarabel", "clarabel_cone")
 NEAR = 1.25  # times the fastest: differences below say nothing on a machine that does other work
 ADVICE = (
-    "A *case* is one problem of the built-in suite, and cases of similar structure are grouped. The first table\n"
+    "A *case* is one problem of the built-in suite, and cases of similar structure are grouped. The table\n"
     "has a solver for each structure and each relative residual: the solver that solves the largest number of cases\n"
     "to this residual, and among several such solvers the fastest. The number is the shifted geometric mean of its\n"
-    "times. Brackets show the number of solved cases if not all are solved.\n\n"
-    "The second table has a solver for each time: the solver that serves the largest number of cases within this\n"
-    "time. A solver serves a case if its residual is at most half of the residual of the start. The number is the\n"
-    "residual at the 90th percentile of the cases. *none* means that no solver serves nine cases of ten. Solvers\n"
-    "after ≈ are equally good within the noise of the repetitions (in the second table: within a factor of two)."
+    "times. Brackets show the number of solved cases if not all are solved. Solvers after ≈ are equally good within\n"
+    "the noise of the repetitions."
 )
 # Paragraphs of docs/solvers.md.
 INTRODUCTION = """\
@@ -516,26 +513,21 @@ def solver_pages(site, report, figures):
 
 
 def by_structure(report):
-    """Return the report's tables of the best solver for each structure as markdown."""
+    """Return the report's table of the fastest solvers for each structure as markdown."""
 
-    def cells(row, format_number):
+    def cells(row):
         pairs = list(row)[2:]
         for names, number in zip(pairs[::2], pairs[1::2], strict=True):
             first, _, ties = names.partition(" ≈ ")
-            number = "" if number != number else f" {format_number(number)}"
+            number = "" if number != number else f" {format_seconds(number)}"
             yield f"**{first}**{number}" + (f"<br>≈ {ties.replace(' ≈ ', ', ')}" if ties else "")
 
-    found = []
-    for frame, format_number in (
-        (tables.tabulate_fastest(report), format_seconds),
-        (tables.tabulate_in_time(report), format_residual),
-    ):
-        rows = [
-            (f"{row[0].replace(' / ', '<br>')}<br>{row[1]} cases", *cells(row, format_number))
-            for row in frame.itertuples(index=False)
-        ]
-        found.append(table(("structure", *list(frame)[2::2]), rows))
-    return f"{ADVICE}\n\n{wide(*found)}"
+    frame = tables.tabulate_fastest(report)
+    rows = [
+        (f"{row[0].replace(' / ', '<br>')}<br>{row[1]} cases", *cells(row))
+        for row in frame.itertuples(index=False)
+    ]
+    return f"{ADVICE}\n\n{wide(table(('structure', *list(frame)[2::2]), rows))}"
 
 
 def measured_page(site, report, figures):
