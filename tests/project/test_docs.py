@@ -2,6 +2,7 @@
 
 import doctest
 import importlib
+import inspect
 import pkgutil
 import re
 import shlex
@@ -21,6 +22,10 @@ from lavender.cli import cli
 ROOT = Path(__file__).resolve().parent.parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCK = re.compile(r"^( *)```(python|pycon|sh|console)\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
+#: Largest number of pages in docs/, and of words in them and README.md (as `wc -w` counts). Shorten another page before
+#: you raise a limit: nobody reads more. The limit of words is 3 % above their number when the limit was set.
+MAX_PAGES = 28
+MAX_WORDS = 46000
 FLAGS = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
 
 
@@ -230,6 +235,43 @@ def test_the_page_of_examples_lists_every_example():
     page = (ROOT / "examples" / "README.md").read_text(encoding="utf-8")
     listed = set(re.findall(r"`examples/(\w+\.py)`", page))
     assert listed == {path.name for path in (ROOT / "examples").glob("*.py")}
+
+
+def test_pages_are_few_and_short():
+    assert len(PAGES) - 1 <= MAX_PAGES  # without README.md
+    assert sum(len(page.read_text(encoding="utf-8").split()) for page in PAGES) <= MAX_WORDS
+
+
+@pytest.mark.parametrize(
+    "page",
+    # The pages for developers name tests; the chapter names the test that compares its numbers.
+    [page for page in PAGES if not page.stem.startswith(("architecture", "plugin", "chapter"))],
+    ids=lambda page: page.name,
+)
+def test_page_for_users_has_no_commit_and_no_path_of_a_test(page):
+    text = page.read_text(encoding="utf-8")
+    assert re.findall(r"\btests/[\w/.]+", text) == []
+    assert re.findall(r"\b(?=[0-9a-f]*\d)(?=[0-9a-f]*[a-f])[0-9a-f]{7,40}\b", text) == []
+
+
+def test_quickstart_has_the_defaults_of_solve():
+    page = (ROOT / "docs" / "quickstart.md").read_text(encoding="utf-8")
+    rows = dict(
+        re.findall(r"^\| `(\w+)`[^|]* \| ([^|]+) \|", page.partition("| argument | default |")[2], re.MULTILINE)
+    )
+    parameters = inspect.signature(lv.solve).parameters
+    assert list(rows) == ["solver", "tol", "max_iter", "impulse", "time_limit", "friction"]
+    assert rows["solver"] == f'`"{parameters["solver"].default}"`'
+    assert float(rows["tol"]) == parameters["tol"].default
+    for name in ("impulse", "time_limit"):
+        assert (rows[name], parameters[name].default) == ("none", None)
+    assert parameters["max_iter"].default is None  # the solver's own
+    counts = re.findall(r"(\d+) \w+ of `(\w+)`", rows["max_iter"])
+    assert len(counts) == 2
+    assert {name: int(count) for count, name in counts} == {
+        name: lv.registry.specs()[name].max_iter for _, name in counts
+    }
+    assert rows["friction"] == f'`"{inspect.signature(lv.Problem.from_jacobian).parameters["friction"].default}"`'
 
 
 def test_the_page_on_failures_has_every_status_and_every_error():
