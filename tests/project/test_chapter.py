@@ -16,6 +16,7 @@ import re
 import shlex
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 from click.testing import CliRunner
@@ -24,7 +25,7 @@ from worked import example
 from lavender.cli import cli
 
 ROOT = Path(__file__).resolve().parent.parent.parent
-PAGES = [ROOT / "docs" / f"chapter{part}.md" for part in ("", "-answers", "-engines")]
+PAGES = [ROOT / "docs" / f"chapter{part}.md" for part in ("", "-answers")]
 PAGE = "\n".join(path.read_text(encoding="utf-8") for path in PAGES)
 COMMENT = re.compile(r"<!-- (.*?) ?-->", re.DOTALL)
 CODE = re.compile(r"^```.*?^```$|`[^`\n]*`|\]\([^)]*\)", re.DOTALL | re.MULTILINE)
@@ -62,10 +63,11 @@ def printed(command):
         return Path(folder, command.replace("/", "_")).read_text(encoding="utf-8")
     words = shlex.split(command)
     if words[0] == "python":
-        out, figure = io.StringIO(), io.BytesIO()
-        with contextlib.redirect_stdout(out):
-            example(Path(words[1]).stem).main(figure)
-        assert figure.getvalue().startswith(b"\x89PNG")
+        name, out = Path(words[1]).stem, io.StringIO()
+        with TemporaryDirectory() as folder, contextlib.redirect_stdout(out):
+            figure = Path(folder, f"{name}.png")  # the script's own name: all numbers and all panels
+            example(name).main(str(figure))
+            assert figure.read_bytes().startswith(b"\x89PNG")
         return out.getvalue()
     assert words[0] == "lavender"
     result = CliRunner().invoke(cli, words[1:])
@@ -157,9 +159,9 @@ def test_every_python_block_runs_by_itself():
 
 def test_a_file_named_after_a_panel_holds_it_alone(tmp_path):
     module = example("two_particles")
-    module.main(str(tmp_path / "all.svg"))
+    module.main(str(tmp_path / "two_particles.svg"))
     module.main(str(tmp_path / "distance.svg"))
-    whole, alone = ((tmp_path / f"{name}.svg").read_text(encoding="utf-8") for name in ("all", "distance"))
+    whole, alone = ((tmp_path / f"{name}.svg").read_text(encoding="utf-8") for name in ("two_particles", "distance"))
     assert [text.count('<g id="axes_') for text in (whole, alone)] == [len(module.PANELS), 1]
 
 
