@@ -229,6 +229,7 @@ cdef inline void begin_separate_active_set(newton_t* n, const double* z) noexcep
 cdef inline void enter_next_convex_state(newton_t* n) noexcept nogil:
     """Enter the next state of the convex laws."""
     cdef int32_t state = n.stage
+    cdef double* z
     n.stage = state + 1
     if state == UNBOUNDED_ACTIVE_SET and not n.is_cold or state == ROWS_INTERIOR_POINT:
         if not is_finished(n):
@@ -256,8 +257,10 @@ cdef inline void enter_next_convex_state(newton_t* n) noexcept nogil:
         begin_interior_steps(n, False)
     elif state == CONVEX_DAMPED_NEWTON:
         restore_best_of_all(n)
-        # Of cones, the last interior point is nearer to a solution than the point with the lowest residual.
-        begin_damped_newton(n, n.best_z if n.s.bt == NULL else n.progress.best_z, CONE, 1e-3, MAX_INNER_STEPS)
+        # Of cones, the last interior point is nearer to a solution than the point with the lowest residual, unless its
+        # steps failed at once, as beside inactive rows with b = 1e60.
+        z = n.best_z if n.s.bt == NULL or n.progress.steps < 2 else n.progress.best_z
+        begin_damped_newton(n, z, CONE, 1e-3, MAX_INNER_STEPS)
         push_damped_newton(n, UNLIMITED)
     else:
         restore_best_of_all(n)
