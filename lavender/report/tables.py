@@ -257,7 +257,10 @@ def read_engine_answers(sources: Sequence[str], lines: Frame) -> list[EngineAnsw
 
 
 def _read_lines(folder: Path) -> list[Any]:
-    """Return the lines of a folder's `engine.jsonl` without those that are not JSON; empty if there is no such file."""
+    """Return the last line for each file of a folder's `engine.jsonl`, without those that are not JSON.
+
+    A C engine that runs again into the same folder replaces the files and appends further lines.
+    """
     answers = []
     if (folder / ENGINE).is_file():
         for line in (
@@ -265,7 +268,8 @@ def _read_lines(folder: Path) -> list[Any]:
         ):
             with contextlib.suppress(ValueError, RecursionError):
                 answers.append(json.loads(line))
-    return [answer for answer in answers if isinstance(answer, dict)]
+    answers = [answer for answer in answers if isinstance(answer, dict)]
+    return list({str(answer.get("file", i)): answer for i, answer in enumerate(answers)}.values())
 
 
 def _complete_answer(folder: Path, answer: Row) -> Row | None:

@@ -79,6 +79,11 @@ def test_what_computes_otherwise_does_not_compile_and_says_why(folder, compiler,
     assert done.returncode and sign in done.stderr
 
 
+def test_exported_library_contains_the_licence_of_the_project(folder):
+    licence = (Path(__file__).resolve().parents[2] / "LICENSE").read_text(encoding="utf-8")
+    assert (folder / "LICENSE.txt").read_text(encoding="utf-8") == licence
+
+
 def test_checksums_are_of_the_files(folder):
     import hashlib
 

@@ -42,7 +42,7 @@ inline void check(int32_t code) {
 
 /* A problem with the library's default values. */
 struct problem : lav_problem {
-  explicit problem(int32_t form) : lav_problem() { check(lav_default_problem(form, this)); }
+  explicit problem(int32_t kind) : lav_problem() { check(lav_default_problem(kind, this)); }
 };
 
 /* Let a field of a problem point to an array; an empty array stands for the default value. */

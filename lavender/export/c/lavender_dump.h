@@ -208,7 +208,7 @@ static inline int32_t lav_dump_answer(lav_solver *solver, const lav_problem *q, 
   char path[2100], plain[3][1024];
   FILE *lines;
   int32_t i, j, code, is_bad;
-  if (!q || !folder || !name || !method || !impulse) return LAV_ERROR_NULL;
+  if (!q || !folder || !name || !method || (!impulse && q->n_rows > 0)) return LAV_ERROR_NULL;
   if (!(seconds >= 0.0 && seconds < INFINITY)) return LAV_ERROR_NUMBER;
   for (i = 0; i < 3; i++) {
     if (strlen(texts[i]) >= sizeof plain[i]) return LAV_ERROR_FILE;
