@@ -34,7 +34,7 @@ def test_a_problem_with_nothing_to_do_is_said_to_have_nothing_to_do(lavender, tm
 def test_the_command_shows_the_way_and_gives_it_as_data(lavender):
     code, shown, _ = lavender("explain", "stack(n=200)", "granularF(n=4)")
     assert code in (0, None)
-    assert "newton is counted to take" in shown and "granularF(n=4)" in shown and "nncg" in shown
+    assert "newton is counted to take" in shown and "granularF(n=4)" in shown and "admm" in shown
     plan = json.loads(lavender("explain", "stack(n=200)", "--json", "--tol", "1e-9")[1])
     assert plan["tol"] == 1e-9 and plan["rows"] == 200 and plan["stages"][0]["solver"] == "direct"
 

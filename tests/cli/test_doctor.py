@@ -22,7 +22,7 @@ def test_it_says_what_a_report_of_a_bug_needs_and_finds_every_bit():
     assert found["self_test"] == dict.fromkeys(doctor.HASHES, "same")
     assert found["versions"]["numpy"] == np.__version__
     assert found["backends"]["osqp"] == f"osqp {found['versions']['osqp']}"
-    facts = machine.describe_run({}).build
+    facts = machine.describe_run({})["build"]
     assert {"kernels", "compiler", "python_flags", "blas"} <= set(facts)
     assert {k: found["build"][k] for k in facts if k != "clock"} == {k: facts[k] for k in facts if k != "clock"}
 

@@ -292,7 +292,8 @@ report.run({SEEDED[:6]}, ["pgs", "nncg"], plan, {str(path)!r})"""
         assert len(report.read(path)) >= 0
     python("-c", code)
     fresh = report.run(SEEDED[:6], ["pgs", "nncg"], report.Plan((1e-6,), budgets=(4, 8), repeats=1))
-    assert keys_of(report.read(path)) == keys_of(fresh)
+    # Without the first field, the hash of the run: it depends on the packages that this process has imported.
+    assert [key[1:] for key in keys_of(report.read(path))] == [key[1:] for key in keys_of(fresh)]
 
 
 def test_run_other_version_or_cpu_is_another_run(tmp_path, monkeypatch):
