@@ -33,11 +33,11 @@ def judge(model, datas):
     return lv.residual_many(batch, impulse)
 
 
-def main(path):
-    """Judge 64 worlds with random velocities."""
+def main():
+    """Judge 64 worlds of a model with random velocities."""
     import mujoco
 
-    model = mujoco.MjModel.from_xml_path(path)
+    model = mujoco.MjModel.from_xml_path(sys.argv[1])
     datas = [mujoco.MjData(model) for _ in range(64)]
     for i, data in enumerate(datas):
         data.qvel[:] = 0.1 * np.random.default_rng(i).standard_normal(model.nv)
@@ -46,4 +46,4 @@ def main(path):
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main()

@@ -41,8 +41,11 @@ cdef extern from *:
     /* `PyArray_New` and `PyArray_Type` of NumPy's table of functions, whose order has not changed since NumPy 1.0. */
     static void** lav_numpy;
     #define lav_read_numpy(capsule) (lav_numpy = (void**)PyCapsule_GetPointer(capsule, NULL))
-    #define lav_new_array(n) ((PyObject* (*)(void*, int, Py_ssize_t*, int, void*, void*, int, int, void*))lav_numpy[93])( \
-        lav_numpy[2], 1, n, 12, NULL, NULL, 0, 0, NULL)
+    static PyObject* lav_new_array(Py_ssize_t* n) {
+        PyObject* (*make_array)(void*, int, Py_ssize_t*, int, void*, void*, int, int, void*);
+        memcpy(&make_array, lav_numpy + 93, sizeof make_array);  /* C has no cast of an object pointer to a function pointer */
+        return make_array(lav_numpy[2], 1, n, 12, NULL, NULL, 0, 0, NULL);
+    }
     #if defined(_MSC_VER)
     #include <intrin.h>
     #define lav_add(p, x) _InterlockedExchangeAdd64((volatile __int64*)(p), (x))

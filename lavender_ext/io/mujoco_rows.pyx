@@ -202,7 +202,9 @@ def read_jacobian(Step step, Blocks blocks):
     cdef int32_t i, j, last, column, count = s.n
     cdef int64_t first, end = 0, total = s.jac_entries if is_sparse else <int64_t>s.m * s.n
     cdef double x, factor
-    cdef const double* scale = NULL if blocks is None else get_row_scales(blocks)
+    cdef const double* scale = NULL
+    if blocks is not None:
+        scale = get_row_scales(blocks)
     if total > s.jac_entries or is_sparse and s.m and (
             s.efc_J_rownnz == NULL or s.efc_J_rowadr == NULL or s.efc_J_colind == NULL):
         return -1

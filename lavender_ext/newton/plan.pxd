@@ -258,7 +258,7 @@ cdef inline void enter_next_convex_state(newton_t* n) noexcept nogil:
     elif state == CONVEX_DAMPED_NEWTON:
         restore_best_of_all(n)
         # Of cones, the last interior point is nearer to a solution than the point with the lowest residual, unless its
-        # steps failed at once, as beside inactive rows with b = 1e60.
+        # steps failed at once, as with inactive rows of b = 1e60.
         z = n.best_z if n.s.bt == NULL or n.progress.steps < 2 else n.progress.best_z
         begin_damped_newton(n, z, CONE, 1e-3, MAX_INNER_STEPS)
         push_damped_newton(n, UNLIMITED)
