@@ -8,7 +8,8 @@
    H z = g.
 2. Bounded rows and cones: a cold-started Mehrotra interior point. When the active rows are identified, the solution on
    them is computed to the round-off limit of float64.
-3. If 1 and 2 fail: proximal damped Newton.
+3. If rows are nearly dependent and 1 and 2 fail: an interior point on the augmented system of the bodies, then
+   proximal damped Newton.
 4. Coulomb friction: proximal damped Newton on the Alart-Curnier map, and interior points on De Saxce's form of the
    law, in which the convex problem changes with every step. If these stall and few contacts slide at the solution of
    the convex law, convex problems with a fixed shift follow from there (`lavender_ext/newton/shifted.pxd`). Otherwise,
@@ -41,7 +42,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray, check_choice
-from lavender.base.deadline import Deadline
+from lavender.base.deadline import Deadline, TooLate
 from lavender.base.errors import CapabilityError, InputError
 from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import compute_stopping_residual, judge_impulse
@@ -431,7 +432,7 @@ def _run_stages(
     (m,) array or None
         A certificate, or a direction that gives a lower bound of every solution's impulse.
     """
-    deadline = None if time_limit is None else Deadline(time_limit)
+    deadline = system.deadline = None if time_limit is None else Deadline(time_limit)
     solve, certificate, proven = system.solve, None, False
     late = interrupted = False
     last = max_iter + (solve.done if is_continued else 0)
@@ -455,7 +456,11 @@ def _run_stages(
                 if time_left <= system.expected_factor_seconds:
                     late = True
                     solve.request_stop()
-            end = solve.step(max(1, int(min(steps, last - before) if max_total else steps)), impulse)
+            try:
+                end = solve.step(max(1, int(min(steps, last - before) if max_total else steps)), impulse)
+            except TooLate:  # The next factorisation would end too late: return the best iterate.
+                late, end = True, OUTCOMES["spent"]
+                solve.request_stop()
             if solve.done > before:
                 system.record_factor_time((perf_counter() - begin) / (solve.done - before))
             if end == OUTCOMES["certificate"]:

@@ -1,4 +1,4 @@
-"""Phases of interior points: of the convex law and of De Saxce's form.
+"""Phases of interior points: of the convex law, of De Saxce's form, and on the augmented system.
 
 `steps.pxd` has the equations and takes each step; `interior.pxd` limits its length. A phase repeats them and decides when
 to stop or to try to finish by another method:
@@ -9,8 +9,10 @@ to stop or to try to finish by another method:
                                              Coulomb's law: solved but slips, or many slip       end
                                              idle, stalled, short step, or a step fails          damped Newton or the
                                                                                                  certificate search
-    INTERIOR_WITH_NEWTON   interior point    residual fell tenfold                               damped Newton, then on
+    INTERIOR_WITH_NEWTON   interior point    residual fell tenfold                               damped Newton, or
+                                                                                                 AUGMENTED_NEWTON, then on
                                              idle, short steps, or a step fails                  end
+    AUGMENTED_NEWTON       Newton            accepted, or two steps without halving              end
 
 A step fails if it is not finite, or if a pivot fails and the gap is not finite (`take_interior_point_step`).
 """
@@ -18,18 +20,21 @@ from libc.math cimport fabs
 from libc.stdint cimport int32_t
 from libc.string cimport memset
 
-from lavender_ext.core.block_types cimport CONE, COULOMB
-from lavender_ext.core.validate cimport norm_inf
+from lavender_ext.core.block_types cimport CONE
+from lavender_ext.core.validate cimport all_finite, norm_inf
 from lavender_ext.judge.score cimport relative_residual
 from lavender_ext.newton.active_set cimport begin_active_set
 from lavender_ext.newton.cones cimport cone_gap, cone_size, has_lower_bound, has_upper_bound, load_cone_variable
 from lavender_ext.newton.damped_newton cimport begin_damped_newton, push_damped_newton
 from lavender_ext.newton.elements cimport elements_t, is_row
-from lavender_ext.newton.run cimport (INTERIOR_POINT, INTERIOR_WITH_NEWTON, MAX_INNER_STEPS, N_DE_SAXCE, N_INTERIOR,
-                                      PLAN_COULOMB, compute_slack, copy_vector, is_at_roundoff, is_budget_spent, is_finished,
-                                      judge_and_keep_best_point, newton_t, pop_phase, progress_t, push_phase)
+from lavender_ext.newton.run cimport (AUGMENTED_NEWTON, INTERIOR_POINT, INTERIOR_WITH_NEWTON, MAX_INNER_STEPS,
+                                      N_AUGMENTED_DE_SAXCE, N_AUGMENTED_INTERIOR, N_AUGMENTED_NEWTON, N_DE_SAXCE, N_INTERIOR,
+                                      PLAN_COULOMB, augmented_newton_t, compute_slack, copy_vector, is_at_roundoff,
+                                      is_budget_spent, is_finished, judge_and_keep_best_point, newton_t, pop_phase, progress_t,
+                                      push_phase)
 from lavender_ext.newton.steps cimport compute_all_normal_shifts, take_interior_point_step
-from lavender_ext.newton.system cimport (BARRIER, factor_newton_system, multiply_system_matrix, solve_newton_system,
+from lavender_ext.newton.system cimport (BARRIER, NATURAL, evaluate_system_natural_map, factor_newton_system,
+                                         multiply_system_matrix, solve_natural_map_system_refined, solve_newton_system,
                                          system_t)
 
 
@@ -43,6 +48,8 @@ cdef enum:
     MAX_HYBRID_STEPS = 60           # Limit of an interior point with Newton trials; more steps rarely help.
     MAX_SHORT_STEPS = 4             # Such an interior point ends after this many short steps in a row: the path has turned back.
     TRIAL_INNER_STEPS = 2           # Newton steps of one attempt to end De Saxce's interior point.
+    AUGMENTED_TRIAL_STEPS = 4       # Newton steps on the augmented system in one attempt.
+    MAX_FAILED_AUGMENTED_STEPS = 2  # An attempt ends if this many steps in a row do not halve the residual.
 
 
 cdef inline double roundoff_residual() noexcept nogil:
@@ -83,6 +90,11 @@ cdef inline double smallest_gap_ratio() noexcept nogil:
     return 1e-24
 
 
+cdef inline double augmented_shift() noexcept nogil:
+    """Return the shift of the augmented system's rows, relative to d. Squared singular values below it count as zero."""
+    return 1e-14
+
+
 # -- the convex law ----------------------------------------------------------------------------------------------------
 
 
@@ -91,7 +103,7 @@ cdef inline void reset_interior_progress(newton_t* n, double trial_residual) noe
     cdef progress_t* k = &n.progress
     k.lowest = 1.0 / 0.0
     k.trial_residual = trial_residual
-    k.idle = k.stalled = k.steps = k.trial_runs = k.is_counted = 0
+    k.idle = k.stalled = k.steps = k.trial_runs = k.augmented = k.is_counted = 0
     copy_vector(n, k.best_z, n.ip.z)
 
 
@@ -251,9 +263,10 @@ cdef inline void step_interior_point(newton_t* n) noexcept nogil:
 # -- with Newton trials ------------------------------------------------------------------------------------------------
 
 
-cdef inline void begin_interior_with_newton(newton_t* n) noexcept nogil:
-    """Begin steps of De Saxce's interior point with attempts to finish by Newton steps."""
-    reset_interior_progress(n, 1e-3)
+cdef inline void begin_interior_with_newton(newton_t* n, int32_t law, int32_t augmented) noexcept nogil:
+    """Begin steps of De Saxce's interior point, or of an augmented one, with attempts to finish by Newton steps of `law`."""
+    reset_interior_progress(n, 1e-5 if augmented else 1e-3)
+    n.progress.law, n.progress.augmented = law, augmented
     push_phase(n, INTERIOR_WITH_NEWTON)
 
 
@@ -261,12 +274,19 @@ cdef inline void step_interior_with_newton(newton_t* n) noexcept nogil:
     """Take an interior point step. Each time the residual falls by a factor of ten, attempt to finish by Newton steps."""
     cdef progress_t* k = &n.progress
     cdef double residual
+    cdef bint succeeded
     if not k.trial_runs:
-        if k.steps == MAX_HYBRID_STEPS or is_finished(n) or not take_interior_point_step(n):
+        n.s.augmented = k.augmented
+        succeeded = k.steps < MAX_HYBRID_STEPS and not is_finished(n) and take_interior_point_step(n)
+        n.s.augmented = 0
+        if not succeeded:
             pop_phase(n)
             return
         k.steps += 1
-        n.counts[N_DE_SAXCE] += 1
+        if k.law == CONE:
+            n.counts[N_AUGMENTED_INTERIOR] += 1
+        else:
+            n.counts[N_AUGMENTED_DE_SAXCE if k.augmented else N_DE_SAXCE] += 1
         residual = judge_and_keep_best_point(n, n.ip.z)
         k.idle = 0 if residual < 0.5 * k.lowest else k.idle + 1
         if residual < k.lowest:
@@ -275,8 +295,11 @@ cdef inline void step_interior_with_newton(newton_t* n) noexcept nogil:
         if residual < k.trial_residual and not is_finished(n):
             k.trial_residual = 0.1 * residual
             k.trial_runs = 1
-            begin_damped_newton(n, n.ip.z, COULOMB, residual, TRIAL_INNER_STEPS)
-            push_damped_newton(n, 1)
+            if k.augmented:
+                begin_augmented_newton(n, n.ip.z)
+            else:
+                begin_damped_newton(n, n.ip.z, k.law, residual, TRIAL_INNER_STEPS)
+                push_damped_newton(n, 1)
             return
     else:
         k.trial_runs = 0
@@ -286,4 +309,44 @@ cdef inline void step_interior_with_newton(newton_t* n) noexcept nogil:
     k.stalled = k.stalled + 1 if n.ip.length < short_step() else 0
     if (k.stalled >= MAX_SHORT_STEPS or (k.idle > MAX_IDLE_INTERIOR_STEPS and k.lowest < 1e-5)
             or n.ip.gap < smallest_gap_ratio() * n.ip.max_gap):
+        pop_phase(n)
+
+
+cdef inline void begin_augmented_newton(newton_t* n, const double* z) noexcept nogil:
+    """Begin Newton steps on the augmented system from z."""
+    cdef augmented_newton_t* x = &n.augmented
+    copy_vector(n, x.z, z)
+    x.best = judge_and_keep_best_point(n, z)
+    x.failed = 0
+    x.steps_left = AUGMENTED_TRIAL_STEPS
+    push_phase(n, AUGMENTED_NEWTON)
+
+
+cdef inline void step_augmented_newton(newton_t* n) noexcept nogil:
+    """Take a Newton step on the augmented system. End the phase if the judge accepts or steps do not lower the residual."""
+    cdef augmented_newton_t* x = &n.augmented
+    cdef int32_t j
+    cdef double residual
+    if x.steps_left == 0 or is_finished(n):
+        pop_phase(n)
+        return
+    x.steps_left -= 1
+    n.s.augmented = 1
+    compute_slack(n, x.z, n.slack)
+    evaluate_system_natural_map(&n.s, x.z, n.slack, n.progress.law, augmented_shift(), n.f)
+    factor_newton_system(&n.s, NATURAL, augmented_shift())
+    n.counts[N_AUGMENTED_NEWTON] += 1
+    for j in range(n.s.e.m):
+        n.f[j] = -n.f[j]
+    solve_natural_map_system_refined(&n.s, n.f, n.dz, n.r, n.da)
+    n.s.augmented = 0
+    for j in range(n.s.e.m):
+        x.z[j] += n.dz[j]
+    if not all_finite(x.z, n.s.e.m):
+        pop_phase(n)
+        return
+    residual = judge_and_keep_best_point(n, x.z)
+    x.failed = 0 if residual < 0.5 * x.best else x.failed + 1
+    x.best = residual if residual < x.best else x.best
+    if x.failed >= MAX_FAILED_AUGMENTED_STEPS or (x.failed and is_at_roundoff(n)):
         pop_phase(n)

@@ -3,11 +3,13 @@
     law             state                     phase                                               next state if unsolved
     bounded rows    START_ACTIVE_SET          exchanges from a given start                        UNBOUNDED_ACTIVE_SET
                     UNBOUNDED_ACTIVE_SET      refinement and exchanges from H z = g               ROWS_INTERIOR_POINT
-                    ROWS_INTERIOR_POINT       interior point, exchanges at each decade            CONVEX_DAMPED_NEWTON
+                    ROWS_INTERIOR_POINT       interior point, exchanges at each decade            AUGMENTED_INTERIOR_POINT
     cones           FIRST_CONE_WEIGHT         interior point, proximal weight 1e-8                SECOND_CONE_WEIGHT
                     SECOND_CONE_WEIGHT        interior point, proximal weight 1e-10               THIRD_CONE_WEIGHT
-                    THIRD_CONE_WEIGHT         interior point, proximal weight 1e-13               CONVEX_DAMPED_NEWTON
-    both            CONVEX_DAMPED_NEWTON      proximal damped Newton; its direction may prove     CONVEX_END
+                    THIRD_CONE_WEIGHT         interior point, proximal weight 1e-13               AUGMENTED_INTERIOR_POINT
+    both            AUGMENTED_INTERIOR_POINT  interior point on the augmented system of bodies,   CONVEX_DAMPED_NEWTON
+                                              if joints are rigid
+                    CONVEX_DAMPED_NEWTON      proximal damped Newton; its direction may prove     CONVEX_END
                                               that there is no solution
     Coulomb's       START_SHIFTED             shifted Newton, if the start solves the convex law  START_DAMPED_NEWTON
                     START_DAMPED_NEWTON       proximal damped Newton from the start               FIRST_DE_SAXCE
@@ -17,19 +19,24 @@
                                               if many contacts slide
                     FIRST_SHIFTED             shifted Newton from it, if few contacts slide       FIRST_PATH
                     FIRST_PATH                path of smoothed problems, unless joints are rigid  SECOND_DE_SAXCE
-                    SECOND_DE_SAXCE           De Saxce's interior point with 0.7 of it            MORE_PATHS
+                    SECOND_DE_SAXCE           De Saxce's interior point with 0.7 of it            AUGMENTED_DE_SAXCE
+                    AUGMENTED_DE_SAXCE        De Saxce's on the augmented system, if joints are   MORE_PATHS
+                                              rigid
                     MORE_PATHS                paths with other ratios of smoothing                COULOMB_DAMPED_NEWTON
                     COULOMB_DAMPED_NEWTON     proximal damped Newton from the best point          COULOMB_END
 
-Problems that need a state, which are tests of tests/suite/test_newton_on_suite.py:
+Problems that need a state; those of weights are tests of tests/suite/test_newton_on_suite.py, the bridge is one of
+tests/sim/engine/test_engine_newton.py:
 
     SECOND_CONE_WEIGHT   pyramid(k=30, friction="coulomb") under the cone law, to 1e-9
     THIRD_CONE_WEIGHT    pyramid(k=6, mass_ratio=1e6, friction="coulomb", sliding=0.5) under the cone law, to 1e-8
+    AUGMENTED_INTERIOR_POINT, AUGMENTED_DE_SAXCE    Scene("bridge", friction=0.5), step 99, to 1e-8
 
 Every state ends the solve as soon as the best point is within tol or at the round-off limit, a certificate is proven,
 or the budget is spent. De Saxce's interior point has states of its own:
 
     DE_SAXCE_INTERIOR    interior point                              far from a solution: end;  else DE_SAXCE_FIRST_END
+                         on the augmented system                     end
     DE_SAXCE_FIRST_END   damped Newton from its best point           DE_SAXCE_SECOND_END
     DE_SAXCE_SECOND_END  the same with a smaller proximal weight     end
 """
@@ -46,9 +53,10 @@ from lavender_ext.newton.path cimport N_PATHS, begin_path, step_path
 from lavender_ext.newton.active_set cimport begin_active_set, step_active_set
 from lavender_ext.newton.damped_newton cimport (begin_damped_newton, begin_damped_newton_stretches,
                                                 continue_damped_newton_stretches, push_damped_newton, step_damped_newton)
-from lavender_ext.newton.interior_phases cimport (begin_interior_steps, begin_interior_with_newton, compute_sliding_fraction,
-                                                  step_interior_point, step_interior_with_newton)
-from lavender_ext.newton.run cimport (ACTIVE_SET, DAMPED_NEWTON, DAMPED_STRETCHES, DE_SAXCE, INTERIOR_POINT,
+from lavender_ext.newton.interior_phases cimport (augmented_shift, begin_interior_steps, begin_interior_with_newton,
+                                                  compute_sliding_fraction, step_augmented_newton, step_interior_point,
+                                                  step_interior_with_newton)
+from lavender_ext.newton.run cimport (ACTIVE_SET, AUGMENTED_NEWTON, DAMPED_NEWTON, DAMPED_STRETCHES, DE_SAXCE, INTERIOR_POINT,
                                       INTERIOR_WITH_NEWTON, MAX_INNER_STEPS, N_COUNTED, N_REFINEMENTS, UNLIMITED,
                                       PLAN_CONVEX, PLAN_COULOMB, SHIFTED_NEWTON, begin_separate_best, convex_residual,
                                       compute_slack, copy_vector, de_saxce_t, end_separate_best, is_at_roundoff,
@@ -66,8 +74,9 @@ cdef enum:                      # states of PLAN_CONVEX
     FIRST_CONE_WEIGHT = 3
     SECOND_CONE_WEIGHT = 4
     THIRD_CONE_WEIGHT = 5
-    CONVEX_DAMPED_NEWTON = 6
-    CONVEX_END = 7
+    AUGMENTED_INTERIOR_POINT = 6
+    CONVEX_DAMPED_NEWTON = 7
+    CONVEX_END = 8
 
 cdef enum:                      # states of PLAN_COULOMB
     START_SHIFTED = 0
@@ -77,9 +86,10 @@ cdef enum:                      # states of PLAN_COULOMB
     FIRST_SHIFTED = 4
     FIRST_PATH = 5
     SECOND_DE_SAXCE = 6
-    MORE_PATHS = 7
-    COULOMB_DAMPED_NEWTON = 8
-    COULOMB_END = 9
+    AUGMENTED_DE_SAXCE = 7
+    MORE_PATHS = 8
+    COULOMB_DAMPED_NEWTON = 9
+    COULOMB_END = 10
 
 cdef enum:                      # states of DE_SAXCE
     DE_SAXCE_INTERIOR = 0
@@ -96,7 +106,7 @@ cdef enum:
     START_FACTORISATIONS = 8    # First stretch of damped Newton; a start near a solution gains within it.
     FIRST_END_INNER_STEPS = 10
     FIRST_END_FACTORISATIONS = 15   # Factorisations of the first damped Newton phase after De Saxce's interior point.
-    MAX_RIGID_ROWS = 10000      # With more rows, a path precedes the second De Saxce point: 0.65 of the time on 12,147 rows.
+    MAX_AUGMENTED_ROWS = 10000  # With more rows, one factorisation of the augmented system may exceed 0.2 s.
     SECOND_END_FACTORISATIONS = 12  # Factorisations and inner steps of the second damped Newton phase after it.
 
 
@@ -223,6 +233,11 @@ cdef inline void begin_separate_active_set(newton_t* n, const double* z) noexcep
     begin_active_set(n, z)
 
 
+cdef inline bint has_rigid_joints(const newton_t* n) noexcept nogil:
+    """Return whether rows may be nearly dependent, as in loops of rigid joints. It must not depend on the caller's factor."""
+    return n.s.form == BODIES and n.s.e.m <= MAX_AUGMENTED_ROWS and has_free_rows(n)
+
+
 # -- bounded rows and cones --------------------------------------------------------------------------------------------
 
 
@@ -245,7 +260,7 @@ cdef inline void enter_next_convex_state(newton_t* n) noexcept nogil:
             begin_separate_active_set(n, n.ip.unbounded_z)
     elif state == ROWS_INTERIOR_POINT:
         begin_interior_steps(n, True)
-        n.stage = CONVEX_DAMPED_NEWTON
+        n.stage = AUGMENTED_INTERIOR_POINT
     elif state == FIRST_CONE_WEIGHT:
         begin_interior_point(n, first_cone_weight(), 0.0)
         begin_interior_steps(n, False)
@@ -255,6 +270,13 @@ cdef inline void enter_next_convex_state(newton_t* n) noexcept nogil:
     elif state == THIRD_CONE_WEIGHT:
         begin_interior_point(n, third_cone_weight(), 0.0)
         begin_interior_steps(n, False)
+    elif state == AUGMENTED_INTERIOR_POINT:
+        restore_best_of_all(n)
+        if n.best < 1e-3 and n.has_augmented and has_rigid_joints(n):   # Nearly dependent rows may prevent further progress.
+            n.s.augmented = 1
+            begin_interior_point(n, augmented_shift(), 0.0)
+            n.s.augmented = 0
+            begin_interior_with_newton(n, CONE, 1)
     elif state == CONVEX_DAMPED_NEWTON:
         restore_best_of_all(n)
         # Of cones, the last interior point is nearer to a solution than the point with the lowest residual, unless its
@@ -272,7 +294,13 @@ cdef inline void enter_next_convex_state(newton_t* n) noexcept nogil:
 
 cdef inline void begin_de_saxce(newton_t* n, double derivative_fraction, double max_residual) noexcept nogil:
     """Begin De Saxce's interior point; damped Newton ends it if its residual is at most `max_residual`."""
-    n.de_saxce = de_saxce_t(derivative_fraction, max_residual, DE_SAXCE_INTERIOR)
+    n.de_saxce = de_saxce_t(derivative_fraction, max_residual, DE_SAXCE_INTERIOR, False)
+    push_phase(n, DE_SAXCE)
+
+
+cdef inline void begin_augmented_de_saxce(newton_t* n) noexcept nogil:
+    """Begin De Saxce's interior point on the augmented system. No damped Newton phase follows."""
+    n.de_saxce = de_saxce_t(second_derivative_fraction(), 0.0, DE_SAXCE_INTERIOR, True)
     push_phase(n, DE_SAXCE)
 
 
@@ -291,13 +319,15 @@ cdef inline void enter_next_de_saxce_state(newton_t* n) noexcept nogil:
     cdef double best
     x.stage = state + 1
     if state == DE_SAXCE_INTERIOR:
-        begin_interior_point(n, compute_proximal_weight(), x.derivative_fraction)
-        begin_interior_with_newton(n)
+        n.s.augmented = x.augmented
+        begin_interior_point(n, augmented_shift() if x.augmented else compute_proximal_weight(), x.derivative_fraction)
+        n.s.augmented = 0
+        begin_interior_with_newton(n, COULOMB, x.augmented)
         return
     best = n.progress.lowest if state == DE_SAXCE_FIRST_END else end_separate_best(n, n.progress.best_z)
     if is_over(n) or state == DE_SAXCE_ENDED:
         pop_phase(n)
-    elif state == DE_SAXCE_FIRST_END and best > x.max_residual:
+    elif state == DE_SAXCE_FIRST_END and (x.augmented or best > x.max_residual):
         pop_phase(n)
     elif state == DE_SAXCE_FIRST_END:
         begin_damped_newton_after_de_saxce(n, min(best, 1e-3), FIRST_END_INNER_STEPS, FIRST_END_FACTORISATIONS)
@@ -318,8 +348,6 @@ cdef inline bint slides_mostly(newton_t* n, const double* z) noexcept nogil:
 cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
     """Enter the next state of Coulomb's law."""
     cdef int32_t state = n.stage
-    # Loops of rigid joints have nearly dependent rows.
-    cdef bint has_rigid_joints = n.s.form == BODIES and n.s.e.m <= MAX_RIGID_ROWS and has_free_rows(n)
     n.stage = state + 1
     if state != START_SHIFTED and is_over(n):
         state = COULOMB_END
@@ -349,10 +377,13 @@ cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
         if n.has_convex_start and not n.mostly_slides:
             begin_shifted_newton(n, n.saved_z, FIRST_SHIFTED_FACTORISATIONS)
     elif state == FIRST_PATH:
-        if not has_rigid_joints:
+        if not has_rigid_joints(n):
             begin_path(n)
     elif state == SECOND_DE_SAXCE:
         begin_de_saxce(n, second_derivative_fraction(), 1.0 / 0.0)
+    elif state == AUGMENTED_DE_SAXCE:
+        if n.has_augmented and has_rigid_joints(n):
+            begin_augmented_de_saxce(n)
     elif state == MORE_PATHS:
         if n.path.paths < N_PATHS:
             n.stage = MORE_PATHS
@@ -382,6 +413,8 @@ cdef inline void step_phase(newton_t* n) noexcept nogil:
         step_interior_point(n)
     elif phase == INTERIOR_WITH_NEWTON:
         step_interior_with_newton(n)
+    elif phase == AUGMENTED_NEWTON:
+        step_augmented_newton(n)
     elif phase == DAMPED_NEWTON:
         step_damped_newton(n)
     elif phase == SHIFTED_NEWTON:
@@ -398,12 +431,13 @@ cdef inline void start_newton_solve(newton_t* n, const double* lam) noexcept nog
     cdef bint has_cones = n.s.e.n < n.s.e.m
     n.stop = n.needs_check = n.proven = n.has_saved_best = n.depth = n.path.paths = 0
     n.has_convex_start = n.mostly_slides = 0
-    n.s.factorisations = 0
+    n.s.augmented = n.s.factorisations = 0
     for i in range(N_COUNTED):
         n.counts[i] = 0
     n.best = 1.0 / 0.0
     n.above_floor = 1.0 / 0.0
     n.island_best.seen = 0
+    n.has_augmented = n.s.others != NULL
     n.is_cold = is_zero_impulse(&n.problem.p, lam)
     n.stage = FIRST_CONE_WEIGHT if has_cones and n.problem.p.law != COULOMB else 0
     write_unknown(n, lam, n.trial)

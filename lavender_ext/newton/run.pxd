@@ -30,10 +30,11 @@ cdef enum:                      # phases
     ACTIVE_SET = 3              # active_set.pxd
     INTERIOR_POINT = 4          # interior_phases.pxd
     INTERIOR_WITH_NEWTON = 5
-    DAMPED_NEWTON = 6           # damped_newton.pxd
-    DAMPED_STRETCHES = 7
-    PATH = 8                    # path.pxd
-    SHIFTED_NEWTON = 9          # shifted.pxd
+    AUGMENTED_NEWTON = 6
+    DAMPED_NEWTON = 7           # damped_newton.pxd
+    DAMPED_STRETCHES = 8
+    PATH = 9                    # path.pxd
+    SHIFTED_NEWTON = 10         # shifted.pxd
 
 cdef enum:                      # counters
     N_ACTIVE_SET = 0
@@ -41,13 +42,16 @@ cdef enum:                      # counters
     N_INTERIOR = 2
     N_PROXIMAL = 3
     N_DE_SAXCE = 4
-    N_PATH = 5
-    N_SHIFTED = 6
-    N_COUNTED = 7
+    N_AUGMENTED_INTERIOR = 5
+    N_AUGMENTED_DE_SAXCE = 6
+    N_AUGMENTED_NEWTON = 7
+    N_PATH = 8
+    N_SHIFTED = 9
+    N_COUNTED = 10
 
 cdef enum:
     MAX_PHASE_DEPTH = 8         # Phases nest at most four deep.
-    N_VECTORS = 29              # vectors (m) of `bind_vectors`
+    N_VECTORS = 30              # vectors (m) of `bind_vectors`
     UNLIMITED = 2147483647      # limit of factorisations that no phase reaches
     MAX_INNER_STEPS = 20        # Newton steps of one proximal iteration; more rarely end it.
 
@@ -91,7 +95,16 @@ cdef struct progress_t:         # progress of an interior point's steps
     int32_t steps
     int32_t trial_runs          # a trial is on the stack
     int32_t bounded_rows        # the problem has bounded rows alone
+    int32_t law                 # law that the Newton steps use
+    int32_t augmented
     int32_t is_counted          # Coulomb's law: the contacts that slide fast have been counted
+
+
+cdef struct augmented_newton_t:
+    double* z
+    double best
+    int32_t failed              # steps in a row that did not halve the residual
+    int32_t steps_left
 
 
 cdef struct damped_newton_t:    # state of the proximal iterations
@@ -124,6 +137,7 @@ cdef struct de_saxce_t:
     double derivative_fraction
     double max_residual         # damped Newton follows only if the relative residual does not exceed this
     int32_t stage
+    int32_t augmented
 
 
 cdef struct path_t:             # a path of smoothed problems
@@ -191,6 +205,7 @@ cdef struct newton_t:           # bound to its workspace; it must not move
     int32_t needs_check         # the caller must check whether `direction` is a certificate
     int32_t proven              # `direction` is a certificate
     int32_t is_cold             # the start is the zero impulse
+    int32_t has_augmented       # the caller can factor the augmented system
     int32_t stage               # state of the plan (plan.pxd)
     int32_t has_saved_best
     int32_t has_convex_start    # Coulomb's law: saved_z solves the convex law, or nearly so if many contacts slide
@@ -225,6 +240,7 @@ cdef struct newton_t:           # bound to its workspace; it must not move
     interior_t ip
     active_set_t active
     progress_t progress
+    augmented_newton_t augmented
     damped_newton_t damped
     stretches_t stretches
     de_saxce_t de_saxce
@@ -272,8 +288,8 @@ cdef inline void bind_vectors(newton_t* n, int64_t m, arena_t* a) noexcept nogil
     at[12], at[13], at[14], at[15] = &n.c, &n.hz, &n.hdz, &n.trial
     at[16], at[17], at[18], at[19] = &n.slack, &n.ip.z, &n.ip.u1, &n.ip.u2
     at[20], at[21], at[22], at[23] = &n.ip.hz, &n.ip.unbounded_z, &n.active.z, &n.active.hz
-    at[24], at[25], at[26], at[27] = &n.active.best_z, &n.progress.best_z, &n.damped.z, &n.s.t
-    at[28] = &n.s.q
+    at[24], at[25], at[26], at[27] = &n.active.best_z, &n.progress.best_z, &n.augmented.z, &n.damped.z
+    at[28], at[29] = &n.s.t, &n.s.q
     for i in range(N_VECTORS):
         at[i][0] = take_doubles(a, m)
 
@@ -314,7 +330,8 @@ cdef inline void scale_problem(newton_t* n, const view_t* v) noexcept nogil:
     if n.sc.e.n == n.sc.e.m:                            # Bounded rows alone.
         n.s.bt = NULL
     n.s.e, n.s.linear = &n.sc.e, &n.linear
-    n.s.factorisations = 0
+    n.s.others = NULL
+    n.s.augmented = n.s.factorisations = 0
 
 
 # -- the stack of phases -----------------------------------------------------------------------------------------------

@@ -37,7 +37,7 @@ from lavender_ext.newton.rows cimport (ANY_FORM, MAX_ALWAYS_DENSE_ROWS, analyse_
 from lavender_ext.newton.scaling cimport index_unfixed_elements, is_problem_supported
 from lavender_ext.newton.steps cimport (begin_interior_point, form_de_saxce_matrices, take_interior_point_step,
                                         multiply_cone_duals, compute_all_normal_shifts)
-from lavender_ext.newton.system cimport (BARRIER, DENSE, NATURAL, PAIR, SPARSE,
+from lavender_ext.newton.system cimport (BARRIER, DENSE, NATURAL, PAIR, SPARSE, external_t,
                                          multiply_by_natural_map_derivative, solve_natural_map_system,
                                          solve_natural_map_system_refined, factor_newton_system, evaluate_system_natural_map,
                                          determinant_sign, solve_newton_system, multiply_system_matrix)
@@ -54,6 +54,9 @@ COUNTED = (
     "interior point steps",
     "proximal iterations",
     "De Saxce steps",
+    "augmented interior point steps",
+    "augmented De Saxce steps",
+    "augmented steps",
     "path steps",
     "shifted Newton steps",
 )
@@ -275,6 +278,20 @@ cdef int32_t start_newton_over_bodies(const view_t* v, const options_t* o, works
 cdef class Solve(Method)        # The class is defined below.
 
 
+cdef int32_t call_linear_factor(void* at, int32_t what, double eps) noexcept with gil:
+    cdef Solve self = <Solve>at
+    try:
+        return bool(self.others.factor(what, eps))
+    except BaseException as error:                      # The step ends, and its caller raises the error, also for Ctrl-C.
+        self.python.store_error(error)
+        return 0
+
+
+cdef void call_linear_solve(void* at, double* x) noexcept with gil:
+    cdef Solve self = <Solve>at
+    solve_by_object(self.others, self.python, x, self.m)
+
+
 cdef int32_t call_sparse_fallback(void* at) noexcept with gil:
     cdef Solve self = <Solve>at
     if self.python.error is not None:                   # The caller is about to raise it.
@@ -374,9 +391,10 @@ cdef class Solve(Method):
     """
     cdef state_t state
     cdef newton_t* n
+    cdef external_t calls
     cdef PythonCalls python
     cdef list held
-    cdef object real, index
+    cdef object others, real, index
     cdef fallback_t fallback
     cdef object splu, sparse, factored                  # of a sparse H
     cdef readonly object keep, block, ptr, part, wptr, fixed, scale, theta, g, lower, upper, reach
@@ -415,6 +433,7 @@ cdef class Solve(Method):
         self.v, self.einv = part(self.real, n.s.v, n.sc.small), part(self.real, n.s.einv, n.sc.small)
         self.p, self.pair = part(self.real, n.s.p, n.sc.small), part(self.real, n.s.pair, n.sc.small)
         self.bt = part(self.real, n.s.bt, n.sc.small) if n.s.bt != NULL else None
+        self.calls = external_t(<void*>self, call_linear_factor, call_linear_solve)
         self.python = PythonCalls()
         self.python.stop = &n.stop
 
@@ -429,6 +448,10 @@ cdef class Solve(Method):
         return self.n.sc.e.n < self.n.sc.e.m
 
     # -- forms -------------------------------------------------------------------------------------
+
+    def set_external(self, others):
+        """Set the object that factors the augmented system."""
+        self.others, self.n.s.others = others, &self.calls
 
     def use_rows(self, Data matrix, bint symmetric, bint wide, splu, bint may_be_dense=True):
         """Use H over the rows of `matrix`, dense or in compressed rows; `splu` factors the latter if pivots are lost.
@@ -573,13 +596,14 @@ cdef class Solve(Method):
         multiply_by_natural_map_derivative(&self.n.s, &dz[0], &out[0])
         return out_array
 
-    def factor(self, str what, double eps=0.0):
+    def factor(self, str what, double eps=0.0, bint augmented=False):
         """Factor the system "barrier", "pair" or "natural"; return whether no pivot failed."""
+        self.n.s.augmented = augmented
         return bool(factor_newton_system(&self.n.s, SYSTEMS[what], eps))
 
     @property
     def sign(self):
-        """Sign of the determinant of the last "natural" factor; 0 for a sparse system."""
+        """Sign of the determinant of the last "natural" factor; 0 for a sparse or the augmented system."""
         return determinant_sign(&self.n.s)
 
     def solve(self, str what, const double[::1] r, bint refined=False):

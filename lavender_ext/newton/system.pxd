@@ -6,7 +6,7 @@
 
 Over bodies the matrix is I + K^T V K (elements.pxd). Over rows it is M = L H R^T + o L + I, or H + W for bounded rows
 alone, dense or in compressed rows (coupled.pxd); a dense (3) has the rows with P != 0 only. All three are one `linear_t`
-(factor/linear.pxd).
+(factor/linear.pxd). The augmented system of the bodies, [I -R K^T; L K I], is factored by the caller (`external_t`).
 
 If a pivot fails, L U replaces a dense L L^T, and the host's factorisation a sparse factor, or L U if there is none. If that
 fails too, `factor_newton_system` returns 0, and the phases use the step only if it is finite: else an interior point, exchanges
@@ -45,9 +45,16 @@ cdef enum:
     REFINEMENT_STEPS = 2        # Refinements of (3), which remove eps; the next Newton step does the rest.
 
 
+cdef struct external_t:         # factorisation of the augmented system by the caller
+    void* at
+    int32_t (*factor)(void* at, int32_t what, double eps) noexcept nogil
+    void (*solve)(void* at, double* x) noexcept nogil       # x (m), in place
+
+
 cdef struct system_t:
     int32_t form
     int32_t symmetric           # A is symmetric
+    int32_t augmented           # the augmented system is factored and solved at present
     int32_t factorisations
     int32_t n_free              # number of rows of the last dense matrix; -1: all rows
     int32_t law                 # law of the last natural map
@@ -56,6 +63,7 @@ cdef struct system_t:
     const double* h             # (m, m) DENSE
     csr_t a                     # H in compressed rows, SPARSE
     coupled_t coupled           # H in the pattern of the elements, SPARSE
+    const external_t* others    # or NULL
     double* multiplied          # (m, m) DENSE with cones: L H, in the place of L L^T
     int32_t* free               # (m) rows of the last dense matrix
     double* v                   # small matrices of the elements
@@ -233,6 +241,8 @@ cdef inline void solve_dense(system_t* s, double* x) noexcept nogil:
 cdef inline int32_t factor_newton_system(system_t* s, int32_t what, double eps) noexcept nogil:
     """Factor (1), (2), or (3) with the last `evaluate_system_natural_map`; return 0 if a pivot fails."""
     s.factorisations += 1
+    if s.augmented:
+        return s.others.factor(s.others.at, what, eps)
     if s.form == DENSE:
         return factor_dense(s, what, eps)
     if s.form == SPARSE:
@@ -244,7 +254,7 @@ cdef inline int32_t factor_newton_system(system_t* s, int32_t what, double eps) 
 
 cdef inline int32_t determinant_sign(const system_t* s) noexcept nogil:
     """Return the sign of the determinant of the last matrix (3); 0 if it is not known."""
-    return 0 if s.form == SPARSE else compute_determinant_sign(s.linear)
+    return 0 if s.augmented or s.form == SPARSE else compute_determinant_sign(s.linear)
 
 
 cdef inline void apply_body_inverse(system_t* s, const double* x, double* out) noexcept nogil:
@@ -257,7 +267,9 @@ cdef inline void apply_body_inverse(system_t* s, const double* x, double* out) n
 cdef inline void solve_over_rows(system_t* s, double* x) noexcept nogil:
     """Solve over the rows of A with the last factor, in place."""
     cdef int32_t j
-    if s.form == DENSE:
+    if s.augmented:
+        s.others.solve(s.others.at, x)
+    elif s.form == DENSE:
         solve_dense(s, x)
     else:
         memcpy(s.y, x, s.e.m * sizeof(double))
@@ -270,7 +282,7 @@ cdef inline void solve_newton_system(system_t* s, int32_t what, const double* r,
     """Solve (1) or (2) for dz in `out`, which must not be r."""
     cdef int32_t j, m = s.e.m
     cdef const double* left = s.pair if what == PAIR else s.bt
-    if s.form == BODIES:
+    if s.form == BODIES and not s.augmented:
         multiply_by_element_matrices(s.e, s.v, r, s.t, False)
         apply_body_inverse(s, s.t, s.q)
         for j in range(m):
@@ -285,6 +297,9 @@ cdef inline void solve_newton_system(system_t* s, int32_t what, const double* r,
         multiply_by_element_matrices(s.e, left, r, s.t, False)
         solve_over_rows(s, s.t)
         multiply_by_element_matrices(s.e, s.bt, s.t, out, True)
+    elif s.augmented:
+        multiply_by_element_matrices(s.e, s.v, r, out, False)
+        solve_over_rows(s, out)
     else:
         memcpy(out, r, m * sizeof(double))
         solve_over_rows(s, out)
@@ -300,7 +315,7 @@ cdef inline double evaluate_system_natural_map(system_t* s, const double* z, con
 cdef inline void solve_natural_map_system(system_t* s, const double* r, double* out) noexcept nogil:
     """Solve (3) for dz in `out`, which must not be r."""
     cdef int32_t j, m = s.e.m
-    if s.form == BODIES:
+    if s.form == BODIES and not s.augmented:
         multiply_by_element_matrices(s.e, s.einv, r, s.t, False)
         apply_body_inverse(s, s.t, s.q)
         multiply_by_element_matrices(s.e, s.p, s.q, s.t, False)
@@ -308,7 +323,7 @@ cdef inline void solve_natural_map_system(system_t* s, const double* r, double* 
             s.t[j] = r[j] - s.t[j]
         multiply_by_element_matrices(s.e, s.einv, s.t, out, False)
         return
-    if s.form == SPARSE and s.bt != NULL:
+    if s.augmented or (s.form == SPARSE and s.bt != NULL):
         memcpy(out, r, m * sizeof(double))
     else:                                               # M_FF dz_F = r_F - P H_FN r_N, and dz_N = r_N for P = 0.
         memcpy(s.t, r, m * sizeof(double))

@@ -11,10 +11,12 @@ from typing import NamedTuple
 import numpy as np
 
 from lavender.base.arrays import IntArray
+from lavender.base.deadline import Deadline
 from lavender.base.lu import splu
 from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.problem import Problem
 from lavender.solvers.factors import USE_WIDE_LANES
+from lavender.solvers.newton_systems.augmented import AugmentedSystem
 from lavender_ext.factor import graph
 from lavender_ext.newton.solve import Layout, Solve
 
@@ -58,6 +60,8 @@ class System:
     form = ""
     work = 0.0  # Multiply-adds of one factorisation.
     expected_factor_seconds = 0.0  # Estimated time of the next factor [s].
+    # Factorisations by Python that are expected to end after this deadline are not started.
+    deadline: Deadline | None = None
     dense = False  # Whether A is stored as a full matrix.
     entries = 0.0  # Number of entries of A.
 
@@ -88,6 +92,8 @@ class VelocitySystem(System):
         solve.use_bodies(
             panel, columns, self.layout, solve.has_friction and problem.law == "coulomb", USE_WIDE_LANES
         )
+        self.augmented = AugmentedSystem(self, bodies)
+        solve.set_external(self.augmented)
 
 
 class MatrixSystem(System):

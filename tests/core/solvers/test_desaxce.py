@@ -1,4 +1,4 @@
-"""De Saxce's interior point: against dense algebra."""
+"""De Saxce's interior point and the augmented system: against dense algebra."""
 
 import dataclasses
 
@@ -48,11 +48,11 @@ def test_slip_is_de_saxces_term_and_psi_its_derivative(seed):
 
 
 @pytest.mark.parametrize("compliant", [True, False])
-@pytest.mark.parametrize("form", ["velocity", "impulse", "sparse"])
+@pytest.mark.parametrize("form", ["velocity", "impulse", "sparse", "augmented"])
 @given(seed=seeds)
 def test_the_system_of_a_step_is_solved(form, compliant, seed):
     problem = problem_of(seed, compliant)
-    system = system_in(problem, form)
+    system = system_in(problem, "velocity" if form == "augmented" else form)
     sc = solve = system.solve
     h = dense_h(problem)[np.ix_(sc.keep, sc.keep)]
     first = np.repeat(sc.ptr[:-1], np.diff(sc.ptr))
@@ -62,7 +62,7 @@ def test_the_system_of_a_step_is_solved(form, compliant, seed):
         w = np.linalg.inv(block_diagonal(system, solve.v)) - np.diag(sc.theta)
         c = np.eye(sc.m)
         np.subtract.at(c, (first, np.arange(sc.m)), solve.form_de_saxce_matrices(0.9))
-        assert solve.factor("pair")
+        assert solve.factor("pair", augmented=form == "augmented")
         r = np.random.default_rng(seed).normal(size=sc.m)
         x = solve.solve("pair", r)
         expected = np.linalg.solve(h + c @ w, r)

@@ -37,11 +37,11 @@ def test_rows_that_outnumber_velocities_take_an_interior_point_no_longer(seed, f
 
 
 @pytest.mark.parametrize("law", [LAWS["cone"], LAWS["coulomb"]])
-@pytest.mark.parametrize("form", ["velocity", "impulse", "sparse"])
+@pytest.mark.parametrize("form", ["velocity", "augmented", "impulse", "sparse"])
 @given(seed=seeds)
 def test_newton_system_is_the_derivative_and_is_solved(form, law, seed):
     problem = random_contact_problem(seed, friction="cone" if law == LAWS["cone"] else "coulomb", bodies=6, contacts=10)
-    system = system_in(problem, form)
+    system = system_in(problem, "velocity" if form == "augmented" else form)
     solve = system.solve
     m, g, eps = solve.m, solve.g, 1e-3
     rng = np.random.default_rng(seed)
@@ -61,7 +61,7 @@ def test_newton_system_is_the_derivative_and_is_solved(form, law, seed):
         # Central differences: third derivatives near the tip of a cone times step^2, rounding over step.
         np.testing.assert_allclose(difference, slope, rtol=0, atol=1e-5 * (1.0 + np.abs(slope).max()))
     solve.evaluate_natural_map(z, solve.multiply_matrix(z) - g, law, eps)
-    assert solve.factor("natural", eps)
+    assert solve.factor("natural", eps, augmented=form == "augmented")
     r = rng.normal(size=m)
     x = solve.solve("natural", r)
     matrix = np.eye(m) + block_diagonal(system, solve.p) @ (
