@@ -7,7 +7,7 @@ from time import perf_counter
 from typing import Any
 
 from lavender.base.arrays import FloatArray
-from lavender.judge.residuals import make_residual
+from lavender.judge.residuals import get_zero_impulse_reference, make_residual
 from lavender.judge.solution import CONVERGED, TIME_LIMIT, Claim, Solution, Status
 from lavender.problem import Problem
 from lavender.solvers.costs import (
@@ -107,4 +107,9 @@ def compute_postponed_fields(
     return make_fields(run, judged)
 
 
-bind_types((Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, perf_counter))
+bind_types(
+    (
+        Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, perf_counter,
+        get_zero_impulse_reference,
+    )
+)  # fmt: skip

@@ -198,13 +198,13 @@ def solve_new_generalized_problem(Data p, start, double tol, Limits limits, doub
 # [s] A limit of at least this does not end the call of few rows, which `solve_general` may repeat if the call fails.
 cdef double MIN_LONG_LIMIT = 0.1
 cdef tuple NO_CALL = (None, None, None, None), LAWS_OF_ROWS = ("linear", "lcp")
-cdef object Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, read_clock
+cdef object Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, read_clock, get_zero_impulse_reference
 
 
 def bind_types(types):
     """Set the classes and functions of the package that `solve_compiled` needs; this package does not import it."""
-    global Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, read_clock
-    Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, read_clock = types
+    global Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, read_clock, get_zero_impulse_reference
+    Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, read_clock, get_zero_impulse_reference = types
 
 
 cdef bint is_plain_start(impulse, Py_ssize_t m) noexcept:
@@ -251,6 +251,9 @@ def solve_compiled(problem, spec, impulse, tol, double max_cost=INFINITY):
         first = problem.impulse_array(impulse)
     if view is not None and (<Data>view).blocks.n_rows:
         judged, counts = solve_new_generalized_problem(view, first, tol, small.limits, max_cost)
+        if judged is None and (<Data>view).reference_energy < 0.0:      # The reference of a row needs v*.
+            get_zero_impulse_reference(problem)
+            judged, counts = solve_new_generalized_problem(view, first, tol, small.limits, max_cost)
     else:
         judged, counts = small.solve_and_judge(problem, first, tol, max_cost)
     if judged is not None and (<Judged>judged).relative <= <double>tol:
@@ -521,7 +524,8 @@ cdef class Worlds:
             solve_task(&j, &h.workspace, &h.small.islands, limits, tol)
             if not had_derived:
                 h.made = j.made                         # The next world reuses the memory of `made`.
-            code = READY if j.solved else TRIED
+            # Without a reference no solver has run; the single call computes it.
+            code = READY if j.solved else TRIED if j.zero_residual[0] >= 0.0 else LEFT
         else:
             code = solve_small_task(&j, &h.small, rules, tol)
         if code == READY or code == STARTED:

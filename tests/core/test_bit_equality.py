@@ -246,7 +246,7 @@ RUNS = {
         f"a step of auto: {kind}": (
             functools.partial(run_step_of_auto, kind=kind), lambda: [stacks(4, 4, 0.5, False)], [40], [3, 10, 27],
         )
-        for kind in ("anderson", "nncg", "admm", "newton")
+        for kind in ("anderson", "admm", "newton")
     },
 }  # fmt: skip
 

@@ -288,7 +288,13 @@ CALLS = {
         {"impulse": "impulses?"},
     ),
     "solve_many, an empty list": Call(lambda **more: lv.solve_many([], **more), LIMITS),
-    "solve_qp": Call(lv.solve_qp, {"problem": PROGRAM, "solver": "auto", "tol": 1e-9, "time_limit": 1.0}),
+    "solve_qp": Call(
+        lv.solve_qp,
+        {"P": A, "q": B, "G": A, "h": ONES, "lb": -ONES, "ub": ONES, "solver": "auto", "tol": 1e-9, "time_limit": 1.0},
+    ),
+    "solve_qp, a problem": Call(
+        partial(lv.solve_qp, PROGRAM), {"q": B, "solver": "auto", "tol": 1e-9, "time_limit": 1.0}
+    ),
 }  # fmt: skip
 
 #: Public calls that are not in the table, and why.
