@@ -23,7 +23,6 @@
 #include "lavender.h"
 
 namespace lavender {
-
 /* An error code of the library in words. */
 class error : public std::runtime_error {
  public:
@@ -62,7 +61,6 @@ inline lav_budget default_budget() {
   check(lav_default_budget(&budget));
   return budget;
 }
-
 class solver {
  public:
   explicit solver(int32_t method) : solver(default_options(method)) {}
@@ -101,8 +99,8 @@ class solver {
     return result;
   }
 
-  void impulse(std::span<double> out) { check(lav_impulse(handle(), out.data(), length(out))); }        /* (m) N s */
-  void velocity(std::span<double> out) { check(lav_velocity(handle(), out.data(), length(out))); }      /* v+ */
+  void impulse(std::span<double> out) { check(lav_impulse(handle(), out.data(), length(out))); } /* (m) N s */
+  void velocity(std::span<double> out) { check(lav_velocity(handle(), out.data(), length(out))); } /* v+ */
   void free_velocity(std::span<double> out) { check(lav_free_velocity(handle(), out.data(), length(out))); } /* v* */
 
   /* Judge any impulse (m) [N s]; `slack` and `error` are empty or have m entries. */
@@ -148,5 +146,5 @@ class solver {
   int32_t n_rows_ = 0;
 };
 
-}  // namespace lavender
+}
 #endif
