@@ -201,7 +201,10 @@ def test_under_a_time_limit_a_backend_runs_in_a_process_of_its_own(name, monkeyp
         assert ("accepts no time limit" in other.message) == (name in APART)
         assert other.status is plain.status
         assert other.work == plain.work
-        assert other.impulse.tobytes() == plain.impulse.tobytes()
+        if name == "proxqp":  # Its vectorised sums depend on the alignment of memory, in one process, too.
+            np.testing.assert_allclose(other.impulse, plain.impulse, rtol=0.0, atol=1e-13)
+        else:
+            assert other.impulse.tobytes() == plain.impulse.tobytes()
 
 
 def test_a_backend_that_does_not_end_is_ended_and_the_next_call_finds_another():
