@@ -128,14 +128,18 @@ cdef inline void compute_objectives(best_t* s, const blocks_t* p, const double* 
 
 
 cdef inline double rounding_of_objective(const blocks_t* p, int32_t island, const double* lam, const double* w) noexcept nogil:
-    """Return what rounding may change in the f of lam (m) with slack w (m) [J]."""
+    """Return what rounding may change in the f of lam (m) with slack w (m) [J].
+
+    A slack and b are sums over dozens of terms. On a stack of six boxes the f of two solutions differ by 1.6e-15 J, four times
+    as much as 8 roundings of each row's largest terms.
+    """
     cdef int32_t a, i, k
     cdef double size = 0.0
     for a in range(index_of_island_begin(p, island), index_of_island_end(p, island)):
         i = get_island_block(p, a)
         for k in range(p.ptr[i], p.ptr[i + 1]):
             size += fabs(lam[k]) * ((fabs(w[k]) + fabs(p.b[k])) + p.d[k] * fabs(lam[k]))
-    return 8.0 * unit_roundoff() * size
+    return 64.0 * unit_roundoff() * size
 
 
 cdef inline bint is_b_hidden(const blocks_t* p, int32_t island, const double* lam) noexcept nogil:

@@ -21,6 +21,8 @@ s_k is the sum of the terms of b = target - J v*, because b may be their roundin
 
     s_k = |target_k| + sum_j |J_kj v*_j|, or |b_k| if A is given      rows that no impulse moves, and in (3) rows with b = 0     (4)
 
+A row that impulses move, and for which (4) is 0, has s_k = 2^-51 sqrt(d_k) sqrt(sum E0_i^2), so that an error far below rounding
+counts as 0.
 The residual of an island is at least max d_k |e_k| / s_k over its rows that no impulse moves; (3) applies if it has no others.
 A b of such a row of at most 2^-51 max |b| is the rounding of a computation that ended in 0 (s_k = infinity).
 """
@@ -233,10 +235,11 @@ cdef inline double compute_row_terms(const view_t* v, const double* free, int32_
     return fabs(v.p.b[k] + velocity) + size
 
 
-cdef inline void compute_terms(const view_t* v, const int32_t* empty, const double* free, double* terms) noexcept nogil:
+cdef inline void compute_terms(const view_t* v, const int32_t* empty, const double* free, double energy,
+                               double* terms) noexcept nogil:
     """Compute `islands_t.terms` (m): (4) on rows with b = 0 and, negative, on rows that no impulse moves, otherwise |b|.
 
-    Rows of a contact that no impulse moves share their largest terms.
+    Rows of a contact that no impulse moves share their largest terms. energy is E0 of all rows.
     """
     cdef const blocks_t* p = &v.p
     cdef int32_t i, k
@@ -249,6 +252,8 @@ cdef inline void compute_terms(const view_t* v, const int32_t* empty, const doub
             terms[k] = fabs(p.b[k])
             if p.b[k] == 0.0 or is_row_unmoved(p, empty, i, k):
                 terms[k] = compute_row_terms(v, free, i, k)
+                if terms[k] == 0.0 and not is_row_unmoved(p, empty, i, k):
+                    terms[k] = 4.0 * unit_roundoff() * sqrt(p.d[k]) * energy
             largest = max(largest, terms[k])
         for k in range(p.ptr[i], p.ptr[i + 1]):
             if is_row_unmoved(p, empty, i, k):
