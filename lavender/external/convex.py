@@ -148,6 +148,17 @@ class ConvexProgram:
         lam[rows] = multipliers
         return self.restore_point(x, lam) if np.isfinite(x).all() else None
 
+    def compare_multipliers_with_slacks(self, x: FloatArray, lam: FloatArray) -> npt.NDArray[np.bool_]:
+        """Return the equations, and the inequalities with a multiplier that exceeds the slack in scaled units.
+
+        At the end of an interior point one of the two is far below the other, also on a row with a right-hand side of
+        0 and no other terms, which `judge_program` compares with its own slack.
+        """
+        x, lam = self.scale_point(x, lam)
+        active: npt.NDArray[np.bool_] = lam > _to_csr(self.scaled.J, len(x)) @ x - self.scaled.t
+        active[: self.free] = True
+        return active
+
     def update_active_rows(
         self, x: FloatArray, lam: FloatArray, active: npt.NDArray[np.bool_], tol: float
     ) -> npt.NDArray[np.bool_]:

@@ -66,18 +66,24 @@ class ProgramJudge:
 
     def accepts(self, x: FloatArray, lam: FloatArray) -> bool:
         """Judge a point and its Newton step; return whether the best point meets tol."""
-        error, active, lam = self.keep(x, lam)
+        error, active, complementary = self.keep(x, lam)
         size = len(x) + len(lam)
         if error > (STEP_ERROR if size <= MAX_FREE_STEP_SIZE else max(self.tol, STEP_ERROR)):
-            for _ in range(MAX_STEPS):
-                point = self.program.polish(x, lam, active)
-                if point is None:
-                    break
-                _, _, lam = self.keep(*point, True)
-                if self.error <= self.tol:
-                    break
-                x, active = point[0], self.program.update_active_rows(*point, active, self.tol)
+            self._polish(x, complementary, active)
+            if self.error > self.tol:
+                self._polish(x, lam, self.program.compare_multipliers_with_slacks(x, lam))
         return self.error <= self.tol
+
+    def _polish(self, x: FloatArray, lam: FloatArray, active: Any) -> None:
+        """Judge the Newton steps from a point with these active rows (m,)."""
+        for _ in range(MAX_STEPS):
+            point = self.program.polish(x, lam, active)
+            if point is None:
+                break
+            _, _, lam = self.keep(*point, True)
+            if self.error <= self.tol:
+                break
+            x, active = point[0], self.program.update_active_rows(*point, active, self.tol)
 
     def keep(self, x: FloatArray, lam: FloatArray, has_step: bool = False) -> tuple[float, Any, FloatArray]:
         """Judge a point and store it if it is the best."""
