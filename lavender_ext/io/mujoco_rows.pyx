@@ -187,9 +187,9 @@ def make_blocks(Step step, int32_t max_equality_rows):
     return blocks
 
 
-cdef inline const double* get_row_scales(Blocks blocks) noexcept:
+cdef inline double* get_row_scales(Blocks blocks) noexcept:
     """Return the factor of each row (m)."""
-    return blocks.at.rolling + blocks.at.n_rows
+    return <double*>blocks.at.rolling + blocks.at.n_rows
 
 
 def read_jacobian(Step step, Blocks blocks):
@@ -202,9 +202,7 @@ def read_jacobian(Step step, Blocks blocks):
     cdef int32_t i, j, last, column, count = s.n
     cdef int64_t first, end = 0, total = s.jac_entries if is_sparse else <int64_t>s.m * s.n
     cdef double x, factor
-    cdef const double* scale = NULL
-    if blocks is not None:
-        scale = get_row_scales(blocks)
+    cdef double* scale = NULL if blocks is None else get_row_scales(blocks)
     if total > s.jac_entries or is_sparse and s.m and (
             s.efc_J_rownnz == NULL or s.efc_J_rowadr == NULL or s.efc_J_colind == NULL):
         return -1

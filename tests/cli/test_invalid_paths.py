@@ -480,11 +480,11 @@ def test_commands_print_paths_as_text(lavender, tmp_path):
         assert "\\x1b" in out + err and "\x1b" not in out + err
 
 
-def test_the_name_of_a_plug_in_is_printed_as_text(lavender, register):
-    register(dataclasses.replace(lv.registry.get("pgs"), name="p\x1b[31m[red]q", summary="of [bold]a\x1b[0m"))
+def test_the_summary_of_a_plug_in_is_printed_as_text(lavender, register):
+    register(dataclasses.replace(lv.registry.get("pgs"), name="p-q", summary="of [bold]a\x1b[0m"))
     code, out, _ = lavender("solvers")
     assert code == 0 and "\x1b" not in out
-    assert r"p\x1b[31m[red]q" in out and r"of [bold]a\x1b[0m" in out
+    assert "p-q" in out and r"of [bold]a\x1b[0m" in out
 
 
 def test_long_names_that_differ_at_the_end_have_different_file_names():
@@ -623,8 +623,8 @@ def test_a_report_with_workers_takes_files_and_folders(lavender, tmp_path):
     more = (*QUICK[:6], "--workers", 1)
     code, _, err = lavender("report", "problems/", "z.npz", "./z.npz", "random_spd(n=4)", *more)
     assert (code, err.strip()) == (0, "")
-    cases = {r.case for r in report.read("lavender-report")}
-    assert cases == {"x", "y", "z", "z #2", "random_spd(n=4)"}
+    cases = report.select_runs(report.read("lavender-report"))["case"]
+    assert set(cases) == {"x", "y", "z", "z #2", "random_spd(n=4)"}
     code, _, err = lavender("report", "nothing.npz", *more)
     assert code == 2 and "no such file" in err
 

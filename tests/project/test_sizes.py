@@ -39,7 +39,7 @@ LINES = {
     "lavender_ext/core": 6603,
     "lavender_ext/derivative": 778,
     "lavender_ext/factor": 3251,
-    "lavender_ext/judge": 3010,
+    "lavender_ext/judge": 3020,
     "lavender_ext/local": 1100,
     "lavender_ext/newton lavender_ext/velocity_newton": 7805,
     "lavender_ext/pivot": 1719,

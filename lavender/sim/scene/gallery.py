@@ -126,8 +126,8 @@ def pile(scene: Scene, n: int = 100, kind: str = "spheres", size: float = 0.5, w
 def chain(scene: Scene, n: int = 20, tip_mass: float = 1.0, length: float = 0.25, angle: float = 1.2) -> None:
     """Build a chain of `n` links on ball joints, with a last link of mass `tip_mass`.
 
-    The scene has 3 n joint rows and no contacts. One sweep propagates an impulse by one link. `angle` is the initial
-    angle of the straight chain from the vertical.
+    The scene has 3 n joint rows and no contacts. Against the order, one sweep propagates an impulse by one link.
+    `angle` is the initial angle of the straight chain from the vertical.
     """
     check_int("n", n, 1)
     length = check_float("length", length, above=0.0)
