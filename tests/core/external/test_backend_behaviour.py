@@ -37,7 +37,10 @@ def test_probe_of_the_installed_backend_gives_the_recorded_behaviour(name):
     require(name)
     behaviour = OBSERVED[name].behaviour
     found = {field: probe(name) for field, probe in BEHAVIOUR_PROBES.items()}
-    assert found == {field: getattr(behaviour, field) for field in BEHAVIOUR_PROBES}
+    recorded = {field: getattr(behaviour, field) for field in BEHAVIOUR_PROBES}
+    if name == "scs":  # Its iterates follow the rounding of the BLAS: 0.7 and 0.8 were seen with two builds.
+        assert abs(found.pop("small_part") - recorded.pop("small_part")) < 0.15
+    assert found == recorded
 
 
 @pytest.mark.parametrize("name", mark_slow(OBSERVED))

@@ -102,10 +102,8 @@ EDGE_CASES = [
 
 @pytest.mark.parametrize(("status", "arrays"), EDGE_CASES)
 def test_programs_at_the_edges_have_one_verdict(status, arrays):
-    for name in (
-        "auto",
-        *installed("osqp", "clarabel", "piqp", "daqp", "quadprog", "highs", "scs", "qpalm", "cvxopt", "ecos"),
-    ):
+    names = ("osqp", "clarabel", "piqp", "daqp", "quadprog", "highs", "scs", "qpalm", "cvxopt", "ecos")
+    for name in ("auto", *(name for name in names if lv.registry.specs()[name].missing() is None)):
         answer = lv.solve_qp(**arrays, solver=name, tol=1e-6)
         assert answer.solution.status.name == status, (name, str(answer))
         assert answer.found == (status == "CONVERGED") == (answer.error <= 1e-6 and answer.ray is None), name
