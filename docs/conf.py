@@ -36,6 +36,9 @@ autodoc_class_signature = "mixed"
 numpydoc_show_class_members = False
 numpydoc_class_members_toctree = False
 
+# Pages link to files of the repository outside docs/; tests/project/test_docs.py checks every link.
+suppress_warnings = ["myst.xref_missing"]
+
 html_theme = "furo"
 html_title = f"lavender {release}"
 html_static_path = ["static"]
