@@ -455,8 +455,8 @@ def backend_observations():
 
 
 def load_engine_facts():
-    """Return the facts about engines that tests check."""
-    sys.path.insert(0, str(ROOT / "tests" / "io"))
+    """Return the facts about engines that probes check."""
+    sys.path.insert(0, str(ROOT / "findings" / "probes"))
     from engine_facts import load_facts
 
     return load_facts()

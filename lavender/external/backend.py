@@ -32,7 +32,7 @@ class Behaviour:
     """Results of a backend alone, at its default settings, on small programs with solutions that are known.
 
     A verdict is "right" (found, within 1 %), "wrong" (found, but not right), "not found" or "raises". The programs are
-    in `PROBE_PROGRAMS` of `backends`, by the name of the field, and `tests/core/external/backend_probes.py` runs them.
+    in `PROBE_PROGRAMS` of `backends`, by the name of the field, and `findings/probes/backend_probes.py` runs them.
     Defaults are the results of a backend that accepts every convex program.
 
     Parameters

@@ -232,9 +232,9 @@ def test_wrong_blocks_of_a_sparse_jacobian_are_rejected():
     {}, {"sparse_jacobian": True}, {"dynamics_solver": "dvi"},
     {"dynamics_solver": "dvi", "sparse_jacobian": False},
 ])  # fmt: skip
-def test_engine_itself(config):
-    """The installed engine has the recorded attributes, and its matrix is the one of J, M and the compliance."""
+def test_from_kamino_of_the_installed_engine_gives_the_matrix_of_j_m_and_compliance(config, monkeypatch):
     pytest.importorskip("newton")
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "findings" / "probes")
     from record_kamino import step_worlds
 
     from newton.tests.utils import basics  # isort: skip

@@ -1,13 +1,11 @@
-"""Backends behave as the table of `lavender/external/backends.py` records, and the adapters as it promises."""
+"""Adapters of backends do what the table of `lavender/external/backends.py` promises."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from backend_probes import BEHAVIOUR_PROBES, NOTE_PROBES
 from backend_truth import TOL, call_here, draw_kind
 from calls import BACKENDS
-from reuse_probes import REUSE_PROBES, find_after_others, find_in_threads
 
 import lavender as lv
 from lavender.external import backends
@@ -19,47 +17,10 @@ OBSERVED = {b.name: b for b in backends.BACKENDS if b.behaviour is not None}
 N_DRAWS = 12  # Three programs of each kind; `python tests/backend_truth.py --kinds 200` draws more.
 
 
-def require(name):
-    """Skip a test if a backend, or qpsolvers, by which the probes call it, is not installed."""
-    pytest.importorskip("qpsolvers")
-    for module in OBSERVED[name].modules:
-        pytest.importorskip(module)
-
-
 def mark_slow(names):
     """Mark backends in JAX, which compiles each of 40 programs for 1 s or more, as tests of the night."""
     is_jax = {b.name: b.jax for b in backends.BACKENDS}
     return [pytest.param(name, marks=[pytest.mark.nightly] * is_jax[name]) for name in names]
-
-
-@pytest.mark.parametrize("name", mark_slow(OBSERVED))
-def test_probe_of_the_installed_backend_gives_the_recorded_behaviour(name):
-    require(name)
-    behaviour = OBSERVED[name].behaviour
-    found = {field: probe(name) for field, probe in BEHAVIOUR_PROBES.items()}
-    recorded = {field: getattr(behaviour, field) for field in BEHAVIOUR_PROBES}
-    if name == "scs":  # Its iterates follow the rounding of the BLAS: 0.7 and 0.8 were seen with two builds.
-        assert abs(found.pop("small_part") - recorded.pop("small_part")) < 0.15
-    assert found == recorded
-
-
-@pytest.mark.parametrize("name", mark_slow(OBSERVED))
-def test_reuse_of_the_installed_backend_gives_the_recorded_behaviour(name):
-    require(name)
-    behaviour = OBSERVED[name].behaviour
-    found = {field: probe(name) for field, probe in REUSE_PROBES.items()}
-    assert found == {field: getattr(behaviour, field) for field in REUSE_PROBES}
-    assert find_after_others(name) == find_in_threads(name) == "same"
-
-
-@pytest.mark.parametrize(("name", "key"), NOTE_PROBES)
-def test_note_of_the_installed_backend_still_holds(name, key):
-    require(name)
-    assert NOTE_PROBES[name, key](), OBSERVED[name].behaviour.notes[key]
-
-
-def test_every_note_has_a_probe():
-    assert set(NOTE_PROBES) == {(b.name, key) for b in OBSERVED.values() for key in b.behaviour.notes}
 
 
 @pytest.mark.parametrize("name", mark_slow(BACKENDS))

@@ -1,7 +1,7 @@
 """Record the arrays that `lavender.io.from_kamino` reads, from steps of newton's SolverKamino.
 
     pip install newton==1.8.0 warp-lang==1.19.0
-    python tests/io/record_kamino.py tests/io/kamino_1.8.0.npz
+    python findings/probes/record_kamino.py tests/io/kamino_1.8.0.npz
 
 Three models are stepped: worlds of different sizes (a stack, a cart and pole, a nunchaku, a four-bar linkage with an
 implicit spring), by PADMM over a dense Jacobian and by DVI over a sparse one; and eight stacks, of which one has a NaN

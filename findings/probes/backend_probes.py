@@ -1,6 +1,6 @@
 """Small programs with known solutions, run by backends without this package: the measurements of `Behaviour`.
 
-    python tests/core/external/backend_probes.py [BACKEND ...]
+    python findings/probes/backend_probes.py [BACKEND ...]
 
 prints the observed behaviour of each installed backend, for the table of `lavender/external/backends.py`.
 """
@@ -12,6 +12,7 @@ import os
 import sys
 import warnings
 from importlib.metadata import version
+from pathlib import Path
 
 import numpy as np
 import scipy.sparse as sp
@@ -242,6 +243,7 @@ def piqp_fails_with_unsorted_indices():
 
 
 def piqp_solves_dense_arrays_only():
+    sys.path.append(str(Path(__file__).resolve().parents[2] / "tests"))
     from backend_truth import draw_program
 
     program, tight = draw_program(285), {"eps_abs": 1e-6, "eps_rel": 0.0, "check_duality_gap": True}

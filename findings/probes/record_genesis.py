@@ -1,7 +1,7 @@
 """Record the arrays that `lavender.io.from_genesis` reads, from steps of the rigid solver of Genesis.
 
     pip install genesis-world==1.4.5 torch
-    python tests/io/record_genesis.py tests/io/genesis_1.4.5.npz
+    python findings/probes/record_genesis.py tests/io/genesis_1.4.5.npz
 
 Three environments of an arm above four boxes and of a stack of three boxes, with different velocities, are stepped with
 each contact resolution. The file holds the arrays under their attribute names, the velocities after the step, and the
