@@ -1,4 +1,4 @@
-"""Small programs with known solutions, run by backends without this package: the measurements of `Behaviour`.
+"""Small programs with known solutions, run by backends without this package: the measurements in `backends.json`.
 
     python findings/probes/backend_probes.py [BACKEND ...]
 
@@ -150,7 +150,7 @@ def find_dependent(name):
 
 
 SADDLE = np.diag([1, -1])
-#: Field of `Behaviour` -> function of a backend's name.
+#: Field of an observed behaviour -> function of a backend's name.
 BEHAVIOUR_PROBES = {
     "triangle": find_triangle,
     "repeated": lambda n: give_verdict(

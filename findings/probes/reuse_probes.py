@@ -205,5 +205,5 @@ def find_in_threads(name):
     return "failed" if None in alone else "same" if found == alone * 4 else "other"
 
 
-#: Field of `Behaviour` -> function of a backend's name.
+#: Field of an observed behaviour -> function of a backend's name.
 REUSE_PROBES = {"time_limit": find_time_limit, "second_solve": find_second_solve}

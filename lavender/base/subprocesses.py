@@ -3,9 +3,8 @@
 Code that hangs, calls `os._exit`, starts processes or exhausts memory makes only its own call fail. Requests are
 pickled. Answers are JSON and float64 arrays of a bounded size, and are never unpickled.
 
-Process pools of libraries are not used, for four reasons (measured with pebble 5.2.3). If the code handles SIGTERM or
-does not return to the interpreter, the pool kills it only 3 s after its limit. Processes that the code started are not
-killed. The parent unpickles the output of the code. A script without `if __name__ == "__main__"` cannot use the pool.
+Process pools of libraries are not used: pebble 5.2.3 kills such code up to 3 s late, leaves the processes that it
+started, unpickles its output, and needs `if __name__ == "__main__"` in scripts.
 """
 
 from __future__ import annotations
@@ -30,6 +29,7 @@ START_TIMEOUT = 60.0  # [s] On a loaded machine, importing a function and its mo
 KILL_TIMEOUT = 10.0
 # [s] A pipe that stays open for this time after a kill is held by another process; it is abandoned.
 PIPE_TIMEOUT = 0.1
+PARENT_CHECK_INTERVAL = 0.5  # [s] Time after which a process notices that its parent has ended.
 MAX_TEXT_SIZE = 2**20  # [bytes] An answer that announces more JSON than this is invalid.
 MAX_ERROR_LENGTH = 500  # [characters] Longer texts of errors are cut.
 #: Whether a process is killed together with the processes that it started, as one process group.
@@ -64,7 +64,8 @@ class RemoteError(Exception):
 class ProcessBackend:
     """Calls one function in another process, which `start` starts and later calls reuse.
 
-    When this process ends, the system kills the other one.
+    When this process ends, the other one ends within `PARENT_CHECK_INTERVAL`, or when its code next returns to the
+    interpreter.
 
     Parameters
     ----------
@@ -85,7 +86,6 @@ class ProcessBackend:
     ) -> None:
         self._function, self._memory, self._environment = function, memory, environment or {}
         self.popen: subprocess.Popen[bytes] | None = None
-        self._lifeline = -1  # Writing end of a pipe; when this process ends, the system closes it.
         self._exchange_thread: threading.Thread | None = None
 
     @property
@@ -104,38 +104,22 @@ class ProcessBackend:
         if self.is_alive:
             return
         self.close()
+        path = os.pathsep.join(p or os.getcwd() for p in sys.path)
         try:
-            self._start()
+            self.popen = subprocess.Popen(
+                [sys.executable, "-c", SERVE_SCRIPT, str(os.getpid()), str(self._memory)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                env={**os.environ, **self._environment, "PYTHONPATH": path},
+                start_new_session=PROCESS_GROUPS,
+            )
             self.call_function(self._function, timeout=START_TIMEOUT, max_bytes=0)
         except (OSError, InvalidAnswer) as error:
             raise ProcessEnded(str(error) or "no answer") from None
         except RemoteError as error:
             self.close()
             raise ProcessEnded(f"{error.kind}: {error}") from None
-
-    def _start(self) -> None:
-        """Start the process, with a pipe that closes when this process ends."""
-        path = os.pathsep.join(p or os.getcwd() for p in sys.path)
-        options: dict[str, Any] = {}
-        lifeline = -1
-        if PROCESS_GROUPS:
-            lifeline, self._lifeline = os.pipe()
-            options = {"start_new_session": True, "pass_fds": (lifeline,)}
-        try:
-            self.popen = subprocess.Popen(  # pyright: ignore[reportAttributeAccessIssue]
-                [sys.executable, "-c", SERVE_SCRIPT, str(lifeline), str(self._memory)],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-                env={**os.environ, **self._environment, "PYTHONPATH": path},
-                **options,
-            )
-        except BaseException:
-            self._close_lifeline()
-            raise
-        finally:
-            if lifeline >= 0:
-                os.close(lifeline)
 
     def call_function(
         self, *arguments: Any, timeout: float, max_bytes: int
@@ -174,14 +158,14 @@ class ProcessBackend:
                 process.stdin.write(struct.pack("<Q", len(request)))
                 process.stdin.write(request)
                 process.stdin.flush()
-                text_size, array_size = struct.unpack("<QQ", _read_bytes(process.stdout, 16))
-                if text_size > MAX_TEXT_SIZE or array_size > max_bytes:
+                sizes = struct.unpack("<QQ", _read_bytes(process.stdout, 16))
+                if sizes[0] > MAX_TEXT_SIZE or sizes[1] > max_bytes:
                     raise InvalidAnswer(
-                        f"the answer has {text_size} bytes of text and {array_size} bytes of arrays; at "
-                        f"most {MAX_TEXT_SIZE} and {max_bytes} are accepted"
+                        f"the answer has {sizes[0]} bytes of text and {sizes[1]} bytes of arrays; at most "
+                        f"{MAX_TEXT_SIZE} and {max_bytes} are accepted"
                     )
                 received.append(
-                    (_read_bytes(process.stdout, text_size), _read_bytes(process.stdout, array_size))
+                    (_read_bytes(process.stdout, sizes[0]), _read_bytes(process.stdout, sizes[1]))
                 )
             except BaseException as error:
                 _close_streams(process)
@@ -229,7 +213,6 @@ class ProcessBackend:
             # Kill the group. Its number, which its first process has too, is not reused while a process of it runs.
             with contextlib.suppress(OSError):
                 os.killpg(process.pid, signal.SIGKILL)
-        self._close_lifeline()
         process.kill()
         with contextlib.suppress(subprocess.TimeoutExpired):
             process.wait(KILL_TIMEOUT)
@@ -238,11 +221,6 @@ class ProcessBackend:
             if self._exchange_thread.is_alive():
                 return  # The exchange's thread still waits for a pipe and closes the streams later.
         _close_streams(process)
-
-    def _close_lifeline(self) -> None:
-        if self._lifeline >= 0:
-            os.close(self._lifeline)
-            self._lifeline = -1
 
 
 def _close_streams(process: subprocess.Popen[bytes]) -> None:
@@ -288,11 +266,11 @@ def unpack_answer(text: bytes, numbers: bytes) -> tuple[dict[str, Any], list[Any
 # -- in the other process -----------------------------------------------------------------------------
 
 
-def serve_requests(lifeline: int, memory: int) -> None:
+def serve_requests(parent: int, memory: int) -> None:
     """Answer requests until the pipe ends: the first names the function, each later one has arguments for it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # The parent handles Ctrl-C.
-    if lifeline >= 0:
-        _kill_with_parent(lifeline)
+    if PROCESS_GROUPS:
+        threading.Thread(target=_wait_and_kill_group, args=(parent,), daemon=True).start()
     requests, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     null = os.open(os.devnull, os.O_RDWR)
     os.dup2(null, 0)  # The function's own input and output are the null device.
@@ -323,30 +301,11 @@ def serve_requests(lifeline: int, memory: int) -> None:
         answers.flush()
 
 
-def _kill_with_parent(lifeline: int) -> None:
-    """Arrange that this process and the processes that it starts are killed when the parent ends.
-
-    `lifeline` is the reading end of a pipe; the parent holds the writing end. On Linux the kernel sends a signal when
-    the writing end closes, which also kills code that never returns to the interpreter. On other systems a thread
-    waits for the end of the pipe.
-    """
-    os.set_inheritable(lifeline, False)
-    with contextlib.suppress(ImportError, AttributeError):  # Only Linux has F_SETSIG.
-        import fcntl
-        import select
-
-        fcntl.fcntl(lifeline, fcntl.F_SETSIG, signal.SIGKILL)
-        fcntl.fcntl(lifeline, fcntl.F_SETOWN, -os.getpgrp())
-        fcntl.fcntl(lifeline, fcntl.F_SETFL, fcntl.fcntl(lifeline, fcntl.F_GETFL) | os.O_ASYNC)
-        if select.select([lifeline], [], [], 0.0)[0]:  # The parent ended before the signal was set up.
-            os.killpg(0, signal.SIGKILL)
-        return
-
-    def wait() -> None:
-        os.read(lifeline, 1)
-        os.killpg(0, signal.SIGKILL)
-
-    threading.Thread(target=wait, daemon=True).start()
+def _wait_and_kill_group(parent: int) -> None:
+    """Wait until the parent process ends, then kill this process and the processes that it started."""
+    while os.getppid() == parent:
+        time.sleep(PARENT_CHECK_INTERVAL)
+    os.killpg(0, signal.SIGKILL)
 
 
 def limit_cpu_time(extra: float) -> None:

@@ -51,7 +51,7 @@ def _describe_solver(name: str) -> None:
     """Print summary, reference, capabilities, options and observed behaviour of a solver."""
     from importlib.metadata import version
 
-    from lavender.external.backends import describe_backend, get_observed_version
+    from lavender.external.backends import describe_backend, get_behaviour
     from lavender.problem import LAWS, OPERATORS
     from lavender.solvers import registry
 
@@ -71,7 +71,7 @@ def _describe_solver(name: str) -> None:
     lines = [f"{name}: {spec.summary}", *(f"{title}: {text}" for title, text in facts if text)]
     if observations:
         lines += [
-            f"Observed with version {get_observed_version(name)}, called alone at its default settings:"
+            f"Observed with version {get_behaviour(name).version}, called alone at its default settings:"
         ]
         lines += [f"- {sentence}" for sentence in observations]
     elif spec.external:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 import sys
 import threading
 from collections.abc import Mapping
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -28,65 +27,6 @@ _HANDLER_LOCK = threading.Lock()
 
 
 @dataclass(frozen=True)
-class Behaviour:
-    """Results of a backend alone, at its default settings, on small programs with solutions that are known.
-
-    A verdict is "right" (found, within 1 %), "wrong" (found, but not right), "not found" or "raises". The programs are
-    in `PROBE_PROGRAMS` of `backends`, by the name of the field, and `findings/probes/backend_probes.py` runs them.
-    Defaults are the results of a backend that accepts every convex program.
-
-    Parameters
-    ----------
-    version : str
-        Version of the backend with which the results were found.
-    triangle : str
-        Part of P that is used if P is not symmetric: "upper", "lower", "mean", "all", or "none" if P is rejected.
-    start : str
-        Arrays of a start that it uses; "" if it uses none.
-    repeated, dependent, contradictory, singular, convex_on_rows, saddle, unbounded : str
-        Verdicts; "" if the program was not run. Of the 20 programs *dependent*, the most frequent one.
-    infeasible_x : str
-        First entry of x after an infeasible program; "none" if no x is returned, "raises" after an exception.
-    linear_term, small_part, offset : float or None
-        x2, x3 and x1 - 1e8, for which 1, 0.5 and 0.3 are right; None if it is not found.
-    fixed_multiplier : float
-        Multiplier of a variable with equal bounds; -1 is right.
-    smallest, conflict : float
-        Largest e that is not returned within 1 %, and largest d that is reported as solved; 0 without one.
-    far_bound : float
-        Size of inactive bounds at which it first fails; inf if it does not fail.
-    second_solve : str
-        Bits of x of a second solve of one object without a start: "same", "other", or "" without such an object.
-    time_limit : str
-        "without set-up" if its time limit does not include the set-up, "with set-up", or "" if this was not observed.
-    notes : mapping of str to str
-        Other observations: key of the probe -> sentence.
-    """
-
-    version: str
-    triangle: str = "upper"
-    start: str = ""
-    repeated: str = "right"
-    dependent: str = "right"
-    contradictory: str = "not found"
-    singular: str = "right"
-    convex_on_rows: str = "right"
-    saddle: str = "not found"
-    unbounded: str = "not found"
-    infeasible_x: str = "none"
-    linear_term: float | None = 1.0
-    small_part: float | None = 0.5
-    fixed_multiplier: float = -1.0
-    smallest: float = 0.0
-    far_bound: float = math.inf
-    conflict: float = 0.0
-    offset: float | None = 0.3
-    second_solve: str = ""
-    time_limit: str = ""
-    notes: Mapping[str, str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
 class Backend:
     """Requirements and capabilities of a backend.
 
@@ -98,8 +38,9 @@ class Backend:
     install : str
         Packages that pip installs.
     summary, reference : str
-    behaviour : Behaviour or None
-        Observed behaviour; None for a backend that was not run.
+    behaviour : namespace or None
+        Results of the backend alone on the programs of `backends.json`, found by `findings/probes/backend_probes.py`;
+        None if it was not run.
     call : callable, optional
         Function that calls the backend's own interface. Default: the backend is called through qpsolvers.
     settings : mapping, optional
@@ -135,7 +76,7 @@ class Backend:
     install: str
     summary: str
     reference: str
-    behaviour: Behaviour | None = None
+    behaviour: Any = None
     call: Call | None = None
     settings: Mapping[str, Any] | None = None
     min_tolerance: float = 0.0

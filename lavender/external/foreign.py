@@ -93,66 +93,62 @@ class ForeignSolver(Solver):
             _copy_iterate_to_impulse(iterate, impulse)
             raise
         is_valid = _copy_iterate_to_impulse(iterate, impulse)
-        error = (
-            ""
-            if is_valid
-            else f"changed the impulse to an array of shape {iterate.shape} and dtype {iterate.dtype}"
-        )
-        return self._check_claim(claim, error, len(impulse), max_iter)
+        fault = f"changed the impulse to an array of shape {iterate.shape} and dtype {iterate.dtype}"
+        return self._check_claim(claim, "" if is_valid else fault, len(impulse), max_iter)
 
-    def _check_claim(self, claim: Any, error: str, m: int, max_iter: int) -> Claim:
+    def _check_claim(self, claim: Any, fault: str, m: int, max_iter: int) -> Claim:
         """Return the claim with checked fields, or a claim of NUMERICAL_ERROR with a message.
 
-        The latter is returned if `error` is not empty or a field is invalid.
+        The latter is returned if `fault` is not empty or a field is invalid.
         """
-        if type(claim) is not Claim:
-            error = error or f"returned a {type(claim).__name__} ({claim!r:.60}); a lavender.Claim is needed"
-            return Claim(Status.NUMERICAL_ERROR, 0, {}, f"solver {self.name!r} {error}")
-        unchecked: Any = claim  # The fields of a plug-in's claim may have any type.
-        iterations = int(unchecked.iterations) if _is_count(unchecked.iterations) else 0
-        work, certificate, dual = unchecked.work, unchecked.certificate, unchecked.dual
-        if not isinstance(unchecked.status, Status):
-            error = error or f"claims the status {claim.status!r:.60}; a lavender.Status is needed"
-        elif unchecked.status is Status.INVALID_PROBLEM:
-            error = (
-                error
-                or "claims the status INVALID_PROBLEM, which only `solve_many` returns, for invalid data"
-            )
-        elif not _is_count(claim.iterations):
-            error = (
-                error or f"claims {claim.iterations!r:.60} iterations; a whole number of at least 0 is needed"
-            )
-        elif iterations > max_iter:
-            error = error or f"claims {iterations} iterations, more than the limit of {max_iter}"
-        elif not isinstance(work, Mapping) or not all(
-            isinstance(k, str) and _is_count(n) for k, n in work.items()
-        ):
-            error = error or f"claims the work {work!r:.60}; counts by name are needed"
-        elif not isinstance(unchecked.message, str) or not isinstance(unchecked.form, str):
-            error = (
-                error
-                or f"claims the message {claim.message!r:.60} and form {claim.form!r:.60}; texts are needed"
-            )
-        if certificate is not None:
+        fault = fault or _find_fault(claim, max_iter)
+        certificate = getattr(claim, "certificate", None)
+        if certificate is not None and not fault:
             try:
                 certificate = mark_read_only(np.array(certificate).astype(np.float64, casting="same_kind"))
             except (TypeError, ValueError):
-                error = (
-                    error or f"gives a certificate that is not an array of {m} numbers ({certificate!r:.60})"
-                )
-        if error:
-            return Claim(Status.NUMERICAL_ERROR, iterations, {}, f"solver {self.name!r} {error}")
+                fault = f"gives a certificate that is not an array of {m} numbers ({certificate!r:.60})"
+        if fault:
+            count = getattr(claim, "iterations", 0) if type(claim) is Claim else 0
+            iterations = int(count) if _is_count(count) else 0
+            return Claim(Status.NUMERICAL_ERROR, iterations, {}, f"solver {self.name!r} {fault}")
         return replace(
             claim,
-            iterations=iterations,
-            work={_join_lines(k): int(n) for k, n in work.items()},
-            dual=mark_read_only(dual.copy()) if isinstance(dual, np.ndarray) else dual,
+            iterations=int(claim.iterations),
+            work={_join_lines(k): int(n) for k, n in claim.work.items()},
+            dual=mark_read_only(claim.dual.copy()) if isinstance(claim.dual, np.ndarray) else claim.dual,
             certificate=certificate,
             message=_join_lines(claim.message),
             form=_join_lines(claim.form),
             stages=(),
             judged=None,
         )
+
+
+def _find_fault(claim: Any, max_iter: int) -> str:
+    """Return a phrase about the first invalid field of a claim, or an empty text."""
+    if type(claim) is not Claim:
+        return f"returned a {type(claim).__name__} ({claim!r:.60}); a lavender.Claim is needed"
+    unchecked: Any = claim  # The fields of a plug-in's claim may have any type.
+    status, iterations, work, texts = (
+        unchecked.status,
+        unchecked.iterations,
+        unchecked.work,
+        (unchecked.message, unchecked.form),
+    )
+    if not isinstance(status, Status):
+        return f"claims the status {status!r:.60}; a lavender.Status is needed"
+    if status is Status.INVALID_PROBLEM:
+        return "claims the status INVALID_PROBLEM, which only `solve_many` returns, for invalid data"
+    if not _is_count(iterations):
+        return f"claims {iterations!r:.60} iterations; a whole number of at least 0 is needed"
+    if iterations > max_iter:
+        return f"claims {iterations} iterations, more than the limit of {max_iter}"
+    if not isinstance(work, Mapping) or not all(isinstance(k, str) and _is_count(n) for k, n in work.items()):
+        return f"claims the work {work!r:.60}; counts by name are needed"
+    if not all(isinstance(text, str) for text in texts):
+        return f"claims the message {texts[0]!r:.60} and form {texts[1]!r:.60}; texts are needed"
+    return ""
 
 
 class State:

@@ -27,9 +27,9 @@ from lavender.judge.solution import Status
 ANSWER_ARRAYS = ("x", "lam")
 MAX_BACKEND_MESSAGE_LENGTH = 500  # [characters] Longer messages of backends are cut.
 STOPPABLE_LIMIT_RATIO = 2.0  # A backend that accepts a time limit is killed after this multiple of its limit.
-ENTRY_SIZE = 12.0  # [bytes] Size of one matrix entry of a program in a request.
-# [bytes/s] If sending a program at this rate exceeds the time limit, the call times out at once.
-TRANSFER_RATE = 3e8
+CPU_TIME_MARGIN = (
+    60.0  # [s] CPU time after the limit of a call, at which the system kills a process without parent.
+)
 
 Start = tuple[FloatArray, FloatArray] | None  # x and multipliers, in scaled units.
 
@@ -78,10 +78,6 @@ def call_backend(
         The backend raised an exception, or its process died.
     """
     assert limit.time_limit is not None
-    if program.nbytes > TRANSFER_RATE * limit.time_limit:
-        return Answer(
-            Status.TIME_LIMIT, "ended at the time limit: sending the program to the process would take longer"
-        )
     process = _take_idle_process()
     if process is None:
         return None
@@ -167,6 +163,7 @@ def run_backend(
                 )
                 backend.run(tiny, None, Limits(1e-3, 1e-3, 100, None), {})
         return {}, ()
+    subprocesses.limit_cpu_time(STOPPABLE_LIMIT_RATIO * (limit.time_limit or 0.0) + CPU_TIME_MARGIN)
     answer = backend.run(program, start, limit, settings)
     work = {str(kind): int(count) for kind, count in answer.work.items()}
     fields = {

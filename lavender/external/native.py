@@ -9,6 +9,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
+from lavender.base.lazy_import import sparse as sp
 from lavender.external.convex import ScaledProgram
 from lavender.external.running import Answer, Limits, classify_status
 from lavender.judge.solution import Status
@@ -46,7 +47,7 @@ def call_clarabel(
         setattr(settings, key, value)
     matrix = program.select_rows(rows, -1.0, False)
     solver = clarabel.DefaultSolver(
-        program.get_upper_hessian(), program.q, matrix, -program.t[rows], cones, settings
+        sp.triu(program.hessian, format="csc"), program.q, matrix, -program.t[rows], cones, settings
     )
     result = solver.solve()
     name, lam = str(result.status), np.zeros(n_rows)
@@ -103,7 +104,9 @@ def call_osqp(
         if key not in known:
             raise InputError(f"osqp has no setting {key!r}; known: {', '.join(sorted(known))}")
     try:
-        solver.setup(program.get_upper_hessian(), program.q, matrix, low, high, **(settings | extra))
+        solver.setup(
+            sp.triu(program.hessian, format="csc"), program.q, matrix, low, high, **(settings | extra)
+        )
     except osqp.OSQPException as error:
         # The text is an error code; 4: the factorisation found that P is not positive semidefinite.
         message = "P is not positive semidefinite" if str(error) == "4" else "see its list of error codes"

@@ -16,7 +16,6 @@ from lavender.base.lazy_import import sparse as sp
 from lavender.external.convex import ConvexProgram
 from lavender.judge.certificates import Proof, prove_infeasibility
 from lavender.problem import Problem
-from lavender.problem.generalized import Compressed
 
 RAY_TOLERANCE = 1e-8  # [-] P d, J d and q.d count as 0 up to this multiple of their largest terms.
 FEASIBLE_TOLERANCE = 1e-6  # [-] Largest error of a row of the feasible point of an unbounded program.
@@ -48,7 +47,7 @@ def find_infeasibility_proof(
         if attempt or deadline.has_passed():
             break
         high = 1.0 if scaled.is_kept is None else scaled.is_kept.astype(float)
-        matrix = _to_sparse(scaled.J, scaled.n).T
+        matrix = scaled.jacobian.T
         t = scaled.t * high
         found = _solve_linear_program(-t, matrix, None, np.where(is_equation, -1.0, 0.0), high, deadline)
         if found is None:
@@ -64,7 +63,7 @@ def find_ray(
     """Return a ray d (n,) with a largest entry of 1 and a feasible point (n,) of an unbounded program, or None."""
     scaled, (scale, _, sigma, _) = program.scaled, program.scales
     n, free = scaled.n, program.free
-    hessian, jac = _to_sparse(scaled.P, n), _to_sparse(scaled.J, n)
+    hessian, jac = scaled.hessian, scaled.jacobian
     level = sp.vstack([hessian, jac[:free]])
     d = _solve_linear_program(scaled.q, level, jac[free:], -1.0, 1.0, deadline)
     if d is None or not scaled.q @ d < 0.0:
@@ -119,11 +118,6 @@ def _project_to_kernel(x: FloatArray, matrix: Any) -> FloatArray:
 
 def _remove_small_entries(x: FloatArray) -> FloatArray:
     return np.where(np.abs(x) >= NEGLIGIBLE_SHARE * np.abs(x).max(initial=0.0), x, 0.0)
-
-
-def _to_sparse(rows: Compressed, n: int) -> Any:
-    ptr, idx, value = rows
-    return sp.csr_array((value, idx, ptr), shape=(len(ptr) - 1, n))
 
 
 def _solve_linear_program(

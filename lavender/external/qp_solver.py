@@ -16,7 +16,7 @@ from lavender.base.lazy_import import import_numerical_modules
 from lavender.external.backend import Backend
 from lavender.external.convex import ConvexProgram
 from lavender.external.forms import Form, build_form, choose_program_form, get_program
-from lavender.external.isolated import ENTRY_SIZE, TRANSFER_RATE, IsolatedBackend, start_process
+from lavender.external.isolated import IsolatedBackend, start_process
 from lavender.external.running import BackendResult, call_backend_until_accepted
 from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import compute_stopping_residual
@@ -153,9 +153,8 @@ class QPSolver(Solver):
         check_bool("isolate", self.isolate)
 
     def cost(self, problem: Problem) -> Cost:
-        """Estimate the cost to form the program, and to send it if the backend runs in another process."""
-        entry = RATES["program entry"] + (1e9 * ENTRY_SIZE / TRANSFER_RATE if self.isolate else 0.0)
-        return Cost(lambda: RATES["program"] + entry * problem.max_entries)
+        """Estimate the cost to form the program."""
+        return Cost(lambda: RATES["program"] + RATES["program entry"] * problem.max_entries)
 
     @np.errstate(all="ignore")  # The judge finds overflows.
     def prepare(self, problem: Problem) -> Form:

@@ -115,21 +115,8 @@ def call_backend_until_accepted(
 ) -> BackendResult:
     """Call the backend, and once more with a smaller tolerance and all rows unless the judge accepts its point.
 
-    Parameters
-    ----------
-    program : ConvexProgram
-    judge : PointJudge
-    call : callable
-        Function that runs the backend once.
-    max_iter : int
-        Limit of the iterations of both calls.
-    tol : float, -
-    deadline : Deadline
-    settings : mapping
-        Additional options of the backend.
-    start : (x, lam), optional
-    needs_definite : bool
-        Whether the backend needs a positive definite P.
+    `max_iter` limits the iterations of both calls; `settings` are additional options of the backend; `start` is (x,
+    lam); `needs_definite` states that the backend needs a positive definite P.
     """
     best: BackendResult | None = None
     work: dict[str, int] = {"backend_calls": 0}
@@ -142,8 +129,7 @@ def call_backend_until_accepted(
         if not scaled.is_representable:
             message = "the scaled program has numbers that overflow; the backend was not called"
             return best or BackendResult(Status.NUMERICAL_ERROR, message, work)
-        eps = max(FIRST_TOLERANCE * SECOND_TOLERANCE**attempt * tol, min_eps)
-        eps = min(eps, 1e-2)
+        eps = min(max(FIRST_TOLERANCE * SECOND_TOLERANCE**attempt * tol, min_eps), 1e-2)
         gap = SECOND_GAP if attempt else eps
         limits = Limits(eps, gap, max_iter - work.get("iterations", 0), deadline.get_remaining_seconds())
         answer = _call_backend_once(scaled, start, call, limits, dict(settings))
