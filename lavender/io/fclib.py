@@ -22,7 +22,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.lazy_import import sparse as sp
-from lavender.io.condensed import SPARSE_ENTRY_BYTES, form_dense_a
+from lavender.base.lu import factor_sparse_lu
 from lavender.io.hdf5 import HDF5Reader, import_h5py, write_array, write_matrix
 from lavender.io.npz import Stored
 from lavender.io.stored import MAX_BYTES, NUMBER_BYTES, Budget, write_bytes
@@ -38,6 +38,8 @@ PARTS = {
     LOCAL: {"W": "mm", "V": "mp", "R": "pp", "q": "m", "s": "p", "mu": "c", "mu_r": "c"},
     GLOBAL: {"H": "nm", "M": "nn", "G": "np", "f": "n", "w": "m", "b": "p", "mu": "c", "mu_r": "c"},
 }
+DENSE_CHUNK_NUMBERS = 2**23  # At most this many entries of M^-1 J^T or A are held densely at a time (64 MiB).
+SPARSE_ENTRY_BYTES = 16  # [bytes] One entry of a sparse matrix: value and index.
 BOUNDS_ROW_BYTES = 64  # [bytes] Memory that `Cones` and b need per row.
 
 
@@ -175,6 +177,50 @@ class Contents:
 
     def _impulse(self, point: Mapping[str, FloatArray]) -> FloatArray:
         return np.concatenate([point["r"], point["l"]]) if "l" in point else point["r"]
+
+
+def form_dense_a(
+    mass: sp.csr_array, jt: sp.csr_array, f: FloatArray, budget: Budget
+) -> tuple[sp.csr_array, FloatArray]:
+    """Return A = J M^-1 J^T (m, m) and J M^-1 f (m,) for M (n, n), J^T (n, m) and f (n,).
+
+    Raises
+    ------
+    InputError
+        M is singular, or the matrices may need more memory than the budget allows.
+    """
+    label = sp.csgraph.connected_components(mass, directed=False)[1]
+    budget.reserve_bytes(SPARSE_ENTRY_BYTES * bound_condensed_entries(label, jt), "A = H^T M^-1 H")
+    size = np.bincount(label).astype(float)
+    # The factors of a connected component of n unknowns have up to n^2 entries.
+    budget.reserve_bytes(SPARSE_ENTRY_BYTES * int(size @ size), "the factors of M")
+    try:
+        solve = factor_sparse_lu(mass).solve
+    except RuntimeError as error:
+        raise InputError(f"M cannot be factorised ({error}); an invertible M is needed") from None
+    m = jt.shape[1]
+    step = max(1, DENSE_CHUNK_NUMBERS // max(1, *jt.shape))
+    columns = sp.csc_array(jt)
+    j = sp.csr_array(jt.T)
+    parts = [sp.csr_array(j @ solve(columns[:, k : min(k + step, m)].toarray())) for k in range(0, m, step)]
+    a = sp.csr_array(sp.hstack(parts)) if parts else sp.csr_array((0, 0))
+    gap = mass - mass.T
+    if gap.nnz == 0 or not np.any(gap.data):
+        a = sp.csr_array(0.5 * (a + a.T))  # With a symmetric M, A is asymmetric only by rounding.
+    return a, j @ solve(f)
+
+
+def bound_condensed_entries(label: np.ndarray, jt: sp.csr_array) -> int:
+    """Return an upper bound of the number of entries of J M^-1 J^T; `label` (n,) holds the connected component of M.
+
+    Two rows of J are coupled only if they touch the same component: a component that r rows touch contributes at
+    most r^2 entries.
+    """
+    m = jt.shape[1]
+    part = np.repeat(label.astype(np.int64), np.diff(jt.indptr))
+    touched = np.unique(part * m + jt.indices) // m if len(part) else part
+    rows = np.bincount(touched, minlength=1).astype(float)
+    return int(min(rows @ rows, float(m) ** 2))
 
 
 # -- reading --------------------------------------------------------------------------------------

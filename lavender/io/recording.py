@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -24,56 +24,59 @@ from lavender.problem import PRECISIONS, Problem
 
 @dataclass(frozen=True)
 class Recording:
-    """Summary of the files that `record` wrote; `str()` formats it.
+    """Result of `record`; `str()` is a summary.
 
     Parameters
     ----------
     folder : path
-    files : tuple of str
-        Names of the problem files.
+    lines : tuple of dict
+        Lines of `engine.jsonl`: each selected step with constraints, in order. A step without a file has `left_out`.
     without : int
-        Number of selected steps that had no constraints and therefore have no file.
-    left_out : tuple of str
-        Reasons why steps could not be exported, one line each.
-    above_floor : int
-        Number of MuJoCo's answers with an error above the round-off floor.
-    stopped : int
-        Number of MuJoCo's answers with an error above the round-off floor and a velocity error above `threshold`.
-    threshold : float, m/s
-    worst : str
-        Velocity error, row, step and verdict of the worst answer.
-    n_starts : int
-        Number of start states of the recorded steps; 0 if the recording is one simulation.
+        Number of selected steps that had no constraints and therefore have no line.
     is_interrupted : bool
         Whether Ctrl-C ended the recording early.
     """
 
     folder: Path
-    files: tuple[str, ...]
-    without: int
-    left_out: tuple[str, ...] = field(default=())
-    above_floor: int = 0
-    stopped: int = 0
-    threshold: float = DEFAULT_THRESHOLD
-    worst: str = ""
-    n_starts: int = 0
+    lines: tuple[dict[str, Any], ...]
+    without: int = 0
     is_interrupted: bool = False
 
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Names of the problem files."""
+        return tuple(line["file"] for line in self.lines if "left_out" not in line)
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """Reasons why steps could not be exported, one line each."""
+        return tuple(f"step {line['step']}: {line['left_out']}" for line in self.lines if "left_out" in line)
+
     def __str__(self) -> str:
-        lines = [f"{len(self.files)} problems in {self.folder}"]
-        if self.n_starts:
-            lines.append(
-                f"from {self.n_starts} start states; steps from different states are independent problems"
+        judged = [line for line in self.lines if "left_out" not in line]
+        above = [line for line in judged if line["verdict"] != AT_FLOOR]
+        far = [line for line in above if line["verdict"] in (UNCONVERGED, WRONG)]
+        text = [f"{len(judged)} problems in {self.folder}"]
+        if starts := {line["start"] for line in judged if "start" in line}:
+            text.append(
+                f"from {len(starts)} start states; steps from different states are independent problems"
             )
         if self.without:
-            lines.append(f"{self.without} steps without constraints")
+            text.append(f"{self.without} steps without constraints")
         if self.left_out:
-            lines.append(f"{len(self.left_out)} left out: {self.left_out[0]}")
-        if self.above_floor:
-            threshold = f"{self.threshold:g}".replace("e-0", "e-")
-            counts = f"{self.above_floor} above their floor, {self.stopped} more than {threshold} m/s off"
-            lines.append(f"MuJoCo's own answers: {counts}")
-        return "\n".join(lines + ([f"worst: {self.worst}"] if self.stopped else []))
+            text.append(f"{len(self.left_out)} left out: {self.left_out[0]}")
+        if above:
+            threshold = f"{above[0]['threshold']:g}".replace("e-0", "e-")
+            text.append(
+                f"MuJoCo's own answers: {len(above)} above their floor, {len(far)} more than {threshold} m/s off"
+            )
+        if far:
+            worst = max(far, key=lambda line: float(line["velocity"]))
+            verdict = "it " + (UNCONVERGED if worst["verdict"] == UNCONVERGED else f"is {WRONG}")
+            text.append(
+                f"worst: {worst['velocity']:.2g} m/s off at {worst['worst']}, step {worst['step']}: {verdict}"
+            )
+        return "\n".join(text)
 
 
 def record(
@@ -162,26 +165,7 @@ def record(
                 raise
             is_interrupted = True
         recorder.write_lines()
-    records = [recorder.lines[file] for file in recorder.files]
-    left_out = [line for line in recorder.lines.values() if "left_out" in line]
-    above_threshold = [line for line in records if line["verdict"] in (UNCONVERGED, WRONG)]
-    worst = max(above_threshold, key=lambda line: float(line["velocity"]), default=None)
-    short = ""
-    if worst is not None:
-        verdict = "it " + (UNCONVERGED if worst["verdict"] == UNCONVERGED else f"is {WRONG}")
-        short = f"{worst['velocity']:.2g} m/s off at {worst['worst']}, step {worst['step']}: {verdict}"
-    return Recording(
-        folder=recorder.folder,
-        files=recorder.files,
-        without=without,
-        left_out=tuple(f"step {line['step']}: {line['left_out']}" for line in left_out),
-        above_floor=sum(line["verdict"] != AT_FLOOR for line in records),
-        stopped=len(above_threshold),
-        threshold=threshold,
-        worst=short,
-        n_starts=len({line["start"] for line in records if "start" in line}),
-        is_interrupted=is_interrupted,
-    )
+    return Recording(recorder.folder, tuple(recorder.lines.values()), without, is_interrupted)
 
 
 def iterate_steps(
@@ -277,15 +261,9 @@ def record_file(
     mj, model = load_model(path)
     result = record(model, mj.MjData(model), folder, steps, control=load_controls(control), **options)
     if not result.files:
+        every = options.get("every", 1)
         why = f" ({result.left_out[0]})" if result.left_out else ": more steps, or other controls"
-        every, seed = options.get("every", 1), options.get("seed", 0)
         if every > 1 and not result.left_out:
-            drive = make_controller(model, load_controls(control), seed)
-            starts = options.get("states")
-            starts = None if starts is None else read_states(mj, model, starts).select_evenly(steps)
-            data = mj.MjData(model)
-            n = sum(data.nefc > 0 for _ in iterate_steps(mj, model, data, steps, 1, drive, starts))
-            if n:
-                why = f", but {n} of the {steps} steps had one: record every step (every is {every})"
+            why += f", or every step (every is {every})"
         raise InputError(f"{path}: no step had a constraint that could be recorded{why}")
     return result

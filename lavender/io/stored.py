@@ -16,11 +16,10 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from threading import get_native_id
 from tokenize import TokenError
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 from numpy.lib import format as npy
@@ -430,27 +429,13 @@ class Budget:
 # -- NumPy archives ------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Header:
+class _Header(NamedTuple):
     """Header of a .npy entry, and the stream of its data."""
 
     stream: IO[bytes]
     dtype: np.dtype[Any]
     shape: tuple[int, ...]
     fortran: bool
-
-    @property
-    def n_elements(self) -> int:
-        """Number of elements."""
-        return math.prod(self.shape)
-
-    def read_array(self) -> np.ndarray:
-        """Read the array; raise EOFError if the stream is too short or too long."""
-        size = self.n_elements * self.dtype.itemsize
-        raw = self.stream.read(size)
-        if len(raw) != size or self.stream.read(1):
-            raise EOFError(f"the entry holds {len(raw)} of {size} bytes: the file is damaged, save it again")
-        return np.frombuffer(raw, self.dtype).reshape(self.shape, order="F" if self.fortran else "C")
 
 
 class Archive(Mapping[str, np.ndarray]):
@@ -499,18 +484,23 @@ class Archive(Mapping[str, np.ndarray]):
             width = header.dtype.itemsize
             if header.dtype.kind in "buif":
                 width = JSON_BYTES_PER_BYTE if name == "meta" else max(width, NUMBER_BYTES)
-            budget.reserve_bytes(header.n_elements * width, f"{self.path}: entry {name!r}")
+            budget.reserve_bytes(math.prod(header.shape) * width, f"{self.path}: entry {name!r}")
 
     def __getitem__(self, name: str) -> np.ndarray:
+        if name not in self._headers:
+            has = ", ".join(self._headers) or "nothing"
+            raise InputError(f"{self.path} has no entry {name!r}; it has {has}")
         if name not in self._arrays:
+            stream, dtype, shape, fortran = self._headers[name]
+            size = math.prod(shape) * dtype.itemsize
             try:
-                header = self._headers[name]
-            except KeyError:
-                has = ", ".join(self._headers) or "nothing"
-                raise InputError(f"{self.path} has no entry {name!r}; it has {has}") from None
-            try:
-                with header.stream:
-                    self._arrays[name] = header.read_array()
+                with stream:
+                    raw = stream.read(size)
+                    if len(raw) != size or stream.read(1):
+                        raise EOFError(
+                            f"it holds {len(raw)} of {size} bytes: the file is damaged, save it again"
+                        )
+                self._arrays[name] = np.frombuffer(raw, dtype).reshape(shape, order="F" if fortran else "C")
             except READ_ERRORS as error:
                 raise InputError(f"{self.path}: entry {name!r} cannot be read: {error}") from None
         return self._arrays[name]
