@@ -1,0 +1,388 @@
+"""Properties of every public array, registered solver, backend and form, which no single example checks."""
+
+import json
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from calls import installed
+from random_problems import random_bodies_and_contacts, random_contact_problem, spd
+
+import lavender as lv
+from lavender.external.running import classify_status
+from lavender.judge.certificates import check_certificate
+from lavender.problem.cones import project_impulse
+from lavender.solvers.islands import find_islands, get_rows_of_blocks, restrict_to_blocks
+from lavender.solvers.polyhedral import convert_to_bounded_rows
+from lavender.solving import loop
+from lavender_ext.judge.measure import is_residual_at_floor
+
+# -- many worlds -------------------------------------------------------------------------------------------------------
+
+
+def draw_worlds(kind):
+    """Draw worlds of different speeds: in the slowest ones the zero impulse meets a velocity tolerance of 1e-3 m/s."""
+    rng = np.random.default_rng(0)
+    jac, mass = rng.normal(size=(6, 6, 9)), np.broadcast_to(np.diag(rng.uniform(0.5, 2.0, 9)), (6, 9, 9)).copy()
+    free = rng.normal(size=(6, 9)) * np.array([1.0, 1e-6, 1.0, 1e-7, 1.0, 1.0])[:, None]
+    if kind == "matrices":
+        return [lv.Problem.contact(*spd(6, seed=i), mu=0.5) for i in range(3)]
+    batch = lv.Batch(jac, mass, free, cones=lv.Cones.contacts(0.5, count=2))
+    return batch if kind == "batch" else list(batch)
+
+
+#: Name of each array of `Solutions` and `Residuals` to the same number of a single result.
+SINGLE = {
+    "status": lambda s, r: s.status,
+    "success": lambda s, r: s.success,
+    "iterations": lambda s, r: s.iterations,
+    "verdict": lambda s, r: r.verdict,
+    "excess": lambda s, r: r.excess,
+    "relative": lambda s, r: r.relative,
+    "energy": lambda s, r: r.energy,
+    "velocity_error": lambda s, r: r.velocity,
+    "roundoff_floor": lambda s, r: r.roundoff_floor,
+    "worst_row": lambda s, r: r.worst_row,
+    "energy_at_zero": lambda s, r: r.energy_at_zero,
+    "velocity_at_zero": lambda s, r: r.velocity_at_zero,
+    "impulse_error": lambda s, r: abs(r.error[r.worst_row]) if r.worst_row >= 0 else 0.0,
+}
+OF_ALL_WORLDS = {"impulse", "velocity", "ptr", "flat_impulses"}
+
+
+def list_arrays(cls):
+    """Return the public properties of a class."""
+    found = {n: getattr(cls, n) for n in dir(cls) if not n.startswith("_")}
+    return {n for n, x in found.items() if isinstance(x, property | cached_property)} - OF_ALL_WORLDS
+
+
+@pytest.mark.parametrize("more", [{}, {"velocity_tol": 1e-3, "max_iter": 2}, {"max_iter": 1, "tol": 1e-12}])
+@pytest.mark.parametrize("solver", ["auto", "pgs"])
+@pytest.mark.parametrize("kind", ["batch", "problems", "matrices"])
+def test_solve_many_arrays_equal_the_numbers_of_single_solutions(kind, solver, more):
+    worlds = draw_worlds(kind)
+    many = lv.solve_many(worlds, solver, **more)
+    assert list_arrays(lv.Solutions) <= SINGLE.keys()
+    for name in list_arrays(lv.Solutions):
+        expected = [SINGLE[name](s, s.residual) for s in many]
+        assert getattr(many, name).tolist() == expected, name
+    if more == {"velocity_tol": 1e-3, "max_iter": 2} and kind == "batch":
+        assert many.success[[1, 3]].all() and (many.relative[[1, 3]] > many.tol).all()
+    if kind != "matrices":
+        velocity = np.concatenate([p.velocity(s.impulse).ravel() for p, s in zip(worlds, many, strict=True)])
+        np.testing.assert_allclose(many.velocity.ravel(), velocity, rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize("kind", ["batch", "problems", "matrices"])
+def test_residual_many_arrays_equal_the_numbers_of_single_residuals(kind):
+    worlds = draw_worlds(kind)
+    starts = [0.9 * s.impulse for s in lv.solve_many(worlds)]
+    found = lv.residual_many(worlds, np.array(starts) if kind == "batch" else starts)
+    assert list_arrays(lv.Residuals) <= SINGLE.keys()
+    for name in list_arrays(lv.Residuals):
+        assert getattr(found, name).tolist() == [SINGLE[name](None, r) for r in found], name
+    if kind == "batch":
+        for i, problem in enumerate(worlds):
+            assert worlds.start(i).tolist() == problem.start().tolist()
+
+
+def test_solve_many_invalid_world_between_valid_ones_has_no_numbers():
+    batch = draw_worlds("batch")
+    free = np.array([p.generalized.v_free for p in batch])
+    free[2] = np.nan
+    jac, mass = (np.array([getattr(p.generalized, n).toarray() for p in batch]) for n in ("jac", "mass"))
+    many = lv.solve_many(lv.Batch(jac, mass, free, cones=lv.Cones.contacts(0.5, count=2)), errors="status")
+    assert list(many.faults) == [2] and many.status[2] is lv.Status.INVALID_PROBLEM
+    assert "world 2" in str(many.faults[2])
+    assert (many.iterations[2], many.worst_row[2]) == (0, -1) and np.isnan(many.velocity[2]).all()
+
+
+# -- verdicts and proofs -----------------------------------------------------------------------------------------------
+
+
+def test_verdict_changes_at_its_documented_factors():
+    for floor in (1e-16, 1e-12, 1e-7):
+        assert is_residual_at_floor(1.99 * floor, floor) and not is_residual_at_floor(2.01 * floor, floor)
+    assert is_residual_at_floor(0.99e-5, 0.9e-5) and not is_residual_at_floor(1.01e-5, 0.9e-5)
+    assert not is_residual_at_floor(0.0, 1e-3)
+    problem = lv.Problem.lcp([[1.0]], [1.0])
+    floor = lv.residual(problem, [1.0], "float32").roundoff_floor
+    for factor, expected in ((3.9, "at its floor"), (4.2, "stopped before convergence")):
+        assert lv.residual(problem, [1.0 - factor * floor], "float32", threshold=0.0).verdict == expected
+    for speed, expected in ((0.99, "close enough"), (1.01, "stopped before convergence")):
+        assert lv.residual(problem, [1.0 - 1e-3 * speed], threshold=1e-3).verdict == expected
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_verdict_of_the_zero_impulse_is_wrong_and_of_a_part_of_the_solution_unconverged(seed):
+    problem = random_contact_problem(seed)
+    solution = lv.solve(problem, tol=1e-12).impulse
+    assert lv.residual(problem, problem.start(), threshold=0.0).verdict == "wrong"
+    assert lv.residual(problem, 0.999 * solution, threshold=0.0).verdict == "stopped before convergence"
+
+
+def test_verdict_of_a_diverged_impulse_in_a_scene_at_rest_is_wrong():
+    problem = lv.Problem.lcp(np.eye(3), -np.ones(3))
+    assert lv.residual(problem, np.zeros(3)).verdict == "at its floor"
+    assert lv.residual(problem, np.full(3, 1e6)).verdict == "wrong"
+
+
+@pytest.mark.parametrize("gap", [1e-3, 1e-6])
+def test_proof_of_two_contradicting_rows_holds_below_their_residual_only(gap):
+    problem = lv.Problem.lcp(np.ones((2, 2)), [1.0, 1.0 + gap], -np.inf, np.inf)
+    y = [-1.0, 1.0]
+    assert check_certificate(problem, y, 0.01 * gap) is None
+    assert check_certificate(problem, y, 10.0 * gap) is not None
+
+
+@pytest.mark.parametrize("mu", [(0.9, 0.3), (0.3, 0.9)])
+def test_certificate_of_an_ellipse_proves_in_the_given_tangents(mu):
+    problem = lv.Problem.contact(np.zeros((3, 3)), [-0.2, 0.5, 0.5], mu=[mu], friction="cone")
+    solution = lv.solve(problem)
+    assert solution.status is lv.Status.INFEASIBLE and solution.claim_check == "confirmed"
+    y = solution.certificate
+    assert problem.b @ y > 0.0 and np.hypot(y[1] / mu[0], y[2] / mu[1]) <= y[0] * (1.0 + 1e-12)
+    assert check_certificate(problem, y) is None
+
+
+# -- backends ----------------------------------------------------------------------------------------------------------
+
+
+def build_rows_of_every_kind():
+    """Build J and M with equal limits, two finite limits away from 0, an LCP row, a free row and a row of zeros."""
+    rng = np.random.default_rng(2)
+    jac = rng.normal(size=(7, 8))
+    jac[5] = 0.0
+    low = np.array([0.3, 0.2, 0.0, -np.inf, -0.4, -0.5, -np.inf])
+    high = np.array([0.3, 0.6, np.inf, np.inf, -0.4, 0.7, -0.1])
+    target = np.r_[rng.normal(size=5), 0.2, rng.normal()]
+    return lv.Problem.from_jacobian(jac, spd(8)[0], np.ones(8), target=target, cones=lv.Cones.bounded(low, high))
+
+
+@pytest.mark.parametrize("form", ["impulse", "velocity"])
+@pytest.mark.parametrize("name", installed("clarabel", "osqp", "daqp", "quadprog", "proxqp", "highs", "piqp", "scs"))
+def test_backend_form_with_nonzero_limits_agrees_with_newton(name, form):
+    problem = build_rows_of_every_kind()
+    expected = lv.solve(problem, "newton", tol=1e-13)
+    found = lv.solve(problem, name, form=form, tol=1e-7)
+    assert expected.success and found.success
+    np.testing.assert_allclose(found.impulse, expected.impulse, atol=1e-5)
+    np.testing.assert_allclose(found.slack, expected.slack, atol=1e-5)
+    if found.dual is not None and form == "impulse":
+        np.testing.assert_allclose(found.dual, -found.slack, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("text", "status"),
+    [
+        ("solved inaccurate", "STALLED"), ("primal infeasible inaccurate", "STALLED"), ("AlmostSolved", "STALLED"),
+        ("AlmostPrimalInfeasible", "STALLED"), ("AlmostDualInfeasible", "STALLED"), ("PrimalInfeasible", "INFEASIBLE"),
+        ("dual infeasible", "INFEASIBLE"), ("maximum iterations reached", "MAX_ITERATIONS"), ("Solved", "CONVERGED"),
+        ("run time limit reached", "TIME_LIMIT"), ("interrupted", "INTERRUPTED"), ("InsufficientProgress", "STALLED"),
+        ("problem non convex", "NUMERICAL_ERROR"),
+    ],
+)  # fmt: skip
+def test_classify_status_of_a_backend_wording_is_never_more_certain(text, status):
+    assert classify_status(text) is lv.Status[status]
+
+
+# -- the best answer ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("friction", ["coulomb", "cone"])
+@pytest.mark.parametrize("name", ["lemke", "direct"])
+def test_converted_rows_keep_their_start_and_are_never_worse(name, friction):
+    cones = lv.Cones.contacts(np.full(3, 0.6), 2, shape="box")
+    for seed in range(6):
+        a, b = spd(9, seed=seed)
+        problem = lv.Problem(b, cones, a, friction=friction)
+        inside = project_impulse(cones, np.random.default_rng(seed).normal(size=9) * np.array([9.0, 1.0, 1.0] * 3))
+        form = convert_to_bounded_rows(problem)
+        np.testing.assert_allclose(form.to_impulse @ form.convert_start(inside), inside, atol=1e-14)
+        good = lv.solve(problem, "newton", tol=1e-13)
+        start = good.impulse * 0.9 + 1e-3
+        for given in (good.impulse, start):
+            found = lv.solve(problem, name, impulse=given, max_iter=1, tol=1e-15)
+            before = lv.residual(problem, project_impulse(cones, given)).relative
+            assert found.residual.relative <= max(before, 2.0 * found.residual.roundoff_floor) * (1 + 1e-9), seed
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_direct_of_an_ill_conditioned_asymmetric_matrix_ends_at_its_floor(seed):
+    rng = np.random.default_rng(seed)
+    u, v = (np.linalg.qr(rng.normal(size=(30, 30)))[0] for _ in range(2))
+    a = u @ np.diag(np.logspace(0, -9, 30)) @ v
+    solution = lv.solve(lv.Problem.linear(a, rng.normal(size=30)), "direct", tol=1e-15)
+    assert solution.residual.at_floor, str(solution)
+
+
+# -- numbers that are only shown ---------------------------------------------------------------------------------------
+
+
+def test_cross_check_objective_is_that_of_numpy():
+    a, b = spd(6, seed=3)
+    problem = lv.Problem.lcp(a, b)
+    check = lv.cross_check(problem, ["pgs", "newton"], tol=1e-3)
+    best = lv.solve(problem, "newton", tol=1e-14).impulse
+    for row in check.rows:
+        lam = row.solution.impulse
+        expected = (0.5 * lam @ a @ lam - b @ lam) - (0.5 * best @ a @ best - b @ best)
+        assert row.objective == pytest.approx(expected, abs=1e-10 + 1e-3 * abs(expected))
+
+
+def test_residual_of_ellipses_has_row_errors_in_the_metric_of_the_disk():
+    a, b = spd(6, seed=1)
+    problem = lv.Problem.contact(a, b, mu=[(0.9, 0.3), (0.2, 0.8)])
+    found = lv.residual(problem, 0.1 * np.abs(b))
+    assert found.velocity_by_row.max() <= found.velocity * (1.0 + 1e-12)
+    np.testing.assert_allclose(
+        found.velocity_by_row, lv.residual(problem.disk, problem.on_disk(0.1 * np.abs(b))).velocity_by_row
+    )
+
+
+def test_solution_history_and_time_exclude_the_judge(monkeypatch):
+    """The judge takes 1 s of a clock that nothing else moves."""
+    now, judge = [0.0], loop.residual
+
+    def judge_slowly(*given):
+        now[0] += 1.0
+        return judge(*given)
+
+    monkeypatch.setattr(loop, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(loop, "residual", judge_slowly)
+    problem = random_contact_problem(0)
+    for name in lv.available(problem, history=True, callback=True):
+        seen = []
+        more = {"history": True, "callback": lambda k, x, r: seen.append((k, r.relative, r.energy, r.velocity))}  # noqa: B023
+        history = lv.solve(problem, name, tol=1e-9, max_iter=40, **more).history
+        assert history.time.max() == 0.0, name
+        columns = history.iterations, history.relative, history.energy, history.velocity
+        assert list(zip(*(x.tolist() for x in columns), strict=True)) == seen, name
+
+
+# -- gradients ---------------------------------------------------------------------------------------------------------
+
+
+def test_gradient_by_mass_is_symmetric_and_of_a_doubled_contact_that_of_the_single_one():
+    problem = draw_worlds("batch")[0]
+    solution = lv.solve(problem, tol=1e-13)
+    gradient = lv.derivative(problem, solution).vjp(velocity=np.arange(1.0, 10.0))
+    assert abs(gradient.M - gradient.M.T).max() == 0.0
+    general = problem.generalized
+    twice = lv.Problem.from_jacobian(
+        sp.vstack([general.jac, general.jac]), general.mass, general.v_free, cones=lv.Cones.contacts(0.5, count=4)
+    )
+    both = lv.solve(twice, tol=1e-13)
+    np.testing.assert_allclose(twice.velocity(both.impulse), problem.velocity(solution.impulse), atol=1e-9)
+    found = lv.derivative(twice, both).vjp(velocity=np.arange(1.0, 10.0))
+    np.testing.assert_allclose(found.v_free, gradient.v_free, atol=1e-6)
+
+
+# -- reordered, cut and changed problems -------------------------------------------------------------------------------
+
+
+def build_chain(order):
+    """Build a branched chain of 40 velocities, numbered by `order`, of which only some have rows of J."""
+    rng = np.random.default_rng(5)
+    parent = [-1, *((i - 1) // 2 for i in range(1, 40))]
+    root = np.eye(40) + sum(0.3 * np.outer(np.eye(40)[i], np.eye(40)[p]) for i, p in enumerate(parent) if p >= 0)
+    jac = np.zeros((9, 40))
+    for row, leaf in enumerate((39, 38, 30, 21, 20, 12, 7, 3, 0)):
+        jac[row, leaf] = 1.0
+        jac[row, parent[leaf]] += 0.5
+    mass = (root.T @ root)[np.ix_(order, order)]
+    return lv.Problem.from_jacobian(
+        jac[:, order], mass, rng.normal(size=40)[order], cones=lv.Cones.contacts([0.5] * 3, 2), compliance=1e-3
+    )
+
+
+def test_permuted_velocities_give_the_same_matrix_answers_and_shifted_mass():
+    plain = build_chain(np.arange(40))
+    for seed in range(3):
+        order = np.random.default_rng(seed).permutation(40)
+        problem = build_chain(order)
+        np.testing.assert_allclose(problem.dense(), plain.dense(), atol=1e-12)
+        for name in ("newton", "pgs", "auto"):
+            own, other = (lv.solve(p, name, tol=1e-10).impulse for p in (plain, problem))
+            np.testing.assert_allclose(own, other, atol=1e-7)
+        shift = np.linspace(0.0, 1.0, 40)
+        moved = problem.generalized.with_diagonal_shift(shift)
+        np.testing.assert_allclose(moved.mass.toarray(), problem.generalized.mass.toarray() + np.diag(shift))
+
+
+def list_problems_with_islands():
+    """Return problems with several islands in every form; a tree of M also has velocities without rows."""
+    chain = build_chain(np.arange(40)).generalized
+    general = lv.Problem.from_jacobian(
+        sp.block_diag([chain.jac, chain.jac]), sp.block_diag([chain.mass, chain.mass]),
+        np.r_[chain.v_free, -chain.v_free], cones=lv.Cones.contacts([0.5] * 6, 2),
+        compliance=np.linspace(0.0, 1e-2, 18),
+    )  # fmt: skip
+    rng = np.random.default_rng(8)
+    rows = random_bodies_and_contacts(rng, bodies=12, joints=2, contacts=5)
+    bodies = lv.Problem.from_rows(rows, mu=0.5, compliance=rng.uniform(0.0, 0.1, rows.joint_ptr[-1] + 15))
+    return [general, bodies, lv.Problem(bodies.b, bodies.cones, bodies.csr)]
+
+
+@pytest.mark.parametrize("kind", range(3))
+def test_island_cut_out_has_its_block_of_the_matrix_and_its_answer(kind):
+    problem = list_problems_with_islands()[kind]
+    count, label = find_islands(problem)
+    assert count > 1
+    a, whole = problem.csr.toarray(), lv.solve(problem, tol=1e-12)
+    for island in range(count):
+        blocks = np.flatnonzero(label == island)
+        rows = get_rows_of_blocks(problem, blocks)
+        part = restrict_to_blocks(problem, blocks, rows)
+        np.testing.assert_allclose(part.csr.toarray(), a[np.ix_(rows, rows)], atol=1e-13)
+        np.testing.assert_array_equal(part.b, problem.b[rows])
+        if problem.rows is not None:
+            bodies = np.unique(problem.rows.block_bodies[blocks])
+            np.testing.assert_array_equal(part.rows.v_free, problem.rows.v_free[bodies[bodies >= 0]])
+        others = np.delete(a[rows], rows, axis=1)
+        assert not others.any()
+        assert lv.residual(part, whole.impulse[rows]).relative <= 1e-9
+
+
+@pytest.mark.parametrize("order", ["colored", "bottom_up", "top_down", "given"])
+def test_pinned_body_that_turns_is_moving_in_every_order(order):
+    """Two bodies on a wheel whose centre is fixed: a colour must not contain both of its contacts."""
+    rows = lv.Rows(
+        inv_mass=[0.0, 1.0, 1.0], inv_inertia=np.array([np.eye(3)] * 3),
+        v_free=[[0.0] * 6, [0.0, 0.0, -1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -2.0, 0.0, 0.0, 0.0]],
+        normal=[[0.0, 0.0, 1.0]] * 2, tangent=[[1.0, 0.0, 0.0]] * 2, arm_a=[[1.0, 0.0, 0.0], [-0.5, 0.2, 0.0]],
+        arm_b=[[0.0, 0.0, 0.0]] * 2, contact_body=[[0, 1], [0, 2]],
+    )  # fmt: skip
+    problem = lv.Problem.from_rows(rows, mu=0.3)
+    assert rows.moving_block_bodies.tolist() == [[0, 1], [0, 2]]
+    assert find_islands(problem)[0] == 1
+    expected = lv.solve(problem, "newton", tol=1e-12).impulse
+    for name in ("sequential_impulses", "pgs"):
+        found = lv.solve(problem, name, order=order, tol=1e-11, max_iter=10_000).impulse
+        np.testing.assert_allclose(found, expected, atol=1e-8)
+
+
+# -- two options together ----------------------------------------------------------------------------------------------
+
+
+def test_recorder_with_every_and_keep_worst_keeps_selected_steps(tmp_path):
+    batch = lv.Batch(np.ones((1, 1, 1)), np.ones((1, 1, 1)), -np.ones((1, 1)), cones=lv.Cones.contacts(0.0, tangents=0))
+    with lv.io.Recorder(tmp_path / "a", every=2, keep_worst=1) as recorder:
+        for error in (0.1, 0.2, 0.3, 0.05, 0.4, 0.25):
+            recorder.add(lv.io.EngineStep(batch, np.array([[1.0 - error]]), None))
+    lines = [json.loads(line) for line in (tmp_path / "a" / "engine.jsonl").read_text().splitlines()]
+    assert sorted(line["step"] for line in lines) == [0, 2, 4] == sorted(int(name[5:11]) for name in recorder.files)
+
+
+@pytest.mark.parametrize("name", ["auto", "newton", "pgs", "sequential_impulses", "nncg"])
+def test_prepared_problem_solved_twice_gives_the_bits_of_two_solves(name):
+    problem = random_contact_problem(1)
+    problem = replace(problem, guess=lv.solve(problem, tol=1e-2).impulse)
+    for more in ({}, {"max_iter": 3, "tol": 1e-14}):
+        prepared, expected = lv.prepare(problem, name), lv.solve(problem, name, **more)
+        for _ in range(2):
+            found = prepared.solve(**more)
+            assert found.impulse.tobytes() == expected.impulse.tobytes()
+            assert found.iterations == expected.iterations and found.status is expected.status
