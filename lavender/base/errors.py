@@ -77,7 +77,7 @@ class UnknownName(LavenderError, KeyError):
 
     def __reduce__(self) -> tuple[Any, ...]:
         # The default unpickles an exception by calling its class with `args`, but `__init__` has other parameters.
-        return _restore_unknown_name, (self.message,)
+        return UnknownName.__new__, (UnknownName, self.message), vars(self)
 
 
 def check_name(kind: str, name: object, known: Collection[str]) -> str:
@@ -85,12 +85,6 @@ def check_name(kind: str, name: object, known: Collection[str]) -> str:
     if not isinstance(name, str) or name not in known:
         raise UnknownName(kind, name, known)
     return name
-
-
-def _restore_unknown_name(message: str) -> UnknownName:
-    error = UnknownName.__new__(UnknownName, message)
-    error.message = message
-    return error
 
 
 class SolverUnavailable(LavenderError):

@@ -9,7 +9,6 @@ import click
 
 from lavender.base.errors import InputError
 from lavender.base.exits import EXIT_UNMET
-from lavender.cli.completion import complete_choice
 from lavender.cli.measuring import explain_early_interrupt, show_page, show_progress
 from lavender.cli.options import (
     FILE,
@@ -27,9 +26,8 @@ from lavender.io.stored import lock_output
 @click.command()
 @click.argument("model", metavar="MODEL.xml|MODEL.mjb|SCENE.py", type=FILE)
 @add_worlds_options(worlds=None, steps=200)
-@click.option("--engine", default="mujoco", show_default=True,
-              metavar="mujoco|mjx|mujoco_warp|kamino|newton-mujoco|genesis", shell_complete=complete_choice,
-              help="Engine that steps the worlds.")  # fmt: skip
+@click.option("--engine", default="mujoco", show_default=True, help="Engine that steps the worlds.",
+              type=click.Choice(["mujoco", "mjx", "mujoco_warp", "kamino", "newton-mujoco", "genesis"]))  # fmt: skip
 @click.option("--against", type=FILE, metavar="MODEL.xml|MODEL.mjb",
               help="Another model, such as one with other options, that solves the same steps.")  # fmt: skip
 @click.option("--max-velocity-error", type=float, metavar="M/S",

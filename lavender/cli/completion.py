@@ -39,10 +39,3 @@ def complete_scene(
     from lavender.sim.scene import SCENES
 
     return _list_matches(SCENES, incomplete)
-
-
-def complete_choice(
-    context: click.Context, parameter: click.Parameter, incomplete: str
-) -> list[CompletionItem]:
-    """Return the words of the parameter's metavar, such as `mujoco|mjx`, that begin with `incomplete`."""
-    return _list_matches((parameter.metavar or "").split("|"), incomplete)

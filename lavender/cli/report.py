@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 from collections.abc import Mapping
@@ -181,19 +180,11 @@ def _reject_unused_options(
 def _record_model(
     word: str, out: Path, used_folders: set[Path], reuse: bool, recording: Mapping[str, Any]
 ) -> str:
-    """Record the steps of a model and return their folder; return any other word unchanged.
+    """Record the steps of a model *.xml or *.mjb in the report's folder `out`, and return their folder.
 
-    Steps that were recorded with the same settings are reused.
-
-    Parameters
-    ----------
-    word : argument of the command; a model is a file *.xml or *.mjb
-    out : folder of the report
-    used_folders : folders of the models before this one; the new folder is added
-    reuse : reuse recorded steps
-    recording : options of the recording
-
-    The name of the folder contains the folder and the file of the model, since many files are called scene.xml.
+    Any other word is returned unchanged. With `reuse`, steps that were recorded with the same settings are kept. The
+    new folder is added to `used_folders`. Its name contains the folder and the file of the model, since many files are
+    called scene.xml.
     """
     path = Path(word)
     if path.suffix.lower() not in MODEL_SUFFIXES:
@@ -212,7 +203,7 @@ def _record_model(
     settings = json.dumps(
         {
             "model": model,
-            "changed": _list_modification_times(path, recording["control"], recording["states"]),
+            "changed": _describe_sources(path, recording["control"], recording["states"]),
             **recording,
         }
     )
@@ -235,18 +226,9 @@ def _read_recorded_model(folder: Path) -> str:
         return ""
 
 
-def _list_modification_times(path: Path, controls: str, states: str | None) -> list[float]:
-    """Return the modification times of the model, its included files, its controls and its start states."""
-    try:
-        times = [path.stat().st_mtime]
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror or error}") from None
-    try:
-        from mujoco import FatalError, mju_getXMLDependencies
-    except ImportError:  # MuJoCo is missing, or has no such function.
-        return times
-    # Ignore an invalid model here; reading it raises the error.
-    with contextlib.suppress(ValueError, RuntimeError, FatalError):
-        others = (*sorted(mju_getXMLDependencies(str(path))), controls, states or "")
-        times += [p.stat().st_mtime for p in map(Path, others) if p.is_file()]
-    return times
+def _describe_sources(path: Path, controls: str, states: str | None) -> list[Any]:
+    """Return a hash of the model, and the modification times of the files of model, controls and start states."""
+    from lavender.io.start_states import hash_model, load_model
+
+    files = [file for file in (path, Path(controls), Path(states or "")) if file.is_file()]
+    return [hash_model(load_model(path)[1], options=True), *(file.stat().st_mtime for file in files)]

@@ -16,13 +16,13 @@ from lavender.problem import Problem
 from lavender.problem.rows import Rows
 
 G = 9.81  # [m/s^2]
+MAX_GRAVITY_DEVIATION = 0.05  # [-] A common v* that is this near to 9.81 m/s is an acceleration without dt.
 # [m/s] A larger target would separate bodies by more than 6 cm in a step of 2 ms.
 MAX_SEPARATION_TARGET = 30.0
 # [m/s] A larger target would allow an approach of more than 2 m in a step of 2 ms.
 MAX_APPROACH_TARGET = 1000.0
-MIN_RESTITUTION = (
-    0.05  # [-] A smaller ratio of target to approach speed is not a bounce: dt is a factor too many.
-)
+# [-] A smaller ratio of target to approach speed is not a bounce: dt is a factor too many.
+MIN_RESTITUTION = 0.05
 RESTITUTION_ROUNDING = (
     1e-6  # [-] Coefficients of restitution that are computed from velocities differ by this.
 )
@@ -122,7 +122,7 @@ def diagnose_targets(p: Problem) -> Iterator[Diagnostic]:
 
 
 def diagnose_flipped_normals(p: Problem) -> Iterator[Diagnostic]:
-    """Yield a diagnostic if the normals of static bodies push falling bodies further down.
+    """Yield a diagnostic if static bodies push falling bodies further down, or if bodies fall with g in m/s.
 
     The check is made only if most bodies have the same v*. This v* is the velocity change by gravity in one step, and
     static bodies must then support the others from below.
@@ -137,6 +137,11 @@ def diagnose_flipped_normals(p: Problem) -> Iterator[Diagnostic]:
     size = float(np.linalg.norm(fall))
     if len(still) < 4 or size == 0.0 or np.median(np.abs(v @ fall / size - size)) > 0.6 * size:
         return
+    if abs(size - G) <= MAX_GRAVITY_DEVIATION * G:
+        reason = (
+            f"most bodies have v* of {size:.3g} m/s, as many m/s as g has m/s^2: do accelerations lack dt?"
+        )
+        yield make_diagnostic(p, "v_free", reason, change=size)
     toward = np.where(body[still, 1:] < 0, -1.0, 1.0) * r.normal[still] @ fall[:, None] / size
     if toward.mean() > 0.3 and (toward > -0.1).mean() > 0.9:
         reason = "static bodies push others in the direction of their fall: are normals flipped, or bodies swapped?"

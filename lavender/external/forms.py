@@ -354,20 +354,8 @@ def _list_velocity_rows(
 ) -> tuple[list[tuple[Entries, Entries]], int]:
     """List the rows of the velocity form: entries of a column of T, and of the unknowns t, for each row of A.
 
-    Parameters
-    ----------
-    components : list of FrictionComponent
-    free, lower, upper : (k,) int
-        Rows without friction that are free, have a lower bound, or have only an upper bound.
-    ny : int
-        Number of velocities, which the unknowns t follow.
-    t_of_row : dict
-        Unknown t of each row with both bounds.
-
-    Returns
-    -------
-    rows, n_friction : list of (entries, entries), int
-        The rows, and the number of unknowns t of friction, which follow `t_of_row`.
+    The rows `free`, `lower` and `upper` have no friction; `t_of_row` has the unknown t of each row with both bounds.
+    Unknowns t follow `ny` velocities. The second result is the number of unknowns t of friction, which follow these.
     """
     rows: list[tuple[Entries, Entries]] = [([(i, -1.0)], []) for i in free.tolist()]
     rows += [([(i, 1.0)], [(t_of_row[i], -1.0)] if i in t_of_row else []) for i in lower.tolist()]

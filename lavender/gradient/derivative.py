@@ -98,11 +98,8 @@ class Tangent:
     @property
     def velocity(self) -> FloatArray:
         """Change of v+ (nv,) or (n, 6) [m/s, rad/s]; CapabilityError for a problem given as a matrix."""
-        if self._velocity is None:
-            raise CapabilityError(
-                "the problem was given as a matrix A, without velocities; build it with Problem.from_rows or "
-                "Problem.from_jacobian"
-            )
+        self._derivative._velocity_shape()
+        assert self._velocity is not None
         return self._velocity
 
 
@@ -199,21 +196,17 @@ class Derivative:
         write_body_wrenches(p.data, np.ascontiguousarray(x), out)
         return out.ravel()
 
-    def _apply_mobility(self, x: FloatArray) -> FloatArray:
-        """Compute the velocity change M^-1 J^T x (nv,)."""
-        return self.problem.compute_velocity_change(x).ravel()
-
     def _apply_a(self, x: FloatArray, transpose: bool = False) -> FloatArray:
         """Compute A x or A^T x (m,)."""
         p = self.problem
         if p.matrix is not None:
             return np.asarray((p.matrix.T if transpose else p.matrix) @ x)
         assert p.compliance is not None
-        return self._apply_jacobian(self._apply_mobility(x)) + p.compliance * x
+        return self._apply_jacobian(p.compute_velocity_change(x).ravel()) + p.compliance * x
 
     @cached_property
     def _velocity_change(self) -> FloatArray:
-        return self._apply_mobility(self._impulse)
+        return self.problem.compute_velocity_change(self._impulse).ravel()
 
     @cached_property
     def _velocity(self) -> FloatArray:
@@ -434,7 +427,7 @@ class Derivative:
         impulse = dz / self._root
         slack = self._apply_a(impulse) + dw
         if dv is not None:
-            dv = (dv + self._apply_mobility(impulse)).reshape(self._velocity_shape())
+            dv = (dv + p.compute_velocity_change(impulse).ravel()).reshape(self._velocity_shape())
         return Tangent(slack, dv, impulse, self)
 
     def _apply_coefficient_change(self, de: FloatArray) -> FloatArray:

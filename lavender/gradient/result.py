@@ -30,32 +30,8 @@ COEFFICIENT_INPUTS = ("mu", "patch_radius", "rolling")
 ROW_INPUTS = ("b", "target", "compliance", "A", "J")
 
 
-class _Input:
-    """Descriptor that computes the gradient by one input and stores it as an attribute of the instance."""
-
-    def __init__(self, name: str) -> None:
-        self.name, self.operators, self.is_row_input = name, INPUTS[name], name in ROW_INPUTS
-        self.compute = getattr(Gradient, f"_by_{name}")
-
-    def __get__(self, gradient: Any, owner: Any = None) -> Any:
-        if gradient is None:
-            return self
-        name, derivative = self.name, gradient._derivative
-        if self.operators is not OPERATORS and derivative.problem.operator not in self.operators:
-            raise CapabilityError(
-                f"{name} exists only for problems given as {' or '.join(self.operators)}, and this one was given as "
-                f"{derivative.problem.operator}"
-            )
-        if self.is_row_input and not derivative._uses_kernel:
-            derivative._check_row_changes(f"no derivative by {name} exists here")
-        if name in (*COEFFICIENT_INPUTS, "coefficients") and not derivative._uses_kernel:
-            derivative._check_coefficient_changes("mu" if name == "coefficients" else name)
-        value = gradient.__dict__[name] = self.compute(gradient)
-        return value
-
-
 class GradientArrays:
-    """Types of the gradients that are arrays, which descriptors and `__getattr__` of derived classes compute."""
+    """Types of the gradients that are arrays, which `__getattr__` of derived classes computes."""
 
     if TYPE_CHECKING:
         b: FloatArray
@@ -129,10 +105,27 @@ class Gradient(GradientArrays):
     def __repr__(self) -> str:
         return f"<Gradient of {self._derivative.m} rows by {', '.join(self._derivative.inputs)}>"
 
+    def __dir__(self) -> list[str]:
+        return [*super().__dir__(), *self._derivative.inputs]
+
     if not TYPE_CHECKING:  # Hide `__getattr__` from type checkers, so that they report unknown names.
 
         def __getattr__(self, name: str) -> Any:
-            raise AttributeError(f"a gradient has no {name!r}; it has {', '.join(INPUTS)}")
+            """Compute the gradient by one input, and store it as an attribute."""
+            if name not in INPUTS:
+                raise AttributeError(f"a gradient has no {name!r}; it has {', '.join(INPUTS)}")
+            derivative, operators = self._derivative, INPUTS[name]
+            if derivative.problem.operator not in operators:
+                raise CapabilityError(
+                    f"{name} exists only for problems given as {' or '.join(operators)}, and this one was given as "
+                    f"{derivative.problem.operator}"
+                )
+            if name in ROW_INPUTS and not derivative._uses_kernel:
+                derivative._check_row_changes(f"no derivative by {name} exists here")
+            if name in (*COEFFICIENT_INPUTS, "coefficients") and not derivative._uses_kernel:
+                derivative._check_coefficient_changes("mu" if name == "coefficients" else name)
+            value = self.__dict__[name] = getattr(self, f"_by_{name}")()
+            return value
 
     def _by_b(self) -> FloatArray:
         return self._s
@@ -239,7 +232,3 @@ def _sum_on_pattern(pattern: Any, *pairs: tuple[FloatArray, FloatArray]) -> sp.c
     row = np.repeat(np.arange(pattern.shape[0]), np.diff(pattern.indptr))
     data = sum(u[row] * v[pattern.indices] for u, v in pairs)
     return sp.csr_array((data, pattern.indices, pattern.indptr), shape=pattern.shape)
-
-
-for _name in INPUTS:
-    setattr(Gradient, _name, _Input(_name))

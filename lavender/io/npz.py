@@ -9,9 +9,7 @@ import json
 import os
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, fields, replace
-from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -65,12 +63,6 @@ class Stored:
     compare: str = ""
     guesses: tuple[FloatArray, ...] = ()
     info: Mapping[str, str] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "info", MappingProxyType(dict(self.info)))
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return partial(Stored, **vars(self) | {"info": dict(self.info)}), ()
 
 
 def read_npz(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
@@ -218,8 +210,7 @@ def _read_meta(archive: Archive) -> dict[str, Any]:
     for name in needed:
         if name not in meta:
             raise InputError(f"entry 'meta' has no {name!r}; {', '.join(needed)} are needed")
-    unknown = sorted(set(meta) - {*needed, "dof_names", "precision", "program"})
-    if unknown:
+    if unknown := sorted(set(meta) - {*needed, "dof_names", "precision", "program"}):
         raise InputError(f"entry 'meta' has the unknown names {', '.join(unknown)}: remove them")
     operators = ("dense", "csr", "rows", "generalized")
     for name, is_valid, requirement in (
@@ -243,14 +234,9 @@ def _build_generalized(archive: Archive, names: list[str] | None) -> Generalized
     """Build the generalised form from its entries."""
     v_free = archive["general_v_free"]
     n, m = v_free.size, archive["b"].size
+    parts = "indptr", "indices", "data"
     jac, mass = (
-        build_checked_csr(
-            archive[f"general_{name}_indptr"],
-            archive[f"general_{name}_indices"],
-            archive[f"general_{name}_data"],
-            rows,
-            n,
-        )
+        build_checked_csr(*(archive[f"general_{name}_{part}"] for part in parts), rows, n)
         for name, rows in (("jac", m), ("mass", n))
     )
     return Generalized(jac, mass, v_free, names)

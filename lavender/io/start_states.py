@@ -43,18 +43,8 @@ LABELS = (
 )  # Additional arrays in the files of `lavender audit`: the origin of each state.
 # Arrays of a model with these prefixes determine the motion; together with a state they define a step's problem.
 MODEL_ARRAYS = (
-    "body_",
-    "jnt_",
-    "dof_",
-    "geom_",
-    "eq_",
-    "tendon_",
-    "wrap_",
-    "actuator_",
-    "pair_",
-    "flex_",
-    "qpos",
-)
+    "body_", "jnt_", "dof_", "geom_", "eq_", "tendon_", "wrap_", "actuator_", "pair_", "flex_", "qpos",
+)  # fmt: skip
 APPEARANCE = ("rgba", "matid", "user", "group", "plugin")  # Arrays with these words do not.
 # [m, rad] Equality constraints that a start state violates by more than this are named.
 MAX_EQUALITY_ERROR = 0.05
@@ -112,26 +102,25 @@ def hash_model(model: Any, options: bool = False) -> str:
 
 
 def load_controls(control: Control) -> Control:
-    """Return controls for `record`: the array of a file (.npy), or `control` unchanged."""
-    return _load_controls_npy(control) if isinstance(control, str) and control not in CONTROLS else control
+    """Return controls for `record`: the array of a file (.npy), or `control` unchanged.
 
-
-def _load_controls_npy(path: str) -> Any:
-    """Return the array of a .npy file; raise InputError if it cannot be read or holds several arrays."""
+    Raises
+    ------
+    InputError
+        The file cannot be read or holds several arrays.
+    """
+    if not isinstance(control, str) or control in CONTROLS:
+        return control
+    needed = f"one of {', '.join(CONTROLS)}, or a .npy file of one array, is needed"
     try:
-        read_first_bytes(path)  # Raises an error if `path` is not a regular file.
+        read_first_bytes(control)  # Raises an error if `control` is not a regular file.
         # A memory map cannot be longer than the file, whatever size the header declares.
-        result = np.load(path, mmap_mode="r", allow_pickle=False)
+        result = np.load(control, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(
-            f"controls {path} cannot be read ({error}); one of {', '.join(CONTROLS)}, or a .npy file of one "
-            "array, is needed"
-        ) from None
+        raise InputError(f"controls {control} cannot be read ({error}); {needed}") from None
     if not isinstance(result, np.ndarray):
         result.close()
-        raise InputError(
-            f"controls {path}: it is an archive of several arrays; a .npy file of one array is needed"
-        )
+        raise InputError(f"controls {control}: it is an archive of several arrays; {needed}")
     return result
 
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import ast
 import functools
 import inspect
 import json
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,6 +20,7 @@ from lavender.problem import Problem
 from lavender.problem.derived import cached_property
 
 P = ParamSpec("P")
+CASE_NAME = re.compile(r"\s*(\w+)\s*(?:\(([^()]*)\))?\s*")
 MAX_SIZE = 10**7  # Larger integer parameters are rejected: they are typing errors and would fill the memory.
 
 
@@ -246,39 +247,23 @@ def parse_case_name(text: str) -> tuple[str, dict[str, Any]]:
     InputError
         The text is not a name with parameters in brackets.
     """
-    problem = InputError(
-        f"{text!r} is not a case; write a name with parameters, such as pyramid(k=10, mass_ratio=1e6)"
-    )
-    if not isinstance(text, str):
-        raise problem
-    try:
-        node = ast.parse(text.strip(), mode="eval").body
-    except (SyntaxError, ValueError, RecursionError, MemoryError):
-        raise problem from None
-    if isinstance(node, ast.Name):
-        return node.id, {}
-    if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Name) or node.args:
-        raise problem
-    values: dict[str, Any] = {}
-    for keyword in node.keywords:
-        if keyword.arg is None or keyword.arg in values:
-            raise problem
-        values[keyword.arg] = _evaluate_parameter(keyword.value, problem)
-    return node.func.id, values
+    match = CASE_NAME.fullmatch(text) if isinstance(text, str) else None
+    body = match[2] if match and match[2] and match[2].strip() else ""
+    parameters = [part.partition("=") for part in body.split(",")] if body else []
+    values = {name.strip(): _parse_value(value.strip()) for name, _, value in parameters}
+    if match is None or len(values) < len(parameters) or "" in values or None in values.values():
+        raise InputError(
+            f"{text!r} is not a case; write a name with parameters, such as pyramid(k=10, mass_ratio=1e6)"
+        )
+    return match[1], values
 
 
-def _evaluate_parameter(node: ast.expr, problem: InputError) -> Any:
-    """Evaluate a literal or a bare word of a parameter; raise `problem` for anything else."""
-    if isinstance(node, ast.Name):
-        return node.id
-    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
-        value = _evaluate_parameter(node.operand, problem)
-        if isinstance(value, (int, float)):
-            return -value
-    if (
-        isinstance(node, ast.Constant)
-        and isinstance(node.value, (int, float, str))
-        and not isinstance(node.value, bool)
-    ):
-        return node.value
-    raise problem
+def _parse_value(text: str) -> int | float | str | None:
+    """Return the number or the word of a parameter; None for another text."""
+    for convert in (int, float):
+        try:
+            return convert(text)
+        except ValueError:
+            pass
+    word = text.strip("'\"")
+    return word if word.isidentifier() else None

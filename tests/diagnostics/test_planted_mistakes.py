@@ -169,6 +169,14 @@ def test_diagnose_with_state_finds_every_planted_mistake(scenes):
                 assert count == total, (mistake, form)  # the state of the engine reveals every planted mistake
 
 
+@pytest.mark.parametrize("form", ["bodies", "J and M"])
+def test_velocity_of_gravity_without_dt_is_reported_without_the_state(scenes, form):
+    """21 of the 30 steps show it; in the others, bodies move, or few contacts are with a static body."""
+    step = scenes["stack 0 2"] if form == "bodies" else replace(scenes["stack 0 2"], rows=None)
+    wrong = MISTAKES["v* = v + a instead of v + dt a"](step)
+    assert kinds(step.problem) == set() and kinds(wrong.problem) == {"v_free"}
+
+
 @pytest.mark.parametrize("has_round_inertia", [True, False])
 def test_a_kinematic_tree_is_not_mistaken_for_rigid_bodies(scenes, has_round_inertia):
     """A base that hangs below its feet is no mistake if there are joints in between."""
