@@ -11,7 +11,7 @@ from lavender.base.errors import InputError
 from lavender.base.exits import EXIT_INFEASIBLE, EXIT_INTERRUPTED, EXIT_UNMET
 from lavender.cli.completion import complete_case_or_file, complete_solver
 from lavender.cli.options import PATH, limit_to_one_thread, print_escaped
-from lavender.io.stored import check_writable, format_json, write_atomically
+from lavender.io.stored import check_writable, format_json, write_arrays
 
 if TYPE_CHECKING:
     from lavender.judge.solution import Solution
@@ -65,17 +65,10 @@ def solve(file: str, solver: str, tol: float, output: Path | None, as_json: bool
         print_escaped(f"lavender: {solver}: {error}", err=True)
         raise click.exceptions.Exit(EXIT_UNMET) from None
     if output is not None:
-        import numpy as np
-
         results = {name: getattr(solution, name) for name in SAVED_FIELDS}
         results |= {name: getattr(solution.residual, name) for name in SAVED_RESIDUAL_FIELDS}
         results |= {"status": solution.status.name, "solver": solution.solver.name}
-
-        def write(part: Path) -> None:
-            with part.open("wb") as f:
-                np.savez(f, **results)
-
-        write_atomically(output, write)
+        write_arrays(output, results)
     if as_json:
         click.echo(format_json(_describe_solution(item.name, item.problem, solution), indent=1))
     else:

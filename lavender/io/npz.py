@@ -234,11 +234,12 @@ def _build_generalized(archive: Archive, names: list[str] | None) -> Generalized
     """Build the generalised form from its entries."""
     v_free = archive["general_v_free"]
     n, m = v_free.size, archive["b"].size
-    parts = "indptr", "indices", "data"
-    jac, mass = (
-        build_checked_csr(*(archive[f"general_{name}_{part}"] for part in parts), rows, n)
-        for name, rows in (("jac", m), ("mass", n))
-    )
+
+    def read(name: str, rows: int) -> sp.csr_array:
+        indptr, indices, data = (archive[f"general_{name}_{part}"] for part in ("indptr", "indices", "data"))
+        return build_checked_csr(indptr, indices, data, rows, n)
+
+    jac, mass = read("jac", m), read("mass", n)
     return Generalized(jac, mass, v_free, names)
 
 

@@ -5,7 +5,7 @@ from lavender import suite
 
 case = suite.pyramid(k=10, mass_ratio=1e6)
 case = suite.case("pyramid(k=10, mass_ratio=1e6)")      # the same by name
-case.problem, case.reason, case.reference, case.expect
+case.problem, case.reason, case.reference
 suite.families()                                        # every family with its parameters
 suite.cases("default"), suite.cases("@hard")            # sets, or a single name
 ```

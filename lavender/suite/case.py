@@ -73,8 +73,6 @@ class Case:
         Name of the function that builds the case.
     parameters : mapping
         Parameters of that function.
-    expect : str
-        Description of the result that solvers should have.
     solve_reference : callable, optional
         Computes the reference if it has a closed form.
     """
@@ -84,7 +82,6 @@ class Case:
     reason: str
     family: str
     parameters: Mapping[str, Any]
-    expect: str = ""
     solve_reference: Callable[[], Reference] | None = field(default=None, repr=False)
 
     @cached_property
@@ -115,7 +112,6 @@ class Draft:
     problem: Problem
     reason: str
     reference: Callable[[], Reference] | None = None
-    expect: str = ""
 
 
 @dataclass(frozen=True)
@@ -183,7 +179,6 @@ def register_family(**aliases: Mapping[str, Any]) -> Callable[[Callable[P, Draft
                 reason=draft.reason,
                 family=name,
                 parameters=MappingProxyType(values),
-                expect=draft.expect,
                 solve_reference=draft.reference,
             )
 

@@ -36,9 +36,6 @@ from lavender.suite.families import (
     multiply_in_index_order,
 )
 
-EXPECT_EXACT = "reaches the floor: newton, direct, auto"
-EXPECT_SWEEPS_STALL = "sweeps stall; " + EXPECT_EXACT
-
 SET = (
     # Mass ratios.
     *(f"stack(n=2, mass_ratio={r})" for r in ("100", "1e4", "1e6", "1e8")),
@@ -95,7 +92,7 @@ def big_box(mass_ratio: float = 400.0, friction: str = "none", sliding: float = 
     problem = build_contact_problem(
         bodies, place_corner_contacts(pairs, centre, 0.5), friction, FRICTION_COEFFICIENT
     )
-    return Draft(problem, "heavy on light with levers of ten metres", expect=EXPECT_SWEEPS_STALL)
+    return Draft(problem, "heavy on light with levers of ten metres")
 
 
 @register_family()
@@ -157,7 +154,6 @@ def four_bar(tilt: float = 0.3) -> Draft:
     return Draft(
         problem,
         "a closed loop off the axes: consistent but singular, so a plain factorisation meets a zero pivot",
-        expect="direct says that A is singular and still solves it",
     )
 
 
@@ -247,7 +243,6 @@ def diagonal(kind: str = "zero", n: int = 12) -> Draft:
         problem,
         f"{kind} diagonal entries: legal, but a sweep cannot divide by them",
         lambda: Reference(impulse, "built from it, in integers", "error"),
-        "solvers that do not accept it raise an error or report that they did not converge",
     )
 
 
@@ -340,22 +335,4 @@ def infeasible(kind: str = "squeeze") -> Draft:
         problem,
         "no impulse satisfies it: CONVERGED would be wrong, INFEASIBLE needs a proof",
         lambda: Reference(None, "A y = 0, b.y > 0", "nothing", certificate=proof),
-        "INFEASIBLE with a certificate, or another correct status than CONVERGED",
     )
-
-
-__all__ = [
-    "SET",
-    "big_box",
-    "degenerate_lcp",
-    "diagonal",
-    "duplicated",
-    "four_bar",
-    "infeasible",
-    "least_speeds",
-    "near_parallel",
-    "ring",
-    "slab",
-    "units",
-    "wedge",
-]

@@ -111,7 +111,10 @@ MISTAKES = {
 
 
 #: Mistakes of several numbers, with their count: any of these is named.
-INEXACT_PLACES = {"a normal of length 0": 3, "a tangent along the normal": 3, "two static bodies": 2}
+INEXACT_PLACES = {
+    **dict.fromkeys(("a normal of length 0", "a normal of length 2", "a tangent along the normal"), 3),
+    **dict.fromkeys(("an inertia below 0", "an inertia that is not symmetric"), 9), "two static bodies": 2,
+}  # fmt: skip
 ROWS = ("inv_mass", "inv_inertia", "contact_body", "normal", "tangent", "arm_a", "arm_b")
 
 

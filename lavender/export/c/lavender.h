@@ -220,7 +220,7 @@ LAV_API uint64_t lav_needed(const lav_solver *solver); /* bytes that the last `l
  * it was in before is the caller's again. */
 LAV_API int32_t lav_move(lav_solver *solver, void *memory, uint64_t bytes, lav_solver **out);
 /* The array or count that the last lav_set rejected, and the index of the invalid entry; null if it rejected none. Of a
- * normal or tangent that is no unit vector it is the largest entry: the contact is index / 3. */
+ * normal, tangent or inertia whose entries contradict each other, it is the first entry: the contact is index / 3. */
 LAV_API const char *lav_refused(const lav_solver *solver, int32_t *index);
 
 /* Set a problem. It starts from `impulse`, from stored impulses of blocks of the same key, kind and rows, or from Pi(0). */

@@ -137,14 +137,6 @@ uint64_t lav_hash(const double *x, int32_t n, uint64_t seed) { return hash_bytes
 
 /* -- checks of arguments ---------------------------------------------------------------------------------------------- */
 
-static int32_t are_finite(const double *x, int64_t n) {
-  double sum = 0.0; /* 0, or NaN if a number is not finite. */
-  int64_t i;
-  for (i = 0; i < n; i++) sum += 0.0 * x[i];
-  return sum == 0.0;
-}
-
-
 static int32_t check_counts(const lav_problem *q) {
   const int64_t m = q->n_rows, n = q->n_velocities;
   if (q->size != sizeof *q) return LAV_ERROR_VERSION;
@@ -274,23 +266,6 @@ static int32_t check_numbers(const double *x, int64_t n, int32_t is_needed, cons
   return i < 0 ? LAV_OK : refuse(at, LAV_ERROR_NUMBER, name, i);
 }
 
-/* Return the index of the largest of three numbers. */
-static int64_t find_largest(const double *x) {
-  const int64_t i = fabs(x[1]) > fabs(x[0]) ? 1 : 0;
-  return fabs(x[2]) > fabs(x[i]) ? 2 : i;
-}
-
-/* Return the first entry of an invalid inverse inertia that is negative on the diagonal, or differs from its mirror image. */
-static int64_t find_inertia_entry(const double *t) {
-  int64_t i, j;
-  for (i = 0; i < 3; i++)
-    if (t[4 * i] < 0.0) return 4 * i;
-  for (i = 0; i < 3; i++)
-    for (j = i + 1; j < 3; j++)
-      if (fabs(t[3 * i + j] - t[3 * j + i]) > ROUNDED * fabs(t[4 * i])) return 3 * i + j;
-  return 0;
-}
-
 #define OPTIONAL(name, n) GIVE_BACK(check_numbers(q->name, (n), 0, #name, at))
 #define NEEDED(name, n) GIVE_BACK(check_numbers(q->name, (n), 1, #name, at))
 
@@ -323,8 +298,7 @@ static int32_t check_bodies(const lav_problem *q, where_t *at) {
   switch (core_faults_find_body_fault(&r, &tolerances, &i)) {
     case core_faults_FAULT_MASS: return refuse(at, q->inv_mass[i] < 0.0 ? LAV_ERROR_MASS : LAV_ERROR_NUMBER, "inv_mass", i);
     case core_faults_FAULT_INERTIA_SIZE: return refuse(at, LAV_ERROR_NUMBER, "inv_inertia", 9 * i);
-    case core_faults_FAULT_INERTIA:
-      return refuse(at, LAV_ERROR_MASS, "inv_inertia", 9 * i + find_inertia_entry(q->inv_inertia + 9 * i));
+    case core_faults_FAULT_INERTIA: return refuse(at, LAV_ERROR_MASS, "inv_inertia", 9 * i);
     case core_faults_FAULT_JOINT_BODY: return refuse(at, LAV_ERROR_INDEX, "joint_body", i);
     case core_faults_FAULT_JOINT_PAIR: return refuse(at, LAV_ERROR_PAIR, "joint_body", 2 * i);
     case core_faults_FAULT_CONTACT_BODY: return refuse(at, LAV_ERROR_INDEX, "contact_body", i);
@@ -332,7 +306,7 @@ static int32_t check_bodies(const lav_problem *q, where_t *at) {
     case core_faults_FAULT_FRAME:
       length = core_rows_dot3(q->normal + 3 * i, q->normal + 3 * i);
       vector = fabs(sqrt(length) - 1.0) <= ROUNDED ? "tangent" : "normal";
-      return refuse(at, LAV_ERROR_FRAME, vector, 3 * i + find_largest((vector[0] == 'n' ? q->normal : q->tangent) + 3 * i));
+      return refuse(at, LAV_ERROR_FRAME, vector, 3 * i);
   }
   return LAV_OK;
 }

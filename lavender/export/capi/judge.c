@@ -139,7 +139,7 @@ int32_t lav_motion_error(lav_solver *solver, const double *impulse, const double
   if (n != s->p.n_rows) return leave(s, LAV_ERROR_COUNT);
   if (!out || ((!impulse || !reference) && n > 0)) return leave(s, LAV_ERROR_NULL);
   if (out->size != sizeof *out) return leave(s, LAV_ERROR_VERSION);
-  if (n > 0 && (!are_finite(impulse, n) || !are_finite(reference, n))) return leave(s, LAV_ERROR_NUMBER);
+  if (n > 0 && (core_validate_find_invalid_number(impulse, n) >= 0 || core_validate_find_invalid_number(reference, n) >= 0)) return leave(s, LAV_ERROR_NUMBER);
   memset(&found, 0, sizeof found);
   found.size = out->size;
   found.row = found.body = -1;
