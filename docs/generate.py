@@ -462,16 +462,6 @@ def load_engine_facts():
     return load_facts()
 
 
-def tabulate_facts():
-    """Return the table of docs/engines.md: facts about the engines of that page, and their handling."""
-    rows = [
-        (f.engine, f.subject, f.text, f.handling)
-        for f in load_engine_facts()
-        if f.handling and f.engine in ("newton", "MuJoCo Warp", "Genesis")
-    ]
-    return table(("engine", "subject", "fact", "in lavender"), rows)
-
-
 def engine_arrays_page(site):
     """Write the page of all facts about engines."""
     parts = [
@@ -671,8 +661,8 @@ def tabulate_scenes():
     for name, build in SCENES.items():
         if build.__module__ != "lavender.sim.scene.gallery":  # a scene of a user or of a doctest
             continue
-        text = " ".join(docstrings.markdown(build.__doc__).replace("|", "\\|").split())
-        lines.append(f"| `{name}({_signature(build, ('scene',))})` | {text} |")
+        text = docstrings.markdown(build.__doc__).partition("\n\n")[0].replace("|", "\\|")
+        lines.append(f"| `{name}({_signature(build, ('scene',))})` | {' '.join(text.split())} |")
     return "\n".join(lines)
 
 
@@ -768,10 +758,8 @@ def write(source, cache):
 def committed_pages():
     """Return the texts of the pages that are checked in, by file name."""
     pages = {"solvers.md": solver_overview()}
-    tables = {"scenes": tabulate_scenes, "engine_facts": tabulate_facts}
-    for name, place in (("engine.md", "scenes"), ("engines.md", "engine_facts")):
-        text = (Path(__file__).resolve().parent / name).read_text(encoding="utf-8")
-        pages[name] = fill_tables(text, {place: tables[place]()})
+    text = (Path(__file__).resolve().parent / "engine.md").read_text(encoding="utf-8")
+    pages["engine.md"] = fill_tables(text, {"scenes": tabulate_scenes()})
     return {name: text.rstrip() + "\n" for name, text in pages.items()}
 
 
