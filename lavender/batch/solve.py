@@ -199,6 +199,8 @@ class Solutions(WorldResults, Sequence[Solution]):
 
     def store_solution(self, i: int, solution: Solution) -> None:
         """Store the solution of a world that a single call solved."""
+        if self.velocity_tol is not None:
+            solution = accept_velocity(solution, self.velocity_tol)
         self._solutions[i] = solution
         self._impulse[self._get_rows(i)] = solution.impulse
         self._store_residual(i, solution.residual)
