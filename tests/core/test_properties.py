@@ -10,12 +10,14 @@ from calls import installed
 from random_problems import random_bodies_and_contacts, random_contact_problem, spd
 
 import lavender as lv
+from lavender.base import deadline
+from lavender.external.forms import get_program
 from lavender.external.running import classify_status
 from lavender.judge.certificates import check_certificate
 from lavender.problem.cones import project_impulse
 from lavender.solvers.islands import find_islands, get_rows_of_blocks, restrict_to_blocks
 from lavender.solvers.polyhedral import convert_to_bounded_rows
-from lavender.solving import loop
+from lavender.solving import log, loop
 from lavender_ext.judge.measure import is_residual_at_floor
 
 # -- many worlds -------------------------------------------------------------------------------------------------------
@@ -209,6 +211,20 @@ def test_classify_status_of_a_backend_wording_is_never_more_certain(text, status
     assert classify_status(text) is lv.Status[status]
 
 
+def test_program_rows_below_the_infinite_size_are_kept_and_their_multipliers_return():
+    program = {"A": [[1.0, 1.0, 0.0]], "b": [1.0], "G": np.ones((4, 3)), "h": [1.0, 5e19, 1e20, np.inf]}
+    problem = lv.Problem.from_qp(np.eye(3), np.ones(3), **program, lb=[-1.0, 0.5, -np.inf], ub=[np.inf, 0.5, 2.0])
+    qp = problem.qp
+    assert len(qp.target) == 2 + 2 + 2  # two equations, of which one has equal bounds, two rows of G, two bounds
+    scaled = get_program(qp).scaled
+    lam = np.arange(1.0, len(qp.target) + 1.0)
+    np.testing.assert_array_equal(scaled.join_multipliers(*scaled.split_multipliers(lam)), lam)
+    x, y = np.array([0.3, 0.5, -0.2]), lam
+    convex = get_program(qp)
+    for found, expected in zip(convex.restore_point(*convex.scale_point(x, y)), (x, y), strict=True):
+        np.testing.assert_array_equal(found, expected)
+
+
 # -- the best answer ---------------------------------------------------------------------------------------------------
 
 
@@ -265,16 +281,19 @@ def test_residual_of_ellipses_has_row_errors_in_the_metric_of_the_disk():
 
 def test_solution_history_and_time_exclude_the_judge(monkeypatch):
     """The judge takes 1 s of a clock that nothing else moves."""
-    now, judge = [0.0], loop.residual
+    now, judge = [0.0], lv.residual
 
     def judge_slowly(*given):
         now[0] += 1.0
         return judge(*given)
 
-    monkeypatch.setattr(loop, "perf_counter", lambda: now[0])
-    monkeypatch.setattr(loop, "residual", judge_slowly)
+    for module in (loop, log):
+        monkeypatch.setattr(module, "residual", judge_slowly)
+    for module in (loop, deadline):
+        monkeypatch.setattr(module, "perf_counter", lambda: now[0])
     problem = random_contact_problem(0)
-    assert lv.solve(problem, "auto", history=True, tol=1e-9).solve_time < 0.5
+    solution = lv.solve(problem, "auto", history=True, tol=1e-9)
+    assert now[0] > 0.0 and solution.history.time.max() == solution.solve_time == 0.0
     for name in lv.available(problem, history=True, callback=True):
         seen = []
         more = {"history": True, "callback": lambda k, x, r: seen.append((k, r.relative, r.energy, r.velocity))}  # noqa: B023
