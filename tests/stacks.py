@@ -15,10 +15,6 @@ def stack(n=6, name="stack", **more):
     return lv.Problem.lcp(p.matrix, np.linspace(1.0, -0.2, n), name=name, **more)
 
 
-def idle_problem():
-    return lv.Problem.lcp(np.eye(3), [-1.0, -2.0, -1.0], name="flying apart")
-
-
 def moving_stack(steps, n=10):
     """A stack whose load changes slowly, as in consecutive steps."""
     p = stack(n)

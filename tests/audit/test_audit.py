@@ -1,7 +1,6 @@
 """Every step of many worlds judged: MuJoCo's own answers, which stopped before convergence, and the worst states."""
 
 import io
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ import lavender as lv
 from lavender.audit import audit as module
 from lavender.audit.audit import audit
 from lavender.audit.pieces import AUDIT_VERDICTS
-from lavender.audit.simulated_worlds import Frame, Runs
+from lavender.audit.simulated_worlds import Frame
 from lavender.io.efc import from_efc
 from lavender.io.start_states import read_states
 
@@ -52,23 +51,6 @@ def test_numbers_equal_the_judge_on_each_step(boxes, options):
             r.verdict in ("stopped before convergence", "wrong") for r in want
         ]
     assert found.is_unconverged.any()
-
-
-def test_without_a_number_as_many_worlds_are_judged_as_fit_in_the_duration(boxes, monkeypatch):
-    monkeypatch.setattr(module, "DEFAULT_DURATION", 0.5)
-    events = []
-    found = audit(boxes(EARLY), steps=20, workers=1, watch=events.append)
-    assert 1 <= found.runs.worlds <= module.MAX_DEFAULT_WORLDS and found.n_judged == 20 * found.runs.worlds
-    first = next(i for i, event in enumerate(events) if event.total)
-    assert [event.case for event in events[:first]] == [
-        "judging one world: 1 step",
-        "judging one world: 20 steps",
-        "judging one world: 20 steps",
-        "simulating trial worlds to choose the spread",
-    ]
-    assert events[-1].done == events[-1].total == 20 * found.runs.worlds
-    same = audit(boxes(EARLY), worlds=found.runs.worlds, steps=20, workers=1)
-    assert same.numbers.tobytes() == found.numbers.tobytes()
 
 
 def test_workers_change_no_bit(boxes, monkeypatch):
@@ -147,20 +129,6 @@ def test_a_world_of_another_engine_that_diverges_does_not_end_the_audit(boxes, m
     assert "1 world diverged, in step 4 at the earliest; 6 steps not judged" in words_of(found)
 
 
-def test_ctrl_c_keeps_what_there_is(boxes, tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "STEPS_PER_TASK", 20)
-
-    def watch(event):
-        if event.done:
-            raise KeyboardInterrupt
-
-    found = audit(boxes(EARLY), worlds=3, steps=20, workers=1, watch=watch)
-    assert found.is_stopped and found.n_processed == 20
-    assert np.isnan(found.numbers[:, 1:]).all()
-    found.write(tmp_path / "out")
-    assert "Stopped before the end" in found.page.write(tmp_path / "out").read_text()
-
-
 @pytest.mark.parametrize(
     ("worlds", "phase", "shape", "judged"),
     [
@@ -193,18 +161,6 @@ def test_ctrl_c_before_the_first_step_is_raised(boxes):
 
     with pytest.raises(KeyboardInterrupt):
         audit(boxes(EARLY), worlds=3, steps=25, workers=1, watch=watch)
-
-
-def test_an_engine_of_joint_worlds_is_shown_as_compiling_until_its_first_step(boxes, monkeypatch):
-    events = []
-
-    def compile_without_end(engine, runs, njmax=None):
-        assert events[-1].case == "compiling mjx"
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(module, "iterate_frames", compile_without_end)
-    with pytest.raises(KeyboardInterrupt):  # The steps of MuJoCo that were timed are no result of MJX.
-        audit(boxes(EARLY), worlds=2, steps=10, engine="mjx", watch=events.append)
 
 
 def test_what_is_close_enough_may_still_not_be_accepted(boxes):
@@ -269,14 +225,6 @@ def test_a_world_that_diverges_in_its_last_step_is_counted(tmp_path, monkeypatch
     assert audit("runaway.xml", worlds=1, steps=steps - 1, workers=1, spread=0.0).n_diverged == 0
 
 
-def test_shares_are_never_rounded_to_nothing(boxes):
-    found = audit(boxes(), worlds=1, steps=3, workers=1)
-    verdict = np.zeros((10, 320), np.int8)
-    verdict[0, 0] = AUDIT_VERDICTS.index("stopped before convergence")
-    many = replace(found, verdict=verdict, numbers=np.zeros((4, 10, 320)), rows=verdict, contacts=verdict + 1)
-    assert "1 of 3200 steps judged in 10 worlds stopped before convergence (0.03 %)" in words_of(many)
-
-
 def test_rows_and_contacts_are_those_of_the_run(boxes):
     path = boxes()
     found = audit(path, worlds=2, steps=60, workers=1)
@@ -314,29 +262,6 @@ def test_an_audit_starts_again_from_the_states_of_an_audit(boxes, tmp_path, name
     # The fourth world starts from the first state with other velocities.
     assert [w.velocity for w in found.worst] == again.numbers[0, :3, 0].tolist()
     assert again.numbers[0, 3, 0] != again.numbers[0, 0, 0]
-
-
-@pytest.mark.parametrize(
-    ("names", "words"),
-    [
-        (("qpos", "qvel"), "have no warm start and no controls: the first solve of each world starts cold and the"),
-        (("qpos", "qvel", "ctrl"), "have no warm start: the first solve of each world starts cold. The first step"),
-        (("qpos", "qvel", "qacc_warmstart"), "have no controls: the first step uses the controls of"),
-        (("state",), ""),
-        (("qpos", "qvel", "ctrl", "qacc_warmstart"), ""),
-    ],
-)
-def test_states_without_warm_start_or_controls_are_warned_of(boxes, names, words):
-    path = boxes(EARLY)
-    worst = audit(path, worlds=3, steps=25, workers=1).worst
-    states = {name: np.array([w.state[name] for w in worst]) for name in names}
-    found = audit(path, worlds=2, steps=1, workers=1, states=states)  # two of three states are selected
-    notes = [note for note in found.notes if note.startswith("The start states")]
-    assert len(notes) == bool(words) and words in "".join(notes)
-    same = [w.velocity for w in worst][:1] == found.numbers[0, :1, 0].tolist()
-    if "no controls: " not in words:  # The worst row does not depend on the controls.
-        assert same == (not words)
-    assert not any("start states" in note for note in audit(path, worlds=1, steps=1, workers=1).notes)
 
 
 def test_physics_vectors_are_states_without_warm_start_and_controls(boxes):
@@ -413,42 +338,6 @@ def test_mujoco_s_own_warnings_are_counted_and_not_printed(boxes, monkeypatch, t
     assert not audit(boxes(), worlds=1, steps=5, workers=1).engine_warnings
 
 
-def test_audit_of_a_file_without_a_model_names_the_file(tmp_path):
-    (tmp_path / "torn.xml").write_text("<mujoco><worldbody>")
-    with pytest.raises(lv.InputError, match=r"torn\.xml"):
-        audit(tmp_path / "torn.xml", worlds=1, steps=2)
-
-
-@pytest.mark.parametrize(("engine", "package"), [("mjx", "mujoco.mjx"), ("mujoco_warp", "mujoco_warp")])
-def test_an_engine_that_is_not_installed_says_how(boxes, engine, package, monkeypatch):
-    import sys
-
-    for name in (package, "jax", "warp"):
-        monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(lv.InputError, match="pip install mujoco-"):
-        audit(boxes(), worlds=1, steps=2, engine=engine)
-
-
-@pytest.mark.parametrize("options", ['solver="Newton"', 'solver="Newton" cone="elliptic"'])
-@pytest.mark.parametrize(("engine", "package"), [("mjx", "mujoco.mjx"), ("mujoco_warp", "mujoco_warp")])
-@pytest.mark.filterwarnings("ignore")
-def test_other_engines_pose_the_problem_that_mujoco_poses(boxes, engine, package, options):
-    pytest.importorskip(package, reason="needs the engine")
-    path = str(boxes(options + ' iterations="100" ls_iterations="50"'))
-    (frame,) = list(module.iterate_frames(engine, Runs.of_model(path, 2, 1)))
-    made = mj.MjModel.from_xml_path(path)
-    for world in range(2):
-        data = mj.MjData(made)
-        for name in ("qpos", "qvel", "ctrl", "qacc_warmstart"):
-            getattr(data, name)[:] = frame.state[name][world]
-        mj.mj_forward(made, data)
-        want = lv.io.from_mujoco(made, data)
-        moved = want.velocity(lv.solve(want, tol=1e-9).impulse)
-        own = frame.batch[world]
-        np.testing.assert_allclose(own.velocity(lv.solve(own, tol=1e-6).impulse), moved, atol=2e-3)
-        assert any("floor" in name for name in frame.batch.names_of(world))
-
-
 SLEEPING = BOXES.format(options="").replace("<worldbody>", '<option><flag sleep="enable"/></option><worldbody>')
 
 
@@ -492,15 +381,6 @@ def fragile(tmp_path, monkeypatch):
     path = tmp_path / "fragile.xml"
     path.write_text(FRAGILE)
     return path
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_audit_of_worlds_that_diverge_by_their_random_velocities_blames_these(fragile):
-    found = audit(fragile, worlds=9, steps=50, workers=1, spread=0.5)
-    assert found.n_diverged > 2 and 0 not in [d.world for d in found.divergences]
-    assert "World 0, which starts without random velocities, did not diverge" in words_of(found)
-    assert f"{found.divergences[0].world}, " in words_of(found)
-    assert "--spread 0" in words_of(found) and "outside the constraint" not in words_of(found)
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -567,19 +447,3 @@ def test_audit_counts_each_verdict_once(boxes):
     assert found.worst_rows["steps"].sum() == unconverged + wrong
     assert (found.totals["unconverged"], found.totals["wrong"]) == (unconverged + wrong, wrong)
     assert len(found.headline) <= 3
-
-
-def test_audit_by_mjx_names_the_settings_that_mjx_ignores(tmp_path):
-    path = tmp_path / "conveyor.xml"
-    path.write_text(
-        """<mujoco><option noslip_iterations="3"/><worldbody><geom type="plane" size="1 1 1" surfacevel="1 0 0 0 0 0"/>
-        <body><joint name="j" type="slide"/><geom size=".1" mass="1"/></body></worldbody>
-        <actuator><motor joint="j" delay="0.01" nsample="9"/></actuator></mujoco>"""
-    )
-    if not hasattr(mj.MjModel.from_xml_path(str(path)), "actuator_delay"):
-        pytest.skip("this MuJoCo has neither moving surfaces nor delays")
-    runs = Runs.of_model(path, 1, 1)
-    assert runs.with_ignored_settings("mujoco").notes == ()
-    (note,) = runs.with_ignored_settings("mjx").notes
-    assert note.endswith("noslip_iterations, surfacevel of geoms, delay of actuators.")
-    assert Runs.of_model(path_without_sleep(tmp_path), 1, 1).with_ignored_settings("mjx").notes == ()

@@ -1,6 +1,5 @@
 """Settings of MuJoCo: what is measured, what is chosen, and the line to copy."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -36,13 +35,6 @@ def test_the_own_setting_is_measured_as_it_ran_and_worlds_are_held_back(boxes, m
     assert best.worst_error < 1e-6 < found.present_result.worst_error
     assert best.worst_motion < 1e-6 < found.present_result.worst_motion
     assert all(m.mean_step_time > 0.0 for m in found.measured)
-
-
-def test_a_model_without_actuators_has_settings_too(tmp_path, monkeypatch):
-    fewer(monkeypatch)
-    path = tmp_path / "passive.xml"
-    path.write_text(BOXES.format(options="").partition("<actuator>")[0] + "</mujoco>")
-    assert len(tune(path, worlds=2, steps=20, repeats=1).measured) > 1
 
 
 def test_the_converged_run_does_not_move_away_from_itself(boxes):
@@ -119,16 +111,6 @@ def test_errors_on_the_worlds_held_back_do_not_change_the_choice():
         after = replace(before, held=held, held_errors={m.setting: float(m.error.max()) for m in held})
         assert (after.faster, after.closer) == (before.faster, before.closer) == (first, first)
         assert not any("not measured" in line for line in after.lines)
-
-
-def test_headline_gain_is_the_one_on_the_worlds_held_back():
-    now, exact = measured(10.0, 61e-3), measured(10.0, 1e-3, tolerance=1e-9)
-    assert "less" not in chosen(now, exact).headline[-1]
-    held = [measured(10.0, 9e-3), replace(exact, error=np.full(100, 1e-3))]
-    head = chosen(now, exact, held=held).headline[-1]
-    assert "In the same time the error can be 9.0 times less on worlds that were held back" in head
-    worse = [measured(10.0, 1e-3), replace(exact, error=np.full(100, 2e-3))]
-    assert "No setting is as fast and more accurate" in chosen(now, exact, held=worse).headline[-1]
 
 
 def test_of_equally_fast_settings_the_largest_iteration_limit_is_recommended():
@@ -224,39 +206,6 @@ def test_noise_is_no_gain_and_what_is_within_the_threshold_is_enough():
     assert chosen(now, astray).faster is None
 
 
-def test_a_gain_that_the_held_back_worlds_do_not_have_is_told_as_none():
-    now, quick, exact = (measured(10.0, 1e-3), measured(8.0, 1e-3, iterations=9), measured(10.0, 1e-5, tolerance=1e-9))
-    # Times within 5 % are equal: no gain.
-    for time, error, refuted in ((7.0, 1e-5, False), (9.8, 1e-3, True), (11.0, 2e-3, True)):
-        held = [now, measured(time, 1e-3, iterations=9), measured(10.0, error, tolerance=1e-9)]
-        lines = [line for line in chosen(now, quick, exact, held=held).lines if "<option" in line]
-        assert len(lines) == 2
-        assert all(("not on the worlds held back" in line) == refuted for line in lines)
-
-
-@pytest.mark.parametrize("how", [{"stopped": True}, {"busy": "The machine was busy: load 9.0"}])
-def test_lines_of_an_interrupted_or_busy_measurement_are_marked(how, tmp_path):
-    now, quick = measured(10.0, 1e-3), measured(8.0, 1e-3, iterations=9)
-    found = replace(chosen(now, quick), **how)
-    assert found.lines[0].startswith('<option iterations="9"/>  <!-- PROVISIONAL, the m')
-    page = html_of(found, tmp_path)
-    assert "Provisional lines" in page and "Lines to copy" not in page and "measure again" in page
-    assert "PROVISIONAL" not in chosen(now, quick).lines[0]
-    none = replace(chosen(now), **how)
-    assert none.lines[0].startswith("PROVISIONAL, the m") and "none of 1 settings" in none.lines[0]
-
-
-def test_a_busy_machine_invalidates_the_times(boxes, monkeypatch):
-    fewer(monkeypatch)
-    cores = sweep.os.cpu_count()
-    monkeypatch.setattr(sweep.machine, "count_runnable_processes", lambda: cores + 2.0)
-    (note,) = tune(boxes(EARLY), worlds=2, steps=10, repeats=1).page.notes
-    assert f"The machine was busy: load {cores + 2:.1f} on {cores} core" in note
-    assert "The times are invalid" in note
-    monkeypatch.setattr(sweep.machine, "count_runnable_processes", lambda: 1.0)
-    assert not tune(boxes(EARLY), worlds=2, steps=10, repeats=1).busy
-
-
 def test_ctrl_c_keeps_what_there_is(boxes, monkeypatch, tmp_path):
     fewer(monkeypatch)
 
@@ -293,25 +242,6 @@ def test_ctrl_c_before_the_first_round_returns_the_present_setting(boxes, monkey
         assert found.stopped and [m.setting.options for m in found.measured] == [()]
         assert len(found.measured[0].error) == n_steps and not found.held
         assert "Stopped before the end" in html_of(found, tmp_path)
-
-
-def test_worlds_are_simulated_with_a_label_and_without_a_count(boxes, monkeypatch):
-    fewer(monkeypatch)
-
-    def stop(event):
-        assert (event.done, event.total, event.case) == (0, 0, "simulating the worlds")
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        tune(boxes(EARLY), worlds=2, steps=10, watch=stop)
-
-
-@pytest.mark.parametrize(
-    ("given", "words"), [({"worlds": 1}, "worlds"), ({"steps": 15}, "horizon"), ({"repeats": 0}, "repeats")]
-)
-def test_bad_words_are_told(boxes, given, words):
-    with pytest.raises(lv.InputError, match=words):
-        tune(boxes(), **{"worlds": 2, "steps": 20} | given)
 
 
 def test_a_setting_with_which_mujoco_ends_in_an_error_is_left_out(boxes, monkeypatch):
@@ -360,16 +290,3 @@ def test_an_interrupted_tuning_reuses_the_settings_judged(boxes, monkeypatch, tm
                 assert (other.error == m.error).all() and (other.motion == m.motion).all()
     # Another model or parameter is not reused.
     assert not any("reused" in note for note in tune(path, **same | {"seed": 3}).notes)
-
-
-def test_numbers_of_a_tuning_are_json_if_a_setting_diverges_on_the_worlds_held_back(tmp_path):
-    now, quick = measured(10.0, 1e-3), measured(8.0, 1e-3, iterations=9)
-    diverged = replace(quick, error=np.full(1, np.inf), motion=np.full(1, np.inf), times=np.full(1, np.inf))
-    found = chosen(now, quick, held=[now, diverged])
-    found.page.write(tmp_path)
-
-    def reject(word):
-        raise AssertionError(word)
-
-    numbers = json.loads((tmp_path / "numbers.json").read_text(), parse_constant=reject)
-    assert numbers["held"][1]["error"] is None

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-from click.testing import CliRunner
 
 import lavender as lv
 from benchmarks import derivatives
@@ -40,11 +39,3 @@ def test_a_direction_that_is_refused_is_flagged():
     found = derivatives.compared("made", twice)
     assert found.flagged == "refused" and np.isnan(found.off)
     assert "| linear | matrix | 1 | 100.0% | 1 | 0 | 0 of 0 | 0 of 0 |" in derivatives.agreement([found])
-
-
-def test_the_command_prints_both_tables():
-    found = CliRunner().invoke(derivatives.command, ["--draws", "2", "--only", "costs"])
-    assert found.exit_code == 0, found.output
-    assert "| source | rows | problems | `newton` [us] |" in found.output
-    line = derivatives.cost("made", suite.case("stack(n=6)").problem, repeats=1)
-    assert min(line.solve, line.first, line.more) > 0.0

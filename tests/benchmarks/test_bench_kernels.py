@@ -1,13 +1,10 @@
 """Kernels and steps timed: bare loops do the same work, figures are consistent, commands print and write them."""
 
-import time
-
 import numpy as np
 import pytest
 
 import lavender as lv
 from benchmarks import core_problems
-from benchmarks.clock import least
 from benchmarks.kernels import microbenchmarks, problems
 from benchmarks.kernels.cases import job, run
 from benchmarks.kernels.command import table
@@ -47,13 +44,6 @@ def test_the_pile_stands_where_it_says():
     assert not np.array_equal(given.rows.contact_body, shuffled.rows.contact_body)
     with pytest.raises(lv.InputError, match="at least 1"):
         core_problems.lattice_pile(0)
-
-
-def test_least_is_the_least_of_many(monkeypatch):
-    clock = iter([0, 5_000, 0, 3_000, 0, 9_000])  # ns; a call of 2 ms is a batch of its own
-    monkeypatch.setattr("benchmarks.clock.process_time_ns", lambda: next(clock))
-    found = least(lambda: time.sleep(0.002), seconds=0.0)
-    assert found == [pytest.approx(3e-6)]
 
 
 @pytest.mark.parametrize("case", ["impulses", "pgs-tridiagonal", "block", "solve-8", "engine-box"])

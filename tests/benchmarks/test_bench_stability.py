@@ -2,12 +2,10 @@
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from worked import after
 
 import lavender as lv
-from benchmarks import stability
-from benchmarks.stability import command, critical_gain, model, modes, slowest
+from benchmarks.stability import critical_gain, model, modes, slowest
 
 H = 1 / 60
 
@@ -62,12 +60,3 @@ def test_the_model_rings_with_root_rho_and_is_driven_above_kappa():
         z = np.abs(model(kappa, 0.0))
         np.testing.assert_allclose(np.sort(z), np.sort([1.0, *[np.sqrt(1 - kappa)] * 2]), atol=1e-6)
         assert np.abs(model(kappa, 0.5 * kappa)).max() < 1.0 < np.abs(model(kappa, 2.0 * kappa)).max()
-
-
-def test_the_command_prints_its_table_and_draws(tmp_path, monkeypatch):
-    for towers in ("TOWERS", "TALL"):
-        monkeypatch.setattr(stability, towers, ((2, 4), (3, 4)))
-    path = tmp_path / "figure.png"
-    done = CliRunner().invoke(command, ["--figure", str(path)], catch_exceptions=False)
-    assert done.exit_code == 0 and "| 3 | 4 | alternating |" in done.output
-    assert path.read_bytes().startswith(b"\x89PNG")

@@ -14,9 +14,7 @@ import pytest
 import benchmarks
 import lavender as lv
 from benchmarks.peers import adapters
-from lavender import registry, suite
-from lavender.external.backend import Backend
-from lavender.external.backends import BACKENDS
+from lavender import suite
 
 CASES = ("two_particles", "box_stack(n=2)", "chain(n=4)", "box_stack(n=2, friction=cone)", "box_stackF(n=2)")
 # The loosest third of the settings reach this residual on problems of a few rows.
@@ -64,29 +62,4 @@ def test_every_module_of_the_benchmarks_can_be_imported(name, monkeypatch):
 
 def test_each_solver_of_lavender_runs(problems):
     for contestant in adapters.ours():
-        assert run_once(contestant, problems) < CLOSE, contestant.name
-
-
-def test_each_qp_backend_runs_or_its_stand_in(problems, monkeypatch):
-    """A backend that is not installed gets the answer of Clarabel to the program that the adapter made for it."""
-    pytest.importorskip("clarabel", reason="the stand-in of other backends (extra: qp)")
-    is_absent = {b.name: registry.specs()[b.name].missing() is not None for b in BACKENDS}
-    assert not is_absent["clarabel"]
-    for backend in BACKENDS:
-        for module in backend.modules if is_absent[backend.name] else ():
-            # Two backends share a module, which the first has replaced already.
-            if module not in sys.modules and importlib.util.find_spec(module) is None:
-                monkeypatch.setitem(sys.modules, module, MagicMock())  # Its calls are timed.
-    clarabel, own = next(b for b in BACKENDS if b.name == "clarabel"), Backend.run
-
-    def run(self, qp, impulse, limit, settings):
-        assert not settings
-        return own(clarabel if is_absent[self.name] else self, qp, impulse, limit, settings)
-
-    monkeypatch.setattr(Backend, "run", run)
-    monkeypatch.setattr(type(registry.get("clarabel")), "missing", lambda _: None)
-    monkeypatch.setattr(adapters, "is_installed", lambda name: False)
-    contestants = adapters.contestants()
-    assert len(contestants) >= 2 * len(BACKENDS)
-    for contestant in contestants:
         assert run_once(contestant, problems) < CLOSE, contestant.name

@@ -17,7 +17,7 @@ from stacks import stack
 from worked import python
 
 import lavender as lv
-from lavender import cli, io, registry, report
+from lavender import cli, io, report
 from lavender.cli import entry
 from lavender.report.store import select_skips
 
@@ -34,23 +34,6 @@ def test_a_contradicted_claim_is_marked(lavender, path, plug_in):
     code, out, _ = lavender("check", path, "--solvers", "liar")
     assert code == 1
     assert "claim contradicted" in out and "1 claims are contradicted" in out
-
-
-def test_check_ends_each_solver_at_its_time_limit(lavender):
-    code, out, _ = lavender("check", "granularF(n=3)", "--solvers", "pgs", "newton", "--time-limit", "1e-9")
-    assert code == cli.EXIT_UNMET and "2 of the solves did not solve their problem" in out
-    assert out.count("TIME_LIMIT") == 2
-
-
-def test_check_states_once_why_problems_have_no_reference(lavender):
-    code, out, _ = lavender("check", "granularF(n=3)", "granularF(n=4)", "--solvers", "newton")
-    assert code == 0 and out.count("no reference: Coulomb friction") == 1 and out.count("granularF(n=4) (coulomb)") == 1
-
-
-def test_a_problem_that_none_of_the_solvers_takes_is_not_checked(lavender):
-    code, out, _ = lavender("check", "granularF(n=3)", "--solvers", "sor")
-    assert code == cli.EXIT_UNMET and "1 problem not accepted by any of these solvers" in out
-    assert lavender("check", "granularF(n=3)", "--solvers", "sor", "newton")[0] == 0
 
 
 def test_contract_checks_a_solver_and_explains_what_it_does_not_meet(lavender, plug_in, tmp_path):
@@ -122,90 +105,6 @@ def test_solve_prints_one_line_and_writes_the_answer(lavender, path, tmp_path):
         assert str(answer["status"]) == "CONVERGED"
 
 
-def test_solvers_lists_all_with_reasons(lavender):
-    code, out, _ = lavender("solvers")
-    assert code == 0
-    for name, spec in registry.specs().items():
-        assert name in out
-        assert spec.missing() is None or "pip install" in out
-    lines = out.splitlines()
-    place = {line.split()[0]: i for i, line in enumerate(lines) if line.strip()}
-    reasons = registry.known()
-    here = [place[n] for n, reason in reasons.items() if reason is None]
-    away = [place[n] for n, reason in reasons.items() if reason is not None]
-    assert max(here) < min(away, default=len(lines)), "those that are here come first"
-
-
-@pytest.mark.parametrize(
-    ("words", "sign"),
-    [
-        (("report", "--solvers", "pgz"), "did you mean 'pgs'"),
-        (("report", "no/such.npz"), "no such file"),
-        (("report", "stak(n=8)"), "did you mean"),
-        (("report", "--tolerances", "0"), "tolerance is 0;"),
-        (("report", "a.jsonl", "b.npz"), "cannot be combined with problems"),
-        (("report", "missing.jsonl"), "cannot read"),
-        (("solve", "stack(n=4)", "--solver", "nobody"), "unknown solver 'nobody'"),
-        (("solve", "stack(n=4)", "--solver", "direct", "--order", "reverse"), "order"),
-        (("solve", "stack(n=4)", "--solver", "pgs", "--output", "no/such/folder.npz"), "cannot write"),
-        (("check", "nothing.npz"), "no such file"),
-        (("report", "--tolerances", "many"), "not a list of numbers"),
-        (("report", "--time-budgets", "0"), "time budget 0.0 is not positive"),
-        (("report", "stack(n=4)", "--list"), "has no effect with --list"),
-        (("cases",), "unknown command 'cases'"),
-        (("report", "stack(n=4)", "--steps", "3"), "--steps has no effect without a MODEL.xml"),
-        (
-            ("report", "stack(n=4)", "--sequence-time-limit", "3"),
-            "--sequence-time-limit has no effect without a sequence",
-        ),
-        (("report", "stack(n=4)", "--solvers", "direct", "--budgets", "3"), "--budgets has no effect"),
-        (("report", "stack(n=4)", "--solvers", "direct", "--orders", "reverse"), "--orders has no effect"),
-        (("report", "--workers", "1", "--time-limit", "3"), "--time-limit has no effect with --workers"),
-        (("report", "a.jsonl", "--tolerances", "1e-3"), "--tolerances has no effect if records are shown again"),
-        (("report", "stack(n=4)", "--solvers", "pgs", "--memory", "3"), "--memory has no effect"),
-        (("run", "stack", "--replace"), "--replace has no effect without --record"),
-        (("record", "a.xml", "--out", "o", "--seed", "3", "--controls", "zero"), "without --controls random"),
-        (("report", "a.xml", "--seed", "3", "--controls", "zero"), "without --controls random"),
-        (("report", "stack(n=4)", "--seed", "3"), "--seed has no effect without a MODEL.xml"),
-        (("check", ""), "an argument is empty"),
-        (("check", "a.jsonl"), "only problems can be checked"),
-        (("report", "stack(n=4)", "--out", ""), "an argument is empty"),
-        (("check", "stack(n=4)", "--reference", "nobody"), "unknown solver 'nobody'"),
-        (("run", "stac"), "did you mean 'stack'"),
-        (("run", "stack", "--set", "n"), "NAME=VALUE"),
-        (("run", "stack", "--iterations", "3"), "--iterations is 3"),
-        (("run", "stack", "--order", "given", "--set", "order=reverse"), "set the same parameter, order"),
-        (
-            ("run", "stack", "--iterations", "8", "--set", "solver_iterations=4"),
-            "set the same parameter, solver_iterations",
-        ),
-        (("run", "stack", "--warm-start", "--set", "warm_start=false"), "set the same parameter, warm_start"),
-        (("nonsense",), "unknown command 'nonsense'"),
-        (("slove", "stack(n=4)"), "did you mean 'solve'"),
-        (("run", "stack", "--set", "m=3"), "unknown parameter 'm' of scene 'stack'"),
-        (("solve", "random_spd(n=5000000)"), "not enough memory"),  # 2e14 bytes, beyond the address space
-        *((("report", "stack(n=4)", "--workers", n), f"workers is {n}") for n in (0, -2, 1_000_000_000)),
-    ],
-)
-def test_bad_input_is_one_line_and_status_2(lavender, words, sign):
-    code, out, err = lavender(*words)
-    assert (code, out) == (cli.EXIT_BAD_INPUT, "")
-    assert sign in err
-    said = err.strip().splitlines()
-    assert len(said) == 1 or said[0].startswith("Usage: "), err
-
-
-def test_a_model_and_the_folder_of_a_report_are_no_problems_and_the_way_on_is_told(lavender, tmp_path):
-    model, folder = tmp_path / "model.xml", tmp_path / "reported"
-    model.write_text("<mujoco/>")
-    folder.mkdir()
-    (folder / "records.jsonl").write_text("")
-    code, _, err = lavender("solve", model)
-    assert (code, err.count("\n")) == (2, 1) and "`lavender record` writes such files" in err
-    code, _, err = lavender("report", folder)
-    assert code == 2 and f"{folder / 'records.jsonl'} shows its report again" in err
-
-
 def test_help_is_quick_and_names_every_command():
     code = "import sys, lavender.cli as c\ntry: c.main(['--help'])\nfinally: print(*sys.modules, file=sys.stderr)"
     done = python("-c", code)
@@ -244,17 +143,6 @@ def test_an_answer_is_not_written_over_its_problem(lavender, path):
     for output in (path, link):
         assert lavender("solve", path, "--output", output)[0] == cli.EXIT_BAD_INPUT
         assert path.read_bytes() == before
-
-
-def test_report_list_names_families_with_parameters_and_sets(lavender):
-    from lavender.suite.case import FAMILIES
-
-    code, out, _ = lavender("report", "--list")
-    assert code == 0
-    for name, family in FAMILIES.items():
-        assert f"\n{name}(" in "\n" + out
-        assert family.summary in out
-    assert all(f"\n@{name}\n" in out for name in lv.suite.SETS)
 
 
 # -- what nobody should ask for ---------------------------------------------------------------------------
@@ -302,22 +190,6 @@ def test_ctrl_c_while_the_module_of_a_command_is_imported_ends_with_130(tmp_path
     assert "Traceback" not in done.stderr
 
 
-def test_check_in_a_narrow_terminal_keeps_solver_verdict_status_and_error(lavender, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "80")
-    code, output, _ = lavender("check", "stack(n=4)", "--solvers", "newton", "block_gauss_seidel")
-    table = output.splitlines()[2:]
-    assert code == 0
-    assert (
-        "block_gauss_seidel" in output
-        and "velocities" in output
-        and "error" in output
-        and "objective [J]" not in output
-    )
-    assert max(len(line) for line in table if "distance of the impulses" not in line) <= 80
-    monkeypatch.setenv("COLUMNS", "300")
-    assert "objective [J]" in lavender("check", "stack(n=4)", "--solvers", "newton")[1]
-
-
 @pytest.mark.parametrize("command", ["audit", "tune"])
 def test_ctrl_c_before_the_first_result_ends_with_130_and_a_reason(tmp_path, monkeypatch, capsys, command):
     pytest.importorskip("mujoco")
@@ -357,17 +229,6 @@ for error in (ValueError("Invalid bounding box"), lv.InputError("mujoco cannot b
     assert "Invalid bounding box" in said and "mujoco cannot be imported" in said
 
 
-@pytest.mark.parametrize("columns", ["0", "19"])
-@pytest.mark.parametrize("words", [("solvers",), ("report", "--list"), ("check", "stack(n=4)", "--solvers", "pgs")])
-def test_names_are_whole_in_the_narrowest_terminal(lavender, monkeypatch, words, columns):
-    wide = lavender(*words)[1]
-    monkeypatch.setenv("COLUMNS", columns)
-    code, narrow, _ = lavender(*words)
-    assert code == 0
-    names = re.findall(r"^\w+", wide, re.MULTILINE)
-    assert names and set(names) <= set(re.findall(r"^\w+", narrow, re.MULTILINE))
-
-
 def test_doctor_tells_what_looks_wrong_in_a_problem(lavender, path, tmp_path):
     assert lavender("doctor", path)[:2] == (0, "1 problems checked, none with diagnostics\n")
     code, out, _ = lavender("doctor", path, "duplicated(k=3)")
@@ -404,26 +265,6 @@ def test_what_cannot_be_written_is_refused_before_the_work(lavender, monkeypatch
         assert (code, out) == (cli.EXIT_BAD_INPUT, "")
         assert re.search(r"^lavender: cannot (write|create) .*; (create|give) ", err)
         assert str(tmp_path / place) in err
-
-
-def test_a_format_that_nobody_writes_is_refused_before_the_work(lavender, monkeypatch):
-    monkeypatch.setattr("lavender.sim.engine.Simulation.step", _must_not_begin)
-    code, _, err = lavender("run", "stack", "--plot", "x.plot")
-    assert code == cli.EXIT_BAD_INPUT and "suffix" in err and "svg" in err
-    code, _, err = lavender("run", "stack", "--film", "x.mp4")
-    assert code == cli.EXIT_BAD_INPUT and ".gif is needed" in err
-
-
-@pytest.mark.skipif(sys.version_info[:3] == (3, 13, 0), reason="CPython 3.13.0 imports nothing in such a folder")
-@pytest.mark.parametrize("words", ["--workers 2", "--workers 1", "--solvers pgs --budgets 2 --no-figures"])
-def test_a_working_directory_that_is_gone_is_said(lavender, path, tmp_path, words):
-    os.rmdir(os.getcwd())
-    words = words if "--solvers" in words else f"--solvers pgs --no-figures {words}"
-    code, _, err = lavender("report", path, *words.split(), "--out", tmp_path / "out")
-    assert code == 0 or (code == cli.EXIT_BAD_INPUT and "the working directory no longer exists" in err)
-    for words in ("run stack --steps 2 --record r", "export c c", "solve toy_stack --output x.npz", "report toy_stack"):
-        code, _, err = lavender(*words.split())
-        assert code == cli.EXIT_BAD_INPUT and "the working directory no longer exists" in err
 
 
 def _unread(*words):

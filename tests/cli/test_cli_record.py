@@ -7,7 +7,7 @@ import pytest
 from mujoco_scene import mj, scene
 
 import lavender as lv
-from lavender.cli import EXIT_BAD_INPUT, cli
+from lavender.cli import EXIT_BAD_INPUT
 from lavender.judge.residuals import AT_FLOOR
 
 PGS = 1e-6  # as in test_io_mujoco.py
@@ -41,14 +41,6 @@ def test_what_a_robot_does_not_feel_is_close_enough_and_the_threshold_is_the_use
     for threshold, status, told in (("1e-6", 0, "0 also more than 1e-6"), ("0", 1, "1 also more than 0")):
         code, out, _ = lavender(*words, threshold)
         assert code == status and f"1 of 1 above their floor, {told} m/s off" in " ".join(out.split())
-
-
-def test_record_and_report_take_the_same_options_with_the_same_defaults():
-    names = ("steps", "every", "control", "seed", "states", "threshold")
-    both = [{p.name: p for p in cli.get_command(None, name).params} for name in ("record", "report")]
-    for name in names:
-        one, two = (options[name] for options in both)
-        assert (one.opts, one.default, one.type) == (two.opts, two.default, two.type)
 
 
 def test_record_then_report_from_the_command_line(lavender, tmp_path):

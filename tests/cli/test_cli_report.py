@@ -7,28 +7,19 @@ import signal
 import subprocess
 import sys
 import time
-from collections import Counter
-from io import StringIO
 from pathlib import Path
 
 import numpy as np
 import pytest
-from stacks import idle_problem, stack
+from stacks import stack
 from worked import python
 
 import lavender as lv
-from lavender import cli, io, report, suite
+from lavender import cli, io, report
 from lavender import export as export
 from lavender.cli import measuring
 from lavender.report import Event
 from lavender.report.store import select_cases, select_skips
-from lavender.suite import steps
-
-
-def test_a_problem_with_nothing_to_do_is_said_to_have_nothing_to_do(lavender, tmp_path):
-    lv.io.save(idle_problem(), tmp_path / "idle.npz")
-    code, out, _ = lavender("solve", tmp_path / "idle.npz", "--solver", "pgs")
-    assert code == 0 and "nothing to do" in out
 
 
 def test_the_command_shows_the_way_and_gives_it_as_data(lavender):
@@ -37,37 +28,6 @@ def test_the_command_shows_the_way_and_gives_it_as_data(lavender):
     assert "newton is counted to take" in shown and "granularF(n=4)" in shown and "admm" in shown
     plan = json.loads(lavender("explain", "stack(n=200)", "--json", "--tol", "1e-9")[1])
     assert plan["tol"] == 1e-9 and plan["rows"] == 200 and plan["stages"][0]["solver"] == "direct"
-
-
-def test_progress_without_terminal_is_lines(capsys, monkeypatch):
-    monkeypatch.setattr(measuring, "PROGRESS_INTERVAL", 0.0)  # s between two lines
-    with measuring.show_progress() as watch:
-        for done in range(3):
-            watch(Event(done, 3, "stack", "newton"))
-    assert capsys.readouterr().err.splitlines() == [
-        f"{done} of 3, 0 s: stack newton" for done in range(3)
-    ]  # and no control codes or empty lines
-    monkeypatch.setattr(measuring, "PROGRESS_INTERVAL", 1e9)
-    with measuring.show_progress() as watch:
-        watch(Event(0, 3, "stack", "newton"))
-    assert capsys.readouterr().err == ""
-
-
-@pytest.mark.parametrize("width", [80, 120])
-def test_progress_on_a_terminal_is_one_line_that_is_cut_and_cleared_at_the_end(monkeypatch, width):
-    from rich.console import Console
-
-    console = Console(force_terminal=True, width=width, file=StringIO(), _environ={}, color_system=None)
-    monkeypatch.setattr(measuring, "make_console", lambda stderr: console)
-    monkeypatch.setattr(measuring, "REDRAW_INTERVAL", 0.0)  # s between two updates
-    with measuring.show_progress() as watch:
-        watch(Event(16816, 36200, "steps, 16816 unconverged", ""))
-        watch(Event(199, 770, "timing: round 1 of 5, " + 99 * "x", ""))
-    lines = [line.removesuffix("\x1b[K") for line in console.file.getvalue().split("\r")[1:]]
-    assert lines[0] == "starting" and lines[-1] == "" and len(lines) == 4 and "\n" not in console.file.getvalue()
-    assert lines[1] == "16816 of 36200, 0 s: steps, 16816 unconverged"
-    assert lines[2].startswith("199 of 770, 0 s: timing: round 1 of 5, x")
-    assert len(lines[2]) == width - 1
 
 
 def test_progress_lines_have_the_remaining_time(capsys, monkeypatch):
@@ -81,21 +41,6 @@ def test_progress_lines_have_the_remaining_time(capsys, monkeypatch):
     assert measuring.format_remaining_time(event, 0.1) == ""  # too early
     assert measuring.format_remaining_time(Event(7, 80, "stack", "newton"), 10.0) == ""  # before a tenth is done
     assert measuring.format_remaining_time(Event(20, 0, "", ""), 10.0) == ""  # the total is not known
-
-
-def test_records_are_shown_again_with_some_solvers(lavender, path, tmp_path):
-    code, *_ = lavender("report", path, "--solvers", "pgs", "jacobi", "newton", *QUICK, "--out", tmp_path / "out")
-    assert code == 0
-    records = tmp_path / "out" / "records.jsonl"
-    again = ("--no-figures", "--out", tmp_path / "again")
-    code, out, _ = lavender("report", records, "--solvers", "jacobi", "pgs", *again)
-    page = (tmp_path / "again" / "tables" / "times.csv").read_text(encoding="utf-8")
-    assert code == 0 and "newton" not in out + page
-    assert "jacobi" in page and "pgs" in page
-    assert set(report.select_runs(report.read(records))["solver"]) == {"jacobi", "newton", "pgs"}  # The file keeps all.
-    code, _, err = lavender("report", records, "--solvers", "nncg", *again)
-    assert code == cli.EXIT_BAD_INPUT
-    assert "no records of solver 'nncg'; there are records of jacobi, newton, pgs" in err
 
 
 QUICK = ("--tolerances", "1e-3", "1e-6", "--budgets", "2", "4", "--repeats", "1", "--no-figures")
@@ -129,52 +74,6 @@ def test_a_file_of_a_folder_that_cannot_be_read_is_named_and_costs_itself_alone(
     assert lavender("explain", path.parent, "--tol", -1)[0] == cli.EXIT_BAD_INPUT
 
 
-def test_records_are_shown_again_without_solving(lavender, path, tmp_path, monkeypatch):
-    report.run([path], ["pgs"], report.Plan((1e-3,), (4,), repeats=1), tmp_path / "r.jsonl")
-    before = (tmp_path / "r.jsonl").read_bytes()
-    monkeypatch.setattr("lavender.report.run", None)
-    out_to = ("--out", tmp_path / "again", "--no-figures")
-    code, out, _ = lavender("report", tmp_path / "r.jsonl", *out_to)
-    assert code == 0
-    assert "it solves your stack" in out
-    assert (tmp_path / "again" / "index.html").exists()
-    assert (tmp_path / "r.jsonl").read_bytes() == before
-
-
-def test_a_file_without_a_record_is_refused(lavender, path, tmp_path):
-    report.run([path], ["pgs"], report.Plan((1e-3,), (4,), repeats=1), tmp_path / "r.jsonl")
-    head = (tmp_path / "r.jsonl").read_bytes().splitlines(keepends=True)[0]  # of a run that was stopped at once
-    for left in (b"", b"\n", head):
-        (tmp_path / "r.jsonl").write_bytes(left)
-        code, _, said = lavender("report", tmp_path / "r.jsonl", "--out", tmp_path / "again")
-        assert (code, "has no records" in said) == (2, True)
-        assert not (tmp_path / "again").exists()
-
-
-def test_a_report_that_measured_nothing_says_why(lavender, tmp_path):
-    lv.Problem.contact(np.eye(3), [1.0, 2.0, 0.0], mu=[0.5]).save(tmp_path / "friction.npz")
-    code, out, _ = lavender("report", tmp_path / "friction.npz", "--solvers", "direct")
-    assert code == 1
-    assert "nothing was measured: takes laws linear, lcp, not 'coulomb'" in out
-
-
-def test_one_reason_of_many_cases_is_said_once(lavender, tmp_path, monkeypatch):
-    """As of 60 robots whose package is not installed."""
-    monkeypatch.setattr(
-        steps, "explain_missing_packages", lambda package: f"robots need {package}: pip install {package}"
-    )
-    code, out, _ = lavender("report", "@robots", "--out", tmp_path / "out")
-    assert code == cli.EXIT_UNMET
-    said = "; ".join(
-        f"robots need {package}: pip install {package} ({n} cases)"
-        for package, n in Counter(map(steps.get_package_name_of_case, suite.get_case_names_of_set("@robots"))).items()
-    )
-    assert f"nothing was measured: {said}\n" in out
-    summary = (tmp_path / "out" / "summary.md").read_text()
-    assert "and 31 more cases: robots need" in summary
-    assert max(map(len, (out + summary).splitlines())) < 500
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 @pytest.mark.parametrize("stop", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.nightly)])
 def test_report_stopped_by_a_signal_keeps_records_and_writes_the_page(stop, tmp_path):
@@ -202,20 +101,6 @@ def test_report_stopped_by_a_signal_keeps_records_and_writes_the_page(stop, tmp_
     assert any(r["kind"] == "run" and r["case"] == "easy" for r in kept)
 
 
-def test_campaigns_put_together_are_one(lavender, tmp_path):
-    more = ("--solvers", "pgs", "--tolerances", "1e-3", "--budgets", "4", "--workers", 1)
-    parts = []
-    for name, seeds in (("a", (0, 1)), ("b", (2, 3))):
-        code, *_ = lavender("report", *(f"granular(n=2, seed={i})" for i in seeds), *more, "--out", tmp_path / name)
-        assert code == 0
-        parts.append((tmp_path / name / "records.jsonl").read_text())
-    (tmp_path / "all.jsonl").write_text("".join(parts))
-    code, out, _ = lavender("report", tmp_path / "all.jsonl", "--out", tmp_path / "all")
-    assert code == 0
-    assert "4 cases" in (tmp_path / "all" / "index.html").read_text()
-    assert re.search(r"pgs +4 +4", out)
-
-
 def test_a_recorded_scene_is_reported_as_a_sequence(lavender, tmp_path):
     folder = tmp_path / "steps"
     code, out, _ = lavender("run", "stack", "--steps", 4, "--record", folder)
@@ -239,24 +124,6 @@ def test_a_recorded_scene_is_reported_as_a_sequence(lavender, tmp_path):
     assert lavender("run", "no such scene")[0] == 2
     assert lavender("report", "--sequence")[0] == 2
     assert lavender("report", "--sequence", folder, "--compare", "nowhere")[0] == 2
-
-
-def test_report_repeated_reuses_the_runs_of_the_first(lavender, path, tmp_path):
-    few = ("--solvers", "pgs", "direct", "auto")
-    words = ("report", path, "duplicated(k=3)", *QUICK, *few, "--out", tmp_path / "out")
-    code, out, _ = lavender(*words)
-    assert code == 0 and len(out.splitlines()) <= 25
-    said, _, rest = out.strip().partition("\n    lv.solve(problem, ")
-    assert said.startswith("Use ") and max(map(len, said.splitlines())) <= 160  # COLUMNS of the fixture.
-    assert "suspicious: duplicated(k=3): duplicate rows: " in rest
-    assert "By structure" not in out
-    code, out, _ = lavender(*words, "--tables")
-    assert "By structure" in out
-    n = len(report.select_runs(report.read(tmp_path / "out")))
-    assert f"{n} of {n} runs of 20" in out
-    code, out, _ = lavender(*words, "--no-reuse")
-    assert "reused" not in out
-    assert len(report.select_runs(report.read(tmp_path / "out"))) == n  # Each replaces the earlier one.
 
 
 WORKER = """

@@ -17,7 +17,6 @@ def test_an_audit_accepts_or_does_not(lavender, boxes, tmp_path):
     words = ("--worlds", 2, "--steps", 20, "--workers", 1, "--out", tmp_path / "out", "--max-velocity-error", "1e-3")
     code, out, _ = lavender("audit", boxes(EARLY), *words)
     assert code == 1 and "stopped before convergence" in out
-    assert len(out.splitlines()) <= 27
     page = (tmp_path / "out" / "index.html").read_text()
     assert "worst_1.npz" in page and "<svg" in page
     told = json.loads((tmp_path / "out" / "numbers.json").read_text())
@@ -27,38 +26,9 @@ def test_an_audit_accepts_or_does_not(lavender, boxes, tmp_path):
     records = np.load(tmp_path / "out" / "records.npz")
     above = np.count_nonzero((records["velocity"] > 1e-3) & (records["verdict"] > 0))
     assert 0 < above == told["above_limit"] and told["error_limit"] == 1e-3
-    assert f"{above} steps above 0.001 m/s ({100 * above / 40:.1f} %)" in " ".join(out.split())
     code, out, _ = lavender("audit", boxes(), *words)
     assert code == 0 and "none of 40 steps judged in 2 worlds stopped before convergence" in out
-    assert "0 steps above 0.001 m/s" in " ".join(out.split())
     assert not list((tmp_path / "out" / "worst").glob("*.npz"))  # files of another run are gone
-
-
-def test_tuning_prints_a_page_and_few_lines(lavender, boxes, tmp_path, monkeypatch):
-    keep_values(monkeypatch, tuning, "MUJOCO", {1e-6, 1e-12, 2, 3, 25}, {"Newton", "CG"})
-    code, out, _ = lavender(
-        "tune", boxes(EARLY), "--worlds", 2, "--steps", 20, "--repeats", 1, "--out", tmp_path / "out"
-    )
-    assert code == 0 and "held back" in out
-    assert "Add the line after the model's own <option>" in " ".join(out.split())
-    warned = 2 if "The machine was busy" in out else 0  # a warning, and longer comments
-    assert len(out.splitlines()) <= 29 + warned
-    assert "On other states they can be larger" in " ".join(out.split())
-    page = (tmp_path / "out" / "index.html").read_text()
-    assert "&lt;option" in page and "<svg" in page
-    assert (tmp_path / "out" / "figures" / "time-and-error.svg").is_file()
-
-
-def test_tuning_to_a_limit_of_the_error(lavender, boxes, tmp_path, monkeypatch):
-    keep_values(monkeypatch, tuning, "MUJOCO", {1e-12, 3}, {"CG"})
-    words = ("tune", boxes(EARLY), "--worlds", 2, "--steps", 10, "--repeats", 1, "--out", tmp_path / "out")
-    for limit, expected, sentence in (
-        ("1e-3", 0, "error at most 0.001 m/s, fastest"),
-        ("0", 1, "error at most 0 m/s: none of"),
-    ):
-        code, out, _ = lavender(*words, "--max-velocity-error", limit)
-        assert code == expected and sentence in " ".join(out.split())
-    assert lavender(*words, "--max-velocity-error", "-1")[0] == 2
 
 
 def test_worlds_that_diverge_end_an_audit_with_1(lavender, boxes, tmp_path):
@@ -69,28 +39,6 @@ def test_worlds_that_diverge_end_an_audit_with_1(lavender, boxes, tmp_path):
     assert (told["judged"], told["unjudged"], told["diverged"]) == (6, 4, 1)
     assert told["divergences"][0]["world"] == 1 and told["largest"] < 1.0
     assert lavender("audit", boxes(), *words)[0] == 0
-
-
-def test_no_line_is_printed_of_states_without_contact(lavender, boxes, tmp_path, monkeypatch):
-    keep_values(monkeypatch, tuning, "MUJOCO", {1e-6, 2}, {"Newton"})
-    high = boxes(EARLY)
-    high.write_text(high.read_text().replace("0 0 0.099", "0 0 9").replace("0.32", "20"))
-    words = ("tune", high, "--worlds", 2, "--steps", 10, "--repeats", 1, "--out", tmp_path / "out")
-    code, out, _ = lavender(*words)
-    assert code == 1 and "<option" not in out
-    assert "No setting is recommended: 0 of 20 steps judged have contact (0 %), fewer than 20 %" in " ".join(
-        out.split()
-    )
-    told = json.loads((tmp_path / "out" / "numbers.json").read_text())
-    assert told["lines"] == [] and told["contacts"] == {"median": 0.0, "maximum": 0, "share": 0.0}
-    assert "&lt;option" not in (tmp_path / "out" / "index.html").read_text()
-    low = tmp_path / "low.npz"
-    np.savez(low, qpos=[0, 0, 0.099, 1, 0, 0, 0, 0.02, 0, 0.32, 1, 0, 0, 0, 0], qvel=np.zeros(13))
-    code, out, _ = lavender(*words, "--states", low)
-    told = json.loads((tmp_path / "out" / "numbers.json").read_text())
-    assert code == 0 and told["contacts"]["share"] == 1.0 and "No setting" not in out
-    warned = 2 if "The machine was busy" in out else 0
-    assert len(out.splitlines()) <= 29 + warned
 
 
 def test_recordings_start_from_states(lavender, tmp_path, boxes):
@@ -133,40 +81,6 @@ def test_states_that_an_audit_saves_are_read_by_the_other_commands(lavender, box
     assert "floor" in lavender("slip", path, "--states", file)[1]
     code, _, err = lavender("audit", path, *words, "--save-states", "best", file)
     assert code == 2 and "'best' is not one of 'contact', 'worst'" in err
-
-
-@pytest.mark.parametrize("option", [("--workers", 3), ("--precision", "float32")])
-def test_an_audit_of_claims_rejects_options_that_it_does_not_use(lavender, boxes, option):
-    code, _, err = lavender("audit", boxes(), "--engine", "kamino", *option)
-    assert code == 2 and f"{option[0]} has no effect with another --engine than mujoco" in err
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("audit", "--steps", 0), "lavender: --steps is 0;"),
-        (("audit", "--worlds", 0), "lavender: --worlds is 0;"),
-        (("audit", "--keep", 0), "lavender: --keep is 0;"),
-        (("tune", "--worlds", 1), "lavender: --worlds is 1;"),
-        (
-            ("tune", "--steps", 3, "--horizon", 2),
-            "lavender: --steps is 3 and --horizon is 2; --steps must be a multiple of --horizon",
-        ),
-        (("record", "--out", "r", "--steps", 0), "lavender: --steps is 0;"),
-        (("slip", "--steps", 0), "lavender: --steps is 0;"),
-        (("slip", "--contact", "wheel"), "lavender: --contact names 'wheel', but no geom's name contains it"),
-    ],
-)
-def test_an_invalid_number_names_the_option_of_the_command(lavender, boxes, words, message):
-    code, _, err = lavender(words[0], boxes(), *words[1:])
-    assert code == 2 and err.startswith(message), err
-
-
-@pytest.mark.parametrize("command", ["audit", "tune", "slip"])
-def test_a_problem_file_in_place_of_a_model_is_named(lavender, tmp_path, command):
-    (tmp_path / "here" / "a.npz").write_bytes(b"")
-    code, _, err = lavender(command, "a.npz")
-    assert code == 2 and "a.npz has the suffix of a problem file; a model of MuJoCo (MJCF) is needed" in err
 
 
 def test_a_model_changed_after_loading_is_read_as_mjb_by_each_command(lavender, boxes, tmp_path, monkeypatch):

@@ -41,8 +41,30 @@ ENDS = [
     (2, "run nowhere"),
     (2, "view nothing.npz"),
     (2, "export c PROBLEM"),
-    (2, "nocommand"),
+    (1, "check granularF(n=3) --solvers sor"),
+    (0, "check granularF(n=3) --solvers sor newton"),
 ]
+#: Commands with a wrong word, number or combination of options.
+WRONG = """
+nocommand | slove PROBLEM | report --solvers pgz | report no/such.npz | report stak(n=8) | report --tolerances 0
+report a.jsonl b.npz | report missing.jsonl | report --tolerances many | report --time-budgets 0 | report PROBLEM --list
+report PROBLEM --steps 3 | report PROBLEM --sequence-time-limit 3 | report PROBLEM --solvers direct --budgets 3
+report PROBLEM --solvers direct --orders reverse | report --workers 1 --time-limit 3 | report a.jsonl --tolerances 1e-3
+report PROBLEM --solvers pgs --memory 3 | report a.xml --seed 3 --controls zero
+report PROBLEM --seed 3 | report PROBLEM --workers 0 | report PROBLEM --workers -2 | check a.jsonl
+report PROBLEM --workers 1000000000 | solve PROBLEM --solver direct --order reverse
+solve PROBLEM --solver pgs --output no/such/folder.npz
+solve random_spd(n=5000000) | check PROBLEM --reference nobody | run stac | run stack --set n | run stack --set m=3
+run stack --iterations 3 | run stack --order given --set order=reverse | run stack --warm-start --set warm_start=false
+run stack --iterations 8 --set solver_iterations=4 | run stack --replace | run stack --plot x.plot
+run stack --film x.mp4 | record a.xml --out o --seed 3 --controls zero
+"""
+WRONG_OF_MUJOCO = """
+audit AIR --steps 0 | audit AIR --worlds 0 | audit AIR --keep 0 | audit AIR --engine kamino --workers 3 | audit PROBLEM
+audit AIR --engine kamino --precision float32 | tune AIR --worlds 1 | tune AIR --steps 3 --horizon 2 | tune PROBLEM
+record AIR --out r --steps 0 | slip AIR --steps 0 | slip AIR --contact wheel | slip PROBLEM
+tune AIR --worlds 2 --steps 2 --max-velocity-error -1
+"""
 #: Commands that need MuJoCo; AIR is a model whose body touches nothing.
 MUJOCO_ENDS = [
     (1, "slip AIR"),
@@ -51,6 +73,11 @@ MUJOCO_ENDS = [
     (1, "tune AIR --worlds 2 --steps 10 --repeats 1"),
     (2, "audit nothing.xml"),
 ]
+
+
+def split_lines(text):
+    """Return the commands of a table, one by one."""
+    return [words.strip() for line in text.strip().splitlines() for words in line.split("|")]
 
 
 def test_documented_exit_codes_equal_those_of_the_package():
@@ -69,6 +96,18 @@ def test_command_ends_with_its_documented_code(lavender, tmp_path, code, words):
     places = {"PROBLEM": tmp_path / "PROBLEM.npz", "INFEASIBLE": tmp_path / "INFEASIBLE.npz", "FOLDER": folder}
     ended, out, err = lavender(*(places.get(word, word) for word in words.split()))
     assert ended == code, out + err
+
+
+@pytest.mark.parametrize("words", [*split_lines(WRONG), *split_lines(WRONG_OF_MUJOCO)])
+def test_command_with_a_wrong_argument_prints_an_error_and_ends_with_2(lavender, tmp_path, words):
+    stack(8).save(tmp_path / "PROBLEM.npz")
+    (tmp_path / "air.xml").write_text(AIR)
+    if words in split_lines(WRONG_OF_MUJOCO):
+        pytest.importorskip("mujoco")
+    places = {"PROBLEM": tmp_path / "PROBLEM.npz", "AIR": tmp_path / "air.xml"}
+    ended, out, err = lavender(*(places.get(word, word) for word in words.split()))
+    assert (ended, out) == (2, ""), out + err
+    assert len(err.strip().splitlines()) == 1 or err.startswith("Usage: "), err
 
 
 @pytest.mark.parametrize(("code", "words"), MUJOCO_ENDS, ids=[f"{words} is {code}" for code, words in MUJOCO_ENDS])

@@ -3,20 +3,14 @@
 import copy
 import json
 import pickle
-from dataclasses import fields, replace
+from dataclasses import fields
 from functools import partial
 
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from gradient_problems import drawn, table
-from random_problems import (
-    as_matrix,
-    dragged,
-    random_bodies_and_contacts,
-    random_contact_problem,
-    random_generalized_problem,
-)
+from gradient_problems import drawn
+from random_problems import as_matrix, dragged, random_bodies_and_contacts, random_generalized_problem
 
 import lavender as lv
 from lavender.problem.ordering import compute_block_order
@@ -31,16 +25,6 @@ GENERAL = random_generalized_problem(9, "cone")
 PLANE, SPACE, TENSORS = np.zeros((2, 3)), np.zeros((2, 6)), np.tile(I3, (2, 1, 1))
 contacts, bounded = lv.Cones.contacts, lv.Cones.bounded
 SWAPPED = "so the two seem to be swapped: the order is inv_mass, inv_inertia, velocity, dt, position"
-
-
-def plane():
-    """Build rows of one planar body."""
-    return lv.RowBuilder([0.5], [3.0], [np.zeros(3)], 1 / 60, [(1.5, -1.0)])
-
-
-def space():
-    """Build rows of one body in space."""
-    return lv.RowBuilder([0.5], [I3], np.zeros((1, 6)), 1 / 60, np.zeros((1, 3)))
 
 
 def two():
@@ -64,12 +48,6 @@ def rows_with(**changes):
     return lv.Rows(**{f.name: getattr(ROWS, f.name) for f in fields(ROWS) if f.name != "copy"} | changes)
 
 
-def batch(**changes):
-    """Build four worlds of four contacts, some arguments replaced."""
-    given = {"J": np.ones((4, 12, 18)), "M": np.tile(np.eye(18), (4, 1, 1)), "v_free": np.ones((4, 18))}
-    return lv.Batch(**given | {"cones": contacts(0.5, count=4)} | changes)
-
-
 def late_batch(jac):
     """Build worlds of one row whose A_ii is the square of `jac`."""
     ones = np.ones((3, 1))
@@ -84,10 +62,6 @@ def solved_builder():
 
 def derivative(problem=CONTACT):
     return lv.derivative(problem, lv.solve(problem, tol=1e-12))
-
-
-def spec(**changes):
-    return replace(lv.get("pgs"), **changes)
 
 
 def box(mu=None, **more):
@@ -114,37 +88,6 @@ ERRORS = {
         (lambda: contacts(np.array([-0.1])), r"mu must not be negative; entry \[0\]"),
         (lambda: contacts(np.array([0.5]), patch_radius=np.array([-1.0])), "patch_radius must not be negative"),
         (lambda: contacts(np.array([0.5]), tangents=6), "tangents"),
-        (lambda: lv.Cones([0, 1], [2], [0], [0], [0.5], [0.1]), "contact"),
-        (lambda: contacts([0.5, 0.6], count=3), r"mu has shape \(2,\)"),
-        (lambda: contacts(0.5, count=-1), "count is -1"),
-        (lambda: lv.Cones([0, 7], [lv.ROUND], np.zeros(7), np.zeros(7), [1.0], [0.0]), "a round cone of 7 rows"),
-        (lambda: contacts(0.5, 3, 0.1), "leave patch_radius out"),
-        (lambda: contacts([(0.5, -0.2)], shape="box"), "mu"),
-        (lambda: contacts([(0.5, 0.1, 0.2)], shape="box"), "one for each tangent"),
-        (lambda: contacts(0.5, 2, 0.1, shape="box"), "neither spin"),
-        (lambda: contacts(0.5, 3, shape="box"), "up to two tangents"),
-        (lambda: lv.Cones([0, 4], [4], np.zeros(4), np.ones(4), [0.5], [1.0]), "box of 4 rows"),
-        (lambda: contacts(0.5, rolling=-0.1), "rolling.*-0.1"),
-        (lambda: contacts(0.5, 1, rolling=0.1), "tangents=2"),
-        (lambda: contacts(0.5, 5, rolling=0.1), "round cone"),
-        (lambda: contacts([0.5, 0.5], rolling=[0.1]), "rolling"),
-        (lambda: lv.Cones([0, 4], [lv.CONTACT_ROLLING], np.zeros(4), np.ones(4), [0.5], [0.0], [0.1]), "5 or 6"),
-        (lambda: lv.Cones([0, 5], [lv.CONTACT_ROLLING], np.zeros(5), np.ones(5), [0.5], [0.0], [-1.0]), "rolling.*-1"),
-        (lambda: contacts([(0.5, 0.0)]), r"contact 0 is \[0.5, 0.0\].*two numbers above 0"),
-        (lambda: contacts([(0.5, 0.5), (1e-30, 0.5)]), "contact 1 is"),
-        (lambda: contacts([(0.5, 0.1)], 1), "neither spin nor rolling"),
-        (lambda: contacts([(0.5, 0.1)], patch_radius=0.1), "neither spin nor rolling"),
-        (lambda: lv.Problem.contact(I3, np.ones(3), [(0.5, 0.1)], 0.1), "neither spin nor rolling"),
-        (lambda: contacts([(0.5, 0.1)], rolling=0.1), "neither spin nor rolling"),
-        (lambda: lv.Cones([0, 2], [lv.CONTACT_ELLIPSE], np.zeros(2), np.ones(2), [0.5], [1.0]), "ellipse of 2 rows"),
-        (lambda: lv.Cones([0, 3], [lv.CONTACT_ELLIPSE], np.zeros(3), np.ones(3), [0.5], [0.0]), "mu_2 / mu_1 = 0"),
-        (lambda: lv.Cones([0, 3], [lv.CONTACT_ELLIPSE], np.zeros(3), np.ones(3), [1e50], [1e12]),
-         "mu_2.* must be at most 1e.60"),
-        (lambda: lv.Cones.free(-1), "-1"),
-        *((partial(lv.Cones.free, n), str(n)) for n in (2**31 - 1, 2**40)),
-        *((partial(contacts, 0.5, count=n), str(n)) for n in (2**31 - 1, 2**40)),
-        (lambda: contacts([(0.0, 0.2)], shape="box").shaped("disk"), "two numbers above 0"),
-        (lambda: contacts(0.5, patch_radius=0.1).shaped("box"), "a box cannot bound spin"),
         # findex
         (lambda: findex([0, -1, -1], [INF, 1, 1], [-1, 1, 0]), "its own row"),
         (lambda: findex([0, -1, -1], [INF, 1, 1], [-1, 0, 1]), "its own findex is 0"),
@@ -219,40 +162,6 @@ ERRORS = {
             ({"cones": contacts([0.7] * 2), "tangents": 2}, "tangents has no effect without mu"),
             ({"mu": [0.7] * 3}, "J has 6 rows and mu 3 values.*tangents=1"),
             ({"mu": [0.7] * 4}, "J has 6 rows, which is not a multiple of the 4 values of mu"), ({"mu": -0.7}, "mu"))),
-        # RowBuilder
-        (lambda: plane().ball(0, 7, (0, 0)), "b is 7; the number of one of the 1 bodies"),
-        (lambda: plane().ball(None, -1, (0, 0)), "a and b are both the static world"),
-        (lambda: plane().ball(0, 0, (0, 0)), "a and b are both body 0"),
-        (lambda: plane().ball(-1, 0, (0, 0, 0)), r"anchor \[m\] has shape \(3,\); \(2,\) is needed"),
-        (lambda: plane().ball(-1, 0, 1.0), "anchor is 1.0; a vector"),
-        (lambda: plane().hinge(-1, 0, (0, 0), (0, 0, 1)), "axis is .*; in two dimensions all rotation is about z"),
-        (lambda: plane().slider(-1, 0, (0, 0), (0, 0)), "axis has length 0"),
-        (lambda: plane().contact(-1, 0, (0, 0), (0, 2)), "normal has length 2; a unit vector"),
-        (lambda: plane().contact(-1, 0, (0, 0), (0, 1), tangent=(1, 0)), "tangent is .*; in two dimensions"),
-        (lambda: plane().spring(-1, 0, (0, 0), (1, 0), 1.0, stiffness=0.0), "stiffness is 0 N/m and damping is 0"),
-        (lambda: plane().motor(-1, 0, speed=1.0), "of max_torque and max_force neither is given"),
-        (lambda: plane().motor(-1, 0, speed=1.0, max_torque=1.0, max_force=1.0), "both are given"),
-        (lambda: plane().motor(-1, 0, (1, 0), speed=1.0, max_force=1.0), "anchor is None"),
-        (lambda: plane().motor(-1, 0, speed=1.0, max_force=1.0, anchor=(0, 0)), "axis is None"),
-        (lambda: plane().motor(-1, 0, speed=1.0, max_torque=1.0, anchor=(0, 0)), "anchor is given with max_torque"),
-        (lambda: plane().limit(-1, 0, value=0.0), "lower is -inf and upper is inf; at least one must be finite"),
-        (lambda: plane().limit(-1, 0, value=0.0, lower=1.0, upper=0.0), "lower must not exceed upper"),
-        (lambda: plane().gear(-1, 0, ratio=0.0), "ratio is 0"),
-        (lambda: [b.ball(-1, 0, (0, 0), feature=3) for b in [plane()] * 2], "feature is 3, which another ball"),
-        (lambda: plane().rows_of(5), "key is 5; a key that a method"),
-        (lambda: plane().velocity_after(None, [0.0]), "problem is None; the result of RowBuilder.problem"),
-        (lambda: plane().ball(-1, 0, (0, 0), name=3), "name is 3; a text is needed"),
-        (lambda: lv.RowBuilder([0.5], [3.0], [np.zeros(3)], 0.1, [np.zeros(4)]),
-         r"position \[m\] has shape \(1, 4\); \(n, 2\) is needed"),
-        (lambda: lv.RowBuilder([0.5], [3.0], [(1.0, 2.0)], 0.1, [(0.0, 0.0)]),
-         r"velocity .* has shape \(1, 2\); \(1, 3\) is needed"),
-        (lambda: lv.RowBuilder([INF], [3.0], [np.zeros(3)], 0.1, [(0.0, 0.0)]),
-         "inv_mass .* of body 0 is inf.*; it is 0 for a body that"),
-        (lambda: lv.RowBuilder([1.0], [INF], [np.zeros(3)], 0.1, [(0.0, 0.0)]),
-         "inv_inertia .* of body 0 is inf.*; it is 0 for a body that"),
-        (lambda: space().hinge(-1, 0, np.zeros(3)), r"axis is None; a vector \(3,\)"),
-        (lambda: space().contact(-1, 0, np.zeros(3), (0.0, 0.0, 1.0), tangent=(0.0, 0.0, 1.0)),
-         "parallel to the normal"),
         (lambda: BUILDER.velocity_after(BUILT, FOUND), r"give its \.impulse"),
         (lambda: BUILDER.problem("pyramid"), "a separate bound for each tangent is a shape"),
         (lambda: lv.solve(BUILDER), r"is a RowBuilder; .* give the result of its \.problem\(\)"),
@@ -276,55 +185,11 @@ ERRORS = {
          r"impulse \[N s\] has shape \(3,\); \(2,\) is needed.*problem\.carry"),
         (lambda: LCP.carry(None), r"previous is None; .* the first step .* without impulse="),
         (lambda: lv.solve(BUILT, impulse=FOUND), r"impulse is a Solution; .* \.impulse, or problem\.carry\(solution\)"),
-        # solve and solve_many
-        (lambda: lv.solve(I2, "pgs"), "Problem"),
-        (lambda: lv.solve(LCP, "pgs", tol=-1.0), "tol"),
-        (lambda: lv.solve(LCP, "pgs", tol=10**400), "tol is inf; a finite number is needed"),
-        (lambda: lv.solve(LCP, "pgs", time_limit=-1.0), "time_limit"),
-        *((partial(lv.solve, LCP, velocity_tol=x), "velocity_tol") for x in (0.0, -1.0, np.nan, INF, "small")),
-        *((partial(lv.solve_many, [LCP], velocity_tol=x), "velocity_tol") for x in (0.0, -1.0, np.nan, INF, "small")),
-        (lambda: lv.solve_many([LCP], impulse=[0.0, 0.0]), "impulses="),
-        (lambda: lv.solve_many([LCP] * 2, impulses=[None]), "1 entries for 2"),
-        (lambda: lv.solve_many(LCP), "one Problem; a list"),
-        (lambda: lv.solve_many([3]), "Problem"),
-        (lambda: lv.solve_many([LCP], threads=0), "threads is 0"),
-        *((partial(lv.solve, LCP, name, **{option: x}), option) for name, option, values in (
-            ("jacobi", "omega", (0.0, -1.0, INF)), ("anderson", "memory", (0, 17)), ("admm", "memory", (-1, 17, 0.5)),
-            ("admm", "relaxation", (0.0, 2.0)), ("nncg", "convex", (-1,)), ("pgs", "callback", (3,))) for x in values),
-        (lambda: lv.solve(random_contact_problem(1, friction="cone"), "nncg", sweep="pgs"), "cone law"),
-        *((partial(lv.residual, LCP, [0.0, 0.0], precision=word), r"precision is .*'float64' or 'float32'")
-          for word in ("float16", "single", 32, np.zeros(2))),
-        *((partial(lv.Problem.lcp, np.eye(1), [1.0], precision=word), r"precision is .*'float64' or 'float32'")
-          for word in ("float16", "single", 32, np.zeros(2))),
         # Orders
         *((partial(compute_block_order, lv.Problem.lcp(I3, np.ones(3)), **options), words) for options, words in (
             ({"order": [0, 0, 2]}, "once"), ({"order": [0, 1]}, "shape"), ({"order": "random", "seed": -1}, "seed"),
             ({"order": "reverse", "seed": 3}, "random"), ({"order": "reverse", "ground": [0]}, "ground"),
             ({"order": [2, 1, 0], "ground": [0]}, "ground"), ({"order": "bottom_up", "ground": [3]}, "3 blocks"))),
-        # Batches
-        *((partial(batch, **change), words) for change, words in (
-            ({"J": np.zeros((3, 12))}, "or with row_ptr"),
-            ({"M": np.zeros((4, 3, 3))}, "M has shape"),
-            ({"M": (np.ones((4, 3)), [0, 0, 1], [0, 1, 3])}, "entries of 2 velocities"),
-            ({"M": (np.ones((4, 3)), [0, 0, 1])}, "M is a tuple of 2"),
-            ({"M": (np.ones((4, 17)), np.arange(18), np.arange(19))}, r"values of M have shape \(4, 17\)"),
-            ({"M": (np.ones((4, 18)), np.arange(18)[::-1], np.arange(19))}, "do not describe a lower triangle"),
-            ({"M": (np.ones((4, 18)), np.arange(18), np.arange(18))}, "do not describe a lower triangle"),
-            ({"cones": contacts(0.5, count=5)}, "48 are needed, the rows of all worlds"),
-            ({"count": [12, 9, 0, 3]}, "24 are needed, the rows of all worlds without padding rows; .* give a list"),
-            ({"cones": [contacts(0.5, count=4)] * 3}, "one for each of 4 worlds"),
-            ({"count": [12, 13, 0, 1]}, "count of world 1 is 13"),
-            ({"friction": "wet"}, "friction is 'wet'"),
-            ({"J": np.zeros((47, 18)), "row_ptr": [0, 12, 24, 36, 48]}, "J has shape"),
-            ({"J": np.zeros((48, 18)), "row_ptr": [1, 12, 24, 36, 48]}, r"row_ptr is \[1, 12, 24, .*must start with 0"),
-            ({"cones": None}, "one for each of 4 worlds"))),
-        # Specs of solvers
-        *((partial(spec, **{name: x}), f"{name}.*needed") for name, values in {
-            "name": ("", 3), "laws": (frozenset(), frozenset({"lcp", "lpc"}), "lcp", None, [["lcp"], 3]),
-            "operators": (frozenset({"rows", "tensor"}), frozenset()), "box_friction_laws": ("cone",),
-            "summary": (None,), "requires": ("numpy",), "options": (["omega"],), "max_iter": (-1, "7"),
-            "resumable": ("no",), "seed": (2,),
-        }.items() for x in values),
         # Numbers out of range
         *((call, rf"(?s)\b{name}.*e[+-]60") for call, name in (
             (lambda: lv.Problem.lcp(I2, [1.0, 1e61]), "b"), (lambda: lv.Problem.lcp(I2, [1e-61, -1e-70]), "b"),
@@ -343,18 +208,6 @@ ERRORS = {
         (lambda: lv.derivative(CONTACT.updated(b=[9.0, 6.0, 0.0]), lv.solve(CONTACT, tol=1e-12)),
          "the impulse is not a solution"),
         (lambda: lv.derivative(LCP, lv.solve(CONTACT)), r"impulse \[N s\] has shape \(3,\); \(2,\)"),
-        (lambda: derivative().jvp(b=[np.nan, 0.0, 0.0]), "b must be finite"),
-        (lambda: derivative().vjp(impulse=[np.nan, 0.0, 0.0]), "impulse must be finite"),
-        (lambda: derivative().vjp(), "give velocity="),
-        (lambda: derivative().jvp(), "give at least one of b, lower"),
-        (lambda: derivative().jvp(J=I3), "'J' is not among the data of this problem"),
-        (lambda: derivative(table()).jvp(M=np.triu(np.ones((3, 3)))), "the change of M must be symmetric"),
-        (lambda: lv.derivatives([P, P], [ANSWER]), "1 entries for 2 problems"),
-        (lambda: lv.derivatives([P, P], [ANSWER, 1.1 * ANSWER.impulse]), "problem 1: the impulse is not a solution"),
-        (lambda: lv.derivatives([P], [ANSWER]).vjp(velocity=[1, 2]), "velocity has 2 cotangents for 1 problems"),
-        (lambda: lv.derivatives(P, ANSWER), "a list of problems is needed"),
-        (lambda: lv.derivatives([P], [ANSWER]).vjp(impulse=[np.ones(P.m)])[0].full("mu"),
-         "full needs one of A, J, M; 'mu' is not a matrix"),
     ],
     lv.UnknownName: [
         *((partial(call, LCP, "pgs", maxiter=3), r"unknown option 'maxiter' .*did you mean 'max_iter'")
@@ -397,27 +250,6 @@ def test_unknown_attributes_raise_attribute_error_with_the_name(owner):
     with pytest.raises(AttributeError, match="no attribute 'nonsense'") as raised:
         owner.nonsense  # noqa: B018
     assert raised.value.name == "nonsense"  # Python suggests the nearest name in the traceback.
-
-
-def test_the_module_of_solvers_names_the_lists_of_solvers():
-    import lavender.solvers
-
-    with pytest.raises(TypeError, match=r"lavender\.available\(problem\) lists .* lavender\.known\(\)"):
-        lavender.solvers()
-    assert all(lv.solve(LCP, name, history=True).history for name in lv.available(LCP, history=True))
-
-
-@pytest.mark.parametrize(
-    ("call", "words"),
-    [
-        (lambda: two().hinge(-1, 0, nonsense=1), "unexpected keyword argument 'nonsense'"),
-        (lambda: two().contact(-1, 0, (0.0, 0.0)), "missing 1 required positional argument: 'normal'"),
-        (lambda: lv.Problem.lcp(A, B, lo=0.0), "unexpected keyword argument 'lo'"),
-    ],
-)
-def test_call_with_an_unknown_or_missing_argument_raises_type_error_of_python(call, words):
-    with pytest.raises(TypeError, match=words):
-        call()
 
 
 def test_a_status_is_equal_to_its_name_everywhere():

@@ -11,35 +11,6 @@ import lavender as lv
 EMPTY: list[float] = []
 
 
-def test_rows_from_lists_equal_rows_from_arrays() -> None:
-    up, side, none = (0.0, 0.0, 1.0), [1, 0, 0], (0, 0, 0)
-    lists = lv.Rows(
-        inv_mass=[0.5],
-        inv_inertia=[np.eye(3) / 0.008],
-        v_free=[[0, 0, -0.16, 0, 0, 0]],
-        contact_body=[(-1, 0)],
-        normal=[up],
-        tangent=[side],
-        arm_a=[none],
-        arm_b=[(0.0, 0.0, -0.09)],
-    )
-    arrays = lv.Rows(
-        np.array([0.5]),
-        np.eye(3)[None] / 0.008,
-        np.array([[0.0, 0.0, -0.16, 0.0, 0.0, 0.0]]),
-        contact_body=np.array([[-1, 0]], np.int32),
-        normal=np.array([up]),
-        tangent=np.array([side], float),
-        arm_a=np.zeros((1, 3)),
-        arm_b=np.array([[0.0, 0.0, -0.09]]),
-    )
-    assert lists == arrays
-    problem = lv.Problem.from_rows(lists, target=0.6, mu=[0.5], key=[7])
-    solution: lv.Solution = lv.solve(problem, tol=1e-9, impulse=[0, 0, 0])
-    impulse: npt.NDArray[np.float64] = solution.impulse
-    assert lv.residual(problem, impulse.tolist()).relative == solution.residual.relative
-
-
 def test_cones_and_problems_from_lists_equal_those_from_arrays() -> None:
     cones = lv.Cones(ptr=[0, 1], kind=[0], lower=[0.0], upper=[1], mu=[0.0], patch_radius=[0.0])
     assert cones == lv.Cones.bounded([0], [1.0]) == lv.Cones.bounded(np.zeros(1), 1.0)
@@ -92,10 +63,3 @@ def test_empty_lists_mean_no_contacts_joints_or_bodies(bodies: int) -> None:
     assert problem.m == 0 and lv.solve(problem).success
     with pytest.raises(lv.InputError, match=r"contact_body has shape \(1, 2\); \(0, 2\) is needed"):
         lv.Rows(mass, inertia, free, contact_body=[(-1, 0)], normal=EMPTY, tangent=EMPTY, arm_a=EMPTY, arm_b=EMPTY)
-
-
-def test_an_unknown_name_is_an_error_for_mypy_and_has_a_hint() -> None:
-    with pytest.raises(AttributeError) as error:
-        _ = lv.sove  # type: ignore[attr-defined]
-    # Python finds "Did you mean: 'solve'?" from these.
-    assert (error.value.name, error.value.obj) == ("sove", lv)

@@ -18,28 +18,6 @@ def solution(problem):
     return lv.solve(problem, "pgs", tol=1e-8, history=True)
 
 
-def test_repr_of_results_has_one_line_with_their_numbers(problem, solution, tmp_path):
-    with lv.io.Recorder(tmp_path, every=1) as recorder:
-        recorder.add(problem, solution.impulse)
-        texts = {
-            f"relative {solution.residual.relative:.2e}": repr(solution.residual),
-            f"{len(solution.history.iterations)} records": repr(solution.history),
-            "8 contacts and 2 other blocks, 10 rows": repr(problem.cones + lv.Cones.free(2)),
-            "pgs for <Problem 'toy_stack'": repr(lv.prepare(problem, "pgs")),
-            "1 steps, 1 files": repr(recorder),
-            "2 agree": repr(lv.cross_check(problem, ["direct", "pgs"])),
-        }
-    for part, text in texts.items():
-        assert part in text and "\n" not in text and len(text) < 200
-
-
-def test_repr_html_has_the_numbers_of_a_result(problem, solution):
-    floor = f"{solution.residual.roundoff_floor:.1e}"
-    assert floor in solution._repr_html_() and floor in solution.residual._repr_html_()
-    html = lv.cross_check(problem, ["direct", "pgs"])._repr_html_()
-    assert html.count("<tr>") == 3 and "agrees" in html
-
-
 def test_plot_shows_the_worst_rows_and_the_history(solution):
     worst, history = solution.plot(rows=3).axes
     widths = [bar.get_width() for bar in worst.patches]

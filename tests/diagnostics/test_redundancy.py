@@ -54,16 +54,6 @@ def test_the_second_of_two_equal_hinges_is_named():
     assert "spare hinge" in str(found)
 
 
-def test_blocks_of_one_row_keep_their_whole_name():
-    """Of the edges of a pyramid the last repeats the others, not the contact."""
-    edges = np.array([[1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 0.0, 1.0], [1.0, 0.0, -1.0]])
-    names = [f"contact 0 (floor, box), edge {k}" for k in range(4)]
-    problem = lv.Problem(
-        np.zeros(4), lv.Cones.bounded(np.zeros(4), np.full(4, np.inf)), matrix=edges @ edges.T, names=names
-    )
-    assert redundancy(problem).block_names == (names[3],)
-
-
 @pytest.mark.parametrize(
     ("a", "b", "rank"),
     [
@@ -76,19 +66,6 @@ def test_blocks_of_one_row_keep_their_whole_name():
 )
 def test_ranks_of_matrices_by_hand(a, b, rank):
     assert redundancy(lv.Problem.linear(a, b)).rank == rank
-
-
-@pytest.mark.parametrize("kind", ["asymmetric", "indefinite"])
-def test_the_rank_of_a_matrix_is_that_of_exact_numbers_whatever_the_units_of_its_rows(kind):
-    rng = np.random.default_rng(7)
-    for _ in range(50):
-        m, r = rng.integers(1, 9, 2)
-        g = rng.integers(-3, 4, (m, r)).astype(float)
-        h = rng.integers(-2, 3, (r, m)) if kind == "asymmetric" else rng.choice([-1.0, 1.0], r)[:, None] * g.T
-        size = 2.0 ** rng.integers(-20, 21, m)
-        a = size[:, None] * (g @ h) * (1.0 if kind == "asymmetric" else size)
-        truth = len(eliminate([[Fraction(x) for x in row] for row in a.tolist()], m))
-        assert redundancy(lv.Problem.linear(a, np.zeros(m))).rank == truth, a
 
 
 @given(seed=seeds)
@@ -181,16 +158,6 @@ def test_rank_of_a_sparse_island_is_that_of_its_eigenvalues():
     assert found.rank == np.count_nonzero(values > 1e-7)
     kept = np.delete(np.arange(a.shape[0]), found.rows)
     np.linalg.cholesky((unit @ a @ unit).toarray()[np.ix_(kept, kept)])  # and they are independent
-
-
-def test_a_share_that_is_none_is_refused():
-    with pytest.raises(lv.InputError, match="tol"):
-        redundancy(box_on_corners(), tol=2.0)
-
-
-def test_no_velocities():
-    nothing_moves = lv.Problem.from_jacobian(np.zeros((2, 0)), np.zeros((0, 0)), [], cones=lv.Cones.free(2))
-    assert redundancy(nothing_moves).rows == (0, 1)
 
 
 # -- rows and bodies of very different size -------------------------------------------------------------

@@ -176,18 +176,6 @@ def test_numbers_of_any_size_are_looked_at(what, size):
         assert all(isinstance(s.reason, str) for s in lv.diagnose(problem, np.full(problem.m, 1e300)))
 
 
-def test_a_state_that_does_not_fit_the_problem_is_refused():
-    problem = SCENES["stack"]
-    with pytest.raises(lv.InputError, match="give dt"):
-        lv.diagnose(problem, gap=np.zeros(problem.rows.n_contacts))
-    with pytest.raises(lv.InputError, match="shape"):
-        lv.diagnose(problem, velocity=np.zeros(3))
-    with pytest.raises(lv.InputError, match="shape"):
-        lv.diagnose(problem, np.zeros(3))
-    with pytest.raises(lv.InputError, match="a problem in matrix form does not have"):
-        lv.diagnose(lv.Problem.contact(np.eye(3), np.ones(3), mu=0.5), gap=[0.0], dt=0.01)
-
-
 def test_velocities_of_a_planar_engine_are_accepted():
     dt, velocity = 0.01, np.array([(0.3, -0.2, 1.0), (0.0, 0.0, 0.0)])
 
@@ -205,17 +193,6 @@ def test_velocities_of_a_planar_engine_are_accepted():
         assert [s.kind for s in diagnose(velocity + dt * fall, given)] == []
         assert "v* equals v" in str(diagnose(velocity, given))
         assert "do accelerations lack dt" in str(diagnose(velocity + fall, given))
-
-
-def test_planar_velocities_of_a_problem_in_space_get_the_conversion():
-    problem = SCENES["stack"]
-    velocity = np.arange(3.0 * problem.rows.n_bodies).reshape(-1, 3)
-    with pytest.raises(lv.InputError, match=r"not in the xy plane: .*insert\(v, \[2, 2, 2\], 0\.0, axis=1\)"):
-        lv.diagnose(problem, velocity=velocity)
-    converted = np.insert(velocity, [2, 2, 2], 0.0, axis=1)
-    np.testing.assert_array_equal(converted[:, [0, 1, 5]], velocity)
-    assert not converted[:, 2:5].any()
-    lv.diagnose(problem, velocity=converted)
 
 
 @pytest.mark.parametrize(("mass", "size"), [(100.0, 1.0), (1000.0, 2.0)])
@@ -282,14 +259,6 @@ def test_who_fights_is_named_and_the_compliance_that_is_advised_gives_an_answer(
     else:
         softer = replace(problem, compliance=problem.compliance + softened)
     assert not [s for s in lv.diagnose(softer) if s.kind == "conflict"]
-
-
-def test_what_is_looked_for_once_is_told_anew():
-    problem = lv.Problem.contact(np.eye(6), [0.0, 0.0, 0.2, 0.0, 0.0, 0.2], mu=[0.5, 12.0])
-    first, second = (lv.diagnose(problem) for _ in range(2))
-    assert first == second and len(first) == 2
-    first[0].data["mine"] = 1.0
-    assert all("mine" not in told[0].data for told in (second, lv.diagnose(problem)))
 
 
 def test_conflict_of_contacts_in_a_pile_is_proved():

@@ -145,11 +145,6 @@ def test_an_invalid_problem_is_rejected_with_the_place_of_its_mistake(library, m
     assert library.c.lav_set(solver.at, ct.byref(library.problem(self_test_problem()))) == 0  # and goes on
 
 
-def test_every_error_has_a_text_of_its_own(library):
-    texts = {library.c.lav_text(code) for code in [0, *ERRORS]}
-    assert len(texts) == 1 + len(ERRORS) and all(len(text) > 7 for text in texts)
-
-
 def test_null_and_memory_without_a_solver_have_different_errors(library):
     c, q, o, r = library.c, Problem(), Options(), Result()
     assert c.lav_set(None, ct.byref(q)) == c.lav_run(None, None, None) == c.lav_impulse(None, None, 0) == -1

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from hypothesis import given
-from invalid_values import Call, check_float32, make_tests_of_calls, public_calls
 from random_problems import random_contact_problem
 
 import lavender as lv
@@ -25,78 +24,6 @@ resource = pytest.importorskip("resource")
 
 HUGE = 2**31 - 1
 ALLOWED_MEMORY = 100_000_000  # Rejecting a file may need so many bytes.
-
-# -- public calls -----------------------------------------------------------------------------------------------
-
-RNG = np.random.default_rng(0)
-EFC = {
-    "efc_J": RNG.standard_normal((2, 7, 4)), "efc_D": np.ones((2, 7)), "efc_aref": np.ones((2, 7)),
-    "efc_type": np.array([[0, 1, 7, 7, 7, 3, 0]] * 2), "M": np.array([np.eye(4)] * 2), "qvel": np.ones((2, 4)),
-    "qacc_smooth": np.zeros((2, 4)), "timestep": 0.01, "efc_frictionloss": np.ones((2, 7)), "nefc": np.array([6, 7]),
-    "contacts": ([0, 1], [2, 2], [3, 3], np.full((2, 5), 0.5)), "efc_force": np.ones((2, 7)),
-    "qfrc_smooth": np.zeros((2, 4)),
-}  # fmt: skip
-
-
-def with_contact_part(k, part):
-    parts = list(EFC["contacts"])
-    parts[k] = part
-    return io.from_efc(**EFC | {"contacts": tuple(parts)})
-
-
-CALLS = {
-    "io.from_efc": Call(io.from_efc, EFC, accepts_nan=True),
-    **{f"io.from_efc, {name}": Call(
-        functools.partial(with_contact_part, k), {"part": np.array(EFC["contacts"][k])},
-        {"part": f"{name} of contacts?"}, any_length={"part"} if k == 0 else frozenset(),
-    ) for k, name in enumerate(("world", "efc_address", "dim", "friction"))},
-}  # fmt: skip
-
-#: Public calls that are not in the table, and why.
-NOT_CALLED = {
-    **dict.fromkeys(
-        ("io.Recording", "io.Stored", "io.Claims", "io.EngineStep", "io.StepVerdict"), "a result: the package makes it"
-    ),
-    **dict.fromkeys(
-        (
-            "io.Recorder",
-            "io.Recorder.add",
-            "io.Recorder.close",
-            "io.Recorder.leave_out",
-            "io.Recorder.write_step",
-            "io.read_recorded_state",
-        ),
-        "test_io_recorder.py",
-    ),
-    **dict.fromkeys(
-        ("io.load", "io.load_solution", "io.read", "io.record", "io.save", "load"),
-        "a file: below, and test_invalid_paths.py of tests/cli",
-    ),
-    **dict.fromkeys(
-        (
-            "io.from_drake",
-            "io.from_genesis",
-            "io.from_kamino",
-            "io.from_mujoco",
-            "io.from_mujoco_many",
-            "io.from_newton_mujoco",
-            "io.from_pinocchio",
-        ),
-        "another simulator's objects: the other files of this folder",
-    ),
-}
-
-
-(
-    test_every_public_call_of_io_is_in_the_table,
-    test_malformed_arguments_are_rejected_by_name,
-    test_arrays_in_any_memory_layout_give_the_same_result,
-) = make_tests_of_calls("io", CALLS, NOT_CALLED, public_calls("io", io, "io.") | public_calls("io"))
-
-
-def test_float32_of_either_byte_order_is_single_precision():
-    check_float32(CALLS["io.from_efc"])
-
 
 # -- small files that would make large arrays ---------------------------------------------------------------------
 

@@ -163,37 +163,9 @@ def test_what_is_not_known_is_refused():
         lv.io.from_drake(plant, context, correction=2.0)
 
 
-def test_locked_joints_are_refused():
-    """Drake leaves their velocities out of its step, and dies of a signal where they carry a contact."""
-    _, _, plant, context = robot()
-    plant.GetJointByName("hinge").Lock(context)
-    with pytest.raises(lv.CapabilityError, match="the joints hinge are locked"):
-        lv.io.from_drake(plant, context)
-
-
 def test_velocities_that_do_not_add_up_are_refused(monkeypatch):
     _, _, plant, context = robot()
     honest = drake.compute_free_motion
     monkeypatch.setattr(drake, "compute_free_motion", lambda *a: (honest(*a)[0], honest(*a)[1] + 1e-3))
     with pytest.raises(lv.CapabilityError, match=r"J\^T times the impulses differ"):
         lv.io.from_drake(plant, context)
-
-
-@pytest.mark.parametrize("what", ["another context", "root", "unconnected", "rotation", "huge", "dt", "correction"])
-def test_what_drake_cannot_take_is_an_input_error(what):
-    _, whole, plant, context = robot()
-    more = {}
-    if what == "another context":
-        context = robot()[3]
-    elif what == "root":
-        context = whole
-    elif what == "unconnected":
-        context = plant.CreateDefaultContext()
-    elif what == "rotation":
-        plant.SetPositions(context, np.zeros(plant.num_positions()))
-    elif what == "huge":
-        plant.SetVelocities(context, np.full(plant.num_velocities(), 1e200))
-    else:
-        more = {what: "a"}
-    with pytest.raises(lv.LavenderError):
-        lv.io.from_drake(plant, context, **more)

@@ -1,9 +1,5 @@
 """Many states of MuJoCo in arrays: the problems and answers of one at a time, in float64 and in float32."""
 
-import copy
-import pickle
-import warnings
-
 import numpy as np
 import pytest
 from mujoco_scene import mj, scene, whole_mass
@@ -77,23 +73,6 @@ def test_a_state_that_is_not_finite_harms_no_other():
     assert sorted(many.faults) == sorted(found.faults) == [1, 3]
     for i in (0, 2, 4):
         assert batch[i] == clean.batch[i]
-
-
-@pytest.mark.parametrize("again", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
-def test_an_engine_s_worlds_are_copied_and_pickled_with_their_names(again):
-    model = mj.MjModel.from_xml_string(scene(cone="pyramidal", condim=3, jacobian="dense"))
-    batch, impulse = lv.io.from_mujoco_many(model, states_of(model, 3))
-    twin = again(batch)
-    assert [list(p.names) for p in twin] == [list(p.names) for p in batch]
-    assert str(lv.residual_many(twin, impulse)[2]) == str(lv.residual_many(batch, impulse)[2])
-
-
-def test_a_model_in_which_nothing_moves_has_worlds_without_rows():
-    model = mj.MjModel.from_xml_string("<mujoco><worldbody><geom size='0.1'/></worldbody></mujoco>")
-    batch, impulse = lv.io.from_mujoco_many(model, np.zeros((3, 0)))
-    assert (
-        batch.velocity_shape == (0,) and impulse.shape == (0,) and lv.solve_many(batch).success.tolist() == 3 * [True]
-    )
 
 
 @pytest.mark.parametrize("jacobian", ["dense", "sparse"])
@@ -210,26 +189,6 @@ def test_what_stands_behind_the_rows_that_count_is_not_read(junk):
     np.testing.assert_array_equal(many.impulse, same.impulse)
 
 
-def test_arrays_that_do_not_fit_say_so():
-    model = mj.MjModel.from_xml_string(scene())
-    given = stacked(model, states_of(model, 3), np.float32)
-    with pytest.raises(lv.InputError, match="contacts= is needed"):
-        lv.io.from_efc(**given | {"contacts": None})
-    stiff, mass = given["efc_D"].copy(), given["M"].copy()
-    stiff[1, 2] = 0.0
-    mass[2] *= 1.01
-    with pytest.raises(lv.InputError, match="efc_D of world 1, row 2"):
-        lv.io.from_efc(**given | {"efc_D": stiff})
-    with pytest.raises(lv.CapabilityError, match="world 2: M qacc_smooth"):
-        lv.io.from_efc(**given | {"M": mass})
-    with pytest.raises(lv.InputError, match="belongs to 0 of the contacts"):
-        lv.io.from_efc(**given | {"contacts": tuple(x[:-1] for x in given["contacts"])})
-    with pytest.raises(lv.InputError, match="each state has"):
-        lv.io.from_mujoco_many(model, np.zeros((2, 3)))
-    with pytest.raises(lv.InputError, match="MjModel is needed"):
-        lv.io.from_mujoco_many(None, np.zeros((2, 3)))
-
-
 def contact(given, k, change):
     """The contacts with another array in place k: world, efc_address, dim, friction."""
     return {"contacts": tuple(change(x) if i == k else x for i, x in enumerate(given["contacts"]))}
@@ -237,72 +196,6 @@ def contact(given, k, change):
 
 def contacts(given, change):
     return {"contacts": tuple(map(change, given["contacts"]))}
-
-
-@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
-def test_rows_of_an_earlier_step_without_nefc_name_nefc(cone):
-    """MuJoCo Warp leaves rows beyond nefc: a box in the air has the rows and forces of its last contact."""
-    model = mj.MjModel.from_xml_string(scene(cone=cone))
-    states = states_of(model, 1)
-    given = stacked(model, states, np.float32)
-    (m,) = given.pop("nefc")
-    given = {name: x[:, :m] if name.startswith("efc_") else x for name, x in given.items()}
-    qacc = forwarded(model, states[0]).qacc[None].astype(np.float32)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")  # Forces of this step follow from its acceleration.
-        lv.io.from_efc(**given, qacc=qacc)
-    if cone == "pyramidal":
-        with pytest.warns(UserWarning, match="pass nefc"):
-            lv.io.from_efc(**given, qacc=qacc - np.float32(9.81))
-    else:  # Elliptic rows without a contact of this step.
-        given["contacts"] = tuple(x[:0] for x in given["contacts"])
-        with pytest.raises(lv.InputError, match="pass nefc"):
-            lv.io.from_efc(**given, qacc=qacc)
-
-
-#: A change of valid arrays, and the words of its refusal. Most were read as problems before.
-MALFORMED = {
-    "no type that there is": (lambda g: {"efc_type": 0 * g["efc_type"] + 99}, "efc_type of world 0, row 0 is 99"),
-    "half a type": (lambda g: {"efc_type": 0 * g["efc_type"] + 0.5}, r"efc_type of world 0, row 0 is 0\.5"),
-    "a negative type": (lambda g: {"efc_type": g["efc_type"] - 8}, "efc_type of world 0, row 0 is -"),
-    "types of worlds": (lambda g: {"efc_type": g["efc_type"][:, :1]}, r"efc_type has shape \(3, 1\)"),
-    "a flat J": (lambda g: {"efc_J": g["efc_J"].reshape(3, -1)}, "efc_J has shape"),
-    "more rows than J has": (lambda g: {"nefc": np.array([100, 1, 1])}, "nefc of world 0 is 100"),
-    "a negative count": (lambda g: {"nefc": np.array([1, -1, 1])}, "nefc of world 1 is -1"),
-    "half a row": (lambda g: {"nefc": np.array([1.5, 1.0, 1.0])}, "nefc holds"),
-    "an infinite D": (lambda g: {"efc_D": -np.inf * g["efc_D"]}, "efc_D of world 0, row 0 is -inf"),
-    "a negative friction loss": (
-        lambda g: {"efc_type": 0 * g["efc_type"] + 1, "efc_frictionloss": -1.0, "contacts": None},
-        "efc_frictionloss of world 0, row 0 is -1",
-    ),
-    "friction losses of worlds": (lambda g: {"efc_frictionloss": np.ones((3, 1))}, "efc_frictionloss has shape"),
-    "a flat M": (lambda g: {"M": g["M"].reshape(3, -1)}, "M has shape"),
-    "M of other velocities": (lambda g: {"M": g["M"][:, 1:, 1:]}, "M has shape"),
-    "a triangle without pointers": (lambda g: {"M": (g["M"][:, 0],)}, "M has shape"),
-    "a triangle out of range": (lambda g: {"M": (g["M"][:, 0], [1, 2], [0, 1, 2])}, "do not describe a lower triangle"),
-    "no contacts": (lambda g: {"contacts": ()}, "contacts is"),
-    "contacts without friction": (lambda g: {"contacts": g["contacts"][:3]}, "contacts is"),
-    "contacts of several lengths": (lambda g: contact(g, 0, lambda x: x[1:]), "efc_address of contacts has shape"),
-    "one contact for another": (
-        lambda g: contacts(g, lambda x: np.concatenate([x[:1], x[:1], x[2:]])),
-        r"row \d+ of world 0 belongs to [02] of the contacts, and by efc_type it is an elliptic row",
-    ),
-    "a contact twice": (lambda g: contacts(g, lambda x: np.concatenate([x[:1], x])), "belongs to 2 of the contacts"),
-    "contacts a row too far": (lambda g: contact(g, 1, lambda x: x + 1), "of the contacts|must be at most"),
-    "contacts of other worlds": (lambda g: contact(g, 0, lambda x: (x + 1) % 3), "of the contacts|must be at most"),
-    "seven rows": (lambda g: contact(g, 2, lambda x: x + 4), "dim of contact 0 is 7"),
-    "no coefficient": (lambda g: contact(g, 3, lambda x: 0.0 * x), "friction of contact 0 is 0"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("what", MALFORMED)
-def test_malformed_arrays_are_refused_by_name(what):
-    model = mj.MjModel.from_xml_string(scene(cone="elliptic", condim=3))
-    given = stacked(model, states_of(model, 3), np.float64)
-    lv.io.from_efc(**given)
-    change, words = MALFORMED[what]
-    with pytest.raises(lv.InputError, match=words):
-        lv.io.from_efc(**given | change(given))
 
 
 def test_the_law_of_contacts_can_be_coulombs():
@@ -315,15 +208,6 @@ def test_the_law_of_contacts_can_be_coulombs():
         np.testing.assert_array_equal(rigid.batch[i].b, relaxed.batch[i].b)
         np.testing.assert_array_equal(rigid.batch[i].dense(), relaxed.batch[i].dense())
         assert rigid.batch[i].friction == "coulomb"
-
-
-def test_coulombs_law_is_rejected_where_it_is_not_defined():
-    model = mj.MjModel.from_xml_string(scene(cone="elliptic", condim=4))
-    given = stacked(model, states_of(model, 2), np.float64)
-    with pytest.raises(lv.CapabilityError, match="torsional or rolling"):
-        lv.io.from_efc(**given, friction="coulomb")
-    with pytest.raises(lv.InputError, match="friction"):
-        lv.io.from_efc(**given, friction="ccp")
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -3e10])

@@ -2,7 +2,6 @@
 
 import dataclasses
 import os
-import sys
 
 import numpy as np
 import pytest
@@ -263,65 +262,6 @@ def test_files_that_mix_kinds_or_miss_a_moment_are_told(tmp_path):
 GOOD = encoded(W, -2)
 
 
-@pytest.mark.parametrize(
-    ("changes", "sign"),
-    [
-        ({"W": GOOD | {"p": np.array([0, 2, 1, 6], np.int32)}}, "pointers"),
-        ({"W": GOOD | {"p": np.array([0, 2, 4, 60], np.int32)}}, "announce 60 entries"),
-        ({"W": GOOD | {"p": np.array([0, 2], np.int32)}}, "pointers"),
-        ({"W": GOOD | {"i": np.array([0, 1, 1, 2, 0, 3], np.int32)}}, "indices from 0 to 3"),
-        ({"W": GOOD | {"i": np.array([0, 1, 1, 2, 0, -1], np.int32)}}, "indices from -1 to 2"),
-        ({"W": GOOD | {"i": np.zeros(6)}}, "whole numbers"),
-        ({"W": GOOD | {"x": np.full(6, np.nan)}}, "finite"),
-        ({"W": GOOD | {"x": np.zeros(3)}}, "announce 6 entries"),
-        ({"W": GOOD | {"x": np.array([b"1"] * 6)}}, "numbers are needed"),
-        ({"W": GOOD | {"m": np.array([4], np.int32), "p": np.array([0, 2, 4, 6, 6])}}, "4 x 3"),
-        ({"W": GOOD | {"m": np.array([-3], np.int32)}}, "declares -3 rows"),
-        ({"W": GOOD | {"m": np.array([2**40])}}, "32-bit integer"),
-        ({"W": GOOD | {"m": np.array([3, 3], np.int32)}}, "1 are needed"),
-        ({"W": GOOD | {"nz": np.array([-3], np.int32)}}, "nz must be -2"),
-        ({"W": GOOD | {"nz": np.array([5], np.int32), "p": np.zeros(4, np.int32)}}, "nz announces 5 triplets"),
-        (
-            {"W": GOOD | {"nz": np.array([3], np.int32), "p": np.array([0, 1, 3], np.int32)}},
-            "3 rows and 3 columns are declared",
-        ),
-        ({"W": {k: v for k, v in GOOD.items() if k != "nz"}}, "W/nz is missing"),
-        ({"q": np.zeros(4)}, "q has 4 entries; 3"),
-        ({"q": np.full(3, np.inf)}, "finite"),
-        ({"mu": [0.5, 0.5]}, "mu has 2 entries; 1"),
-        ({"mu": [-0.5]}, "mu"),
-        ({"mu": None}, "mu is missing"),
-        ({"spacedim": 2}, "has 3 rows, which is not a multiple of spacedim = 2"),
-        ({"spacedim": 5}, "2 or 3 is needed"),
-    ],
-)
-def test_inconsistent_files_are_refused_by_name(tmp_path, changes, sign):
-    parts = {"W": GOOD, "q": np.zeros(3), "mu": [0.5]} | changes
-    path = make(tmp_path / "bad.h5", **{n: v for n, v in parts.items() if v is not None})
-    with pytest.raises(lv.InputError, match=sign) as error:
-        lavender.io.load(path)
-    assert "bad.h5" in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("group", "datasets", "sign"),
-    [
-        ("solution", {"u": np.zeros(3)}, "solution/r is missing"),
-        ("solution", {"r": np.zeros(2)}, "solution/r has 2"),
-        ("guesses", {"number_of_guesses": np.array([2**31 - 1])}, "number_of_guesses"),
-        ("guesses", {"number_of_guesses": np.array([1]), "1": np.zeros(3)}, "1/r is missing"),
-        ("guesses", {"number_of_guesses": np.array([1]), "1/r": np.full(3, np.nan)}, "finite"),
-    ],
-)
-def test_wrong_solutions_and_guesses_are_refused(tmp_path, group, datasets, sign):
-    path = make(tmp_path / "p.h5", W=GOOD, q=np.zeros(3), mu=[0.5])
-    with h5py.File(path, "a") as file:
-        for name, value in datasets.items():
-            file[f"{group}/{name}"] = value
-    with pytest.raises(lv.InputError, match=sign):
-        lavender.io.load(path)
-
-
 def test_a_singular_mass_matrix_is_refused(tmp_path):
     parts = {"M": encoded(np.diag([1.0, 0.0]), -2), "H": encoded(np.ones((2, 3)), -2)}
     with pytest.raises(lv.InputError, match="invertible M"):
@@ -352,27 +292,6 @@ def test_a_flipped_bit_of_any_array_is_told(tmp_path):
                     lavender.io.read(path)
 
 
-def test_numbers_that_are_shorter_than_their_checksum_are_told(tmp_path):
-    """HDF5 2.0 reads on from there, to the end of the process."""
-    path = tmp_path / "p.hdf5"
-    lavender.io.save(local_problem(), path)
-    with h5py.File(path, "r+") as file:
-        file["fclib_local/vectors/mu"].id.write_direct_chunk((0,), b"cut")
-    with pytest.raises(lv.InputError, match="mu has a chunk that is shorter than its checksum"):
-        lavender.io.load(path)
-
-
-def test_files_that_are_no_fclib_are_refused(tmp_path):
-    with h5py.File(tmp_path / "foreign.h5", "w") as file:
-        file["weights"] = np.zeros(3)
-    with pytest.raises(lv.InputError, match="holds weights; an FCLIB file"):
-        lavender.io.load(tmp_path / "foreign.h5")
-    with h5py.File(tmp_path / "group.h5", "w") as file:
-        file["fclib_local"] = np.zeros(3)
-    with pytest.raises(lv.InputError, match="spacedim is missing"):
-        lavender.io.load(tmp_path / "group.h5")
-
-
 def test_nothing_outside_the_file_is_read(tmp_path):
     secret = tmp_path / "secret.bin"
     np.arange(3.0).tofile(secret)
@@ -394,14 +313,3 @@ def test_nothing_outside_the_file_is_read(tmp_path):
                 vectors.create_virtual_dataset("q", layout)
         with pytest.raises(lv.InputError, match=r"not followed|not read"):
             lavender.io.load(path)
-
-
-def test_without_h5py_the_extra_is_named(tmp_path, monkeypatch):
-    lavender.io.save(local_problem(), tmp_path / "p.hdf5")
-    monkeypatch.setitem(sys.modules, "h5py", None)
-    for act in (
-        lambda: lavender.io.load(tmp_path / "p.hdf5"),
-        lambda: lavender.io.save(local_problem(), tmp_path / "q.h5"),
-    ):
-        with pytest.raises(lv.InputError, match=r"lavender-contact\[fclib\]"):
-            act()

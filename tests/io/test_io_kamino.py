@@ -138,15 +138,6 @@ def test_velocity_after_the_step_is_the_engines(model):
         start = stop
 
 
-def test_worlds_of_several_sizes_are_as_alone():
-    # The stack is world 0 of the mixed model and each world of the other one; both start alike.
-    mixed, stacks = lv.io.from_kamino(load("mixed")[0]), lv.io.from_kamino(load("stacks")[0])
-    a, b = mixed.batch[0], stacks.batch[0]
-    np.testing.assert_allclose(a.dense(), b.dense(), rtol=1e-12, atol=1e-14)
-    np.testing.assert_allclose(a.b, b.b, rtol=1e-12, atol=1e-14)
-    assert a.names == b.names
-
-
 def test_a_world_with_nan_is_named_and_touches_no_other():
     step = lv.io.from_kamino(load("stacks")[0])
     residuals = lv.residual_many(step.batch, step.impulse, errors="status")
@@ -162,30 +153,12 @@ def test_wrong_matrix_is_rejected():
         lv.io.from_kamino(load("mixed", inv_m_i=lambda x: 1.01 * x)[0])
 
 
-def test_matrix_is_compared_once_or_on_request():
-    solver, _ = load("mixed")
-    lv.io.from_kamino(solver)
-    solver._solver_kamino.problem_fd.data.D = Recorded(2.0 * solver._solver_kamino.problem_fd.data.D.numpy())
-    lv.io.from_kamino(solver)
-    with pytest.raises(lv.CapabilityError, match="the engine's matrix differs"):
-        lv.io.from_kamino(solver, verify=True)
-
-
 @pytest.mark.parametrize(("option", "value"), [("dynamics_solver", "lox"), ("sparse_dynamics", True)])
 def test_other_configurations_are_rejected_by_name(option, value):
     solver, _ = load("mixed")
     setattr(solver._solver_kamino._config, option, value)
     with pytest.raises(lv.CapabilityError, match=f"{option}={value!r}"):
         lv.io.from_kamino(solver)
-
-
-def test_missing_attributes_and_other_objects_are_rejected():
-    solver, _ = load("mixed")
-    del solver._solver_kamino.problem_fd.data.bound_lower
-    with pytest.raises(lv.CapabilityError, match="bound_lower"):
-        lv.io.from_kamino(solver)
-    with pytest.raises(lv.InputError, match="a dict; a newton"):
-        lv.io.from_kamino({})
 
 
 def test_singular_inertia_is_rejected_by_its_body():

@@ -157,33 +157,6 @@ def test_nothing_is_unpickled(tmp_path, monkeypatch):
     assert not trace.exists()
 
 
-@pytest.mark.parametrize(
-    ("entry", "sign"),
-    [
-        (npy("<f8", (2**60,)), "declares"),
-        (npy("<f8", (2**40, 2**40)), "declares"),
-        (npy("<f8", (12,), bytes(95)), "declares"),
-        (npy("<f8", (12,), bytes(97)), "declares"),
-        (npy("<f8", (-12,), b""), "shape"),
-        (npy("<f8", (True, 12), bytes(96)), "integer|shape"),
-        (npy("<f8", 12, bytes(96)), "shape"),
-        (npy([("x", "<f8")], (12,), bytes(96)), "plain numbers are needed"),
-        (npy("<c16", (6,), bytes(96)), "numbers are needed"),
-        (npy("<M8[s]", (12,), bytes(96)), "numbers are needed"),
-        (npy("nonsense", (12,), bytes(96)), "cannot be read"),
-        (npy("<f8", (12,), bytes(96), version=4), "version 1.0"),
-        (b"\x93NUMPY\x01\x00\xff\xff" + b" " * 65535, "header"),
-        (b"\x93NUMPY\x01\x00\x10\x00" + b"(" * 16, "cannot be read"),
-        (b"\x93NUMPY\x02\x00\xff\xff\xff\xff", "version 1.0"),
-        (b"", "magic"),
-        (b"\x93NUM", "magic"),
-    ],
-)
-def test_entries_that_lie_are_refused(tmp_path, entry, sign):
-    with pytest.raises(lv.InputError, match=sign):
-        lavender.io.load(own(tmp_path, b=entry))
-
-
 def test_an_archive_that_hides_its_size_is_refused(tmp_path):
     path = own(tmp_path)
     raw = bytearray(path.read_bytes())
@@ -194,97 +167,9 @@ def test_an_archive_that_hides_its_size_is_refused(tmp_path):
         lavender.io.load(path)
 
 
-def test_files_that_are_no_problem_are_refused(tmp_path):
-    cases = {
-        "empty.npz": (b"", "is empty"),
-        "text.npz": (b"Hello, world", "starts with"),
-        "short.npz": (b"PK", "not a complete"),
-    }
-    for name, (content, sign) in cases.items():
-        (tmp_path / name).write_bytes(content)
-        with pytest.raises(lv.InputError, match=sign):
-            lavender.io.load(tmp_path / name)
-    with pytest.raises(lv.InputError, match="holds the entries x, y; a problem has"):
-        lavender.io.load(archive(tmp_path / "foreign.npz", {"x": 1, "y": 2}))
-    with pytest.raises(lv.InputError, match="holds the entries nothing"):
-        lavender.io.load(archive(tmp_path / "none.npz", {}))
-    with zipfile.ZipFile(tmp_path / "office.npz", "w") as out:
-        out.writestr("word/document.xml", "<xml/>")
-    with pytest.raises(lv.InputError, match=r"word/document\.xml"):
-        lavender.io.load(tmp_path / "office.npz")
-    with zipfile.ZipFile(tmp_path / "twice.npz", "w") as out:
-        out.writestr("b.npy", npy("<f8", (0,)))
-        with pytest.warns(UserWarning, match="Duplicate"):
-            out.writestr("b.npy", npy("<f8", (0,)))
-    with pytest.raises(lv.InputError, match="with different names"):
-        lavender.io.load(tmp_path / "twice.npz")
-
-
 # Of whom entries of these names are, before a kernel reads them.
 OF = {"A_": lv.Problem.linear(sp.eye_array(4, format="csr"), np.ones(4))}
 OF |= dict.fromkeys(("rows_", "compliance"), random_contact_problem(1))
-META = {"operator": "dense", "friction": "coulomb", "name": "", "names": None}
-
-
-@pytest.mark.parametrize(
-    ("changes", "sign"),
-    [
-        ({"lavender_format": np.int64(2)}, "this lavender reads 1"),
-        ({"lavender_format": np.bool_(True)}, "this lavender reads 1"),
-        ({"lavender_format": np.array("1.0")}, "this lavender reads 1"),
-        ({"lavender_format": np.array([1, 1])}, "one value"),
-        ({"b": None}, "entries b are missing"),
-        ({"A": None, "cones_mu": None}, "entries cones_mu, A are missing"),
-        ({"extra": np.zeros(1)}, "extra do not belong"),
-        ({"meta": np.frombuffer(b"{", np.uint8)}, "JSON"),
-        ({"meta": np.frombuffer(b"\xff\xfe", np.uint8)}, "JSON"),
-        ({"meta": np.zeros(3)}, "JSON"),
-        ({"meta": np.frombuffer(b"[" * 100_000, np.uint8)}, "JSON"),
-        ({"meta": META | {"operator": "magic"}}, "operator is 'magic'"),
-        ({"meta": META | {"names": "abc"}}, "names is 'abc'"),
-        ({"meta": META | {"names": [1]}}, "a list of names, or null"),
-        ({"meta": META | {"more": 1}}, "unknown names more"),
-        ({"meta": META | {"friction": "glue"}}, "'coulomb' or 'cone'"),
-        ({"meta": META | {"precision": "float16"}}, "precision is 'float16'; float64 or float32"),
-        ({"meta": META | {"names": ["one"]}}, "entries for 12 blocks"),
-        ({"meta": META | {"program": 2}}, "program is 2; a number of variables, with the operator csr"),
-        ({"meta": META | {"operator": "csr", "program": True}}, "program is True; a number of variables"),
-        ({"b": np.full(12, np.nan)}, "finite"),
-        ({"b": np.array(["1"] * 12)}, "numbers are needed"),
-        ({"b": np.zeros(11)}, "b .*shape"),
-        ({"A": np.zeros((12, 11))}, "A .*shape"),
-        ({"key": np.zeros(12)}, "key"),
-        ({"guess": np.zeros(3)}, "guess"),
-        ({"impulse": np.zeros(3)}, "impulse"),
-        ({"cones_ptr": np.arange(13)[::-1]}, "cones.ptr"),
-        ({"cones_lower": np.full(12, np.nan)}, "NaN"),
-        ({"A_indices": np.array([0, 1, 9, 3], np.int32)}, "column indices from 0 to 9"),
-        ({"A_indices": np.array([0, 1, -1, 3], np.int32)}, "column indices from -1 to 3"),
-        ({"A_indptr": np.array([0, 3, 2, 3, 4], np.int32)}, "pointers"),
-        ({"A_indptr": np.array([0, 1, 2, 3, 2**30], np.int32)}, "announce 1073741824 entries"),
-        ({"A_indptr": np.array([1, 1, 2, 3, 4], np.int32)}, "pointers"),
-        ({"A_indptr": np.array([0, 4], np.int32)}, "pointers"),
-        ({"A_indptr": np.array([0.0, 1, 2, 3, 4])}, "pointers"),
-        ({"A_data": np.zeros((2, 2))}, "values"),
-        ({"A_shape": np.array([2**31, 2**31])}, "A_shape"),
-        ({"A_shape": np.array([4])}, "A_shape"),
-        ({"rows_contact_body": np.full((8, 2), 99, np.int32)}, "body 99"),
-        ({"rows_joint_body": np.full((3, 2), -2, np.int32)}, "body -2"),
-        ({"rows_joint_ptr": np.array([0, 2**31 - 1], np.int32)}, "jac"),
-        ({"rows_normal": np.zeros((8, 3))}, "unit vectors"),
-        ({"rows_arm_a": np.zeros((7, 3))}, "arm_a"),
-        ({"compliance": np.full(1, -1.0)}, "compliance"),
-    ],
-)
-def test_an_inconsistent_file_of_our_own_is_refused_by_name(tmp_path, changes, sign):
-    changes = {
-        n: np.frombuffer(json.dumps(v).encode(), np.uint8) if isinstance(v, dict) else v for n, v in changes.items()
-    }
-    problem = next((p for start, p in OF.items() if min(changes).startswith(start)), None)
-    assert problem is None or lavender.io.load(own(tmp_path, problem)) == problem
-    with pytest.raises(lv.InputError, match=sign) as error:
-        lavender.io.load(own(tmp_path, problem, **changes))
-    assert "own.npz" in str(error.value)
 
 
 def test_a_program_with_a_singular_hessian_comes_back_and_its_form_is_checked(tmp_path):
@@ -357,32 +242,6 @@ def test_box_matrices_may_be_sparse_and_of_any_number(tmp_path):
     assert whole.b.dtype == np.float64
 
 
-@pytest.mark.parametrize(
-    ("changes", "sign"),
-    [
-        ({"A": None}, "no entry 'A_shape'"),
-        ({"lo": np.zeros(6)}, "'lo'"),
-        ({"lo": np.full(7, 1.0), "hi": np.zeros(7)}, "lower <= upper"),
-        ({"b": np.zeros((7, 1))}, "one dimension"),
-        ({"cone_start": [5], "cone_dim": [3], "cone_mu": [0.5]}, "within rows 0 to 6"),
-        ({"cone_start": [-1], "cone_dim": [3], "cone_mu": [0.5]}, "within rows 0 to 6"),
-        ({"cone_start": [0, 2], "cone_dim": [3, 3], "cone_mu": [0.5, 0.5]}, "overlap"),
-        ({"cone_start": [0], "cone_dim": [5], "cone_mu": [0.5]}, "1 to 3 rows"),
-        ({"cone_start": [0], "cone_dim": [3], "cone_mu": [-0.5]}, "mu"),
-        ({"cone_start": [0], "cone_dim": [3, 3], "cone_mu": [0.5]}, "'cone_dim'"),
-        ({"cone_start": [0], "cone_mu": [0.5]}, "'cone_dim'"),
-        ({"cone_start": [0.5], "cone_dim": [3], "cone_mu": [0.5]}, "'cone_start' holds"),
-        ({"cone_start": [0], "cone_dim": [2.5], "cone_mu": [0.5]}, "'cone_dim' holds"),
-        ({"cone_start": [np.nan], "cone_dim": [3], "cone_mu": [0.5]}, "'cone_start' holds"),
-        ({"l_ref": np.zeros(3)}, "l_ref"),
-        ({"A": np.full((7, 7), np.inf)}, "finite"),
-    ],
-)
-def test_a_wrong_box_file_is_refused_by_name(tmp_path, changes, sign):
-    with pytest.raises(lv.InputError, match=sign):
-        lavender.io.load(box(tmp_path, **changes))
-
-
 def test_the_documentation_lists_every_entry_of_our_format(tmp_path):
     text = (Path(__file__).resolve().parent.parent.parent / "docs" / "formats.md").read_text(encoding="utf-8")
     for _, problem in variants():
@@ -390,10 +249,3 @@ def test_the_documentation_lists_every_entry_of_our_format(tmp_path):
         with np.load(tmp_path / "p.npz") as saved:
             missing = [name for name in saved if f"`{name}`" not in text]
         assert missing == []
-
-
-@pytest.mark.parametrize(("indices", "indptr"), [([0, 9], [0, 1, 2]), ([0, -1], [0, 1, 2]), ([0, 1], [0, 2, 1])])
-def test_a_broken_compressed_matrix_is_refused_in_memory_too(indices, indptr):
-    broken = sp.csr_array((np.ones(2), np.array(indices), np.array(indptr)), shape=(2, 2))
-    with pytest.raises(lv.InputError, match="not a valid compressed matrix"):
-        lv.Problem.linear(broken, [1.0, 1.0])

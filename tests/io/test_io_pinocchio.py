@@ -157,19 +157,6 @@ def test_a_desired_velocity_is_the_targets(kind):
     np.testing.assert_allclose(problem_of(model, [one], q, v).b - without, added)
 
 
-def test_what_pinocchio_leaves_out_itself_is_refused():
-    model, _, q, v = robot()
-    frame = pin.FrameAnchorConstraintModel(model, 0, pin.SE3.Identity(), 2, pin.SE3.Identity())
-    assert problem_of(model, [frame], q, v).m == 6
-    frame.desired_constraint_offset = np.full(6, 0.1)
-    with pytest.raises(lv.CapabilityError, match="offset"):
-        problem_of(model, [frame], q, v)
-    hinges = chain(3)
-    mimic = pin.transformJointIntoMimic(hinges, 1, 3, 2.0, 0.1)
-    with pytest.raises(lv.CapabilityError, match="mimic"):
-        problem_of(mimic, [], np.zeros(2), np.zeros(2))
-
-
 @pytest.mark.parametrize("where", ["joint", "constraint"])
 @pytest.mark.parametrize("rotation", [2.0 * np.eye(3), np.diag([1.0, 1.0, -1.0]), np.full((3, 3), np.nan)])
 def test_a_placement_that_does_not_rotate_is_refused(where, rotation):
@@ -192,17 +179,6 @@ def test_a_model_of_nothing_and_one_out_of_order():
         model.appendBodyToJoint(joint, pin.Inertia.Random(), pin.SE3.Identity())
     with pytest.raises(lv.InputError, match="follow one another"):
         problem_of(model, [], np.zeros(3), np.zeros(3))
-
-
-def test_what_does_not_fit_is_said():
-    model, models, q, v = robot()
-    with pytest.raises(lv.errors.InputError, match="one for each"):
-        lv.io.from_pinocchio(model, model.createData(), models, [], 0.01, q=q, v=v)
-    with pytest.raises(lv.errors.InputError, match="dt"):
-        problem_of(model, models, q, v, dt=0.0)
-    with pytest.raises(lv.errors.InputError, match=r"pinocchio\.Model"):
-        lv.io.from_pinocchio(3, model.createData(), [], [], 0.01, q=q, v=v)
-    assert problem_of(model, [], q, v).m == 0
 
 
 # -- data that were changed -----------------------------------------------------------------------------
@@ -256,29 +232,6 @@ def changed(what):
     return model, data, models, datas, q, v
 
 
-@pytest.mark.parametrize(
-    "what",
-    [
-        "data of 1", "data of 3", "data of 12", "constraint contact", "constraint friction", "constraint limit",
-        "order of data", "no constraints", "no data", "none", "joint 1", "joint 2", "parent", "parent of itself",
-        "idx_vs", "nvs", "idx_qs", "nqs", "rotation", "another joint",
-    ],
-)  # fmt: skip
-def test_what_does_not_fit_is_refused_before_it_is_followed(what):
-    model, data, models, datas, q, v = changed(what)
-    with pytest.raises(lv.InputError):
-        lv.io.from_pinocchio(model, data, models, datas, 0.01, q=q, v=v)
-
-
-def test_data_of_another_constraint_are_not_written():
-    model, models, q, v = robot()
-    datas = [m.createData() for m in models]
-    right = lv.io.from_pinocchio(model, model.createData(), models, datas, 0.01, q=q, v=v)
-    big = chain(12)
-    datas[2] = pin.JointLimitConstraintModel(big, list(range(1, 13))).createData()
-    assert lv.io.from_pinocchio(model, model.createData(), models, datas, 0.01, q=q, v=v) == right
-
-
 def anchored_chain(kind):
     """A chain of four hinges with its tip anchored, a velocity that keeps the anchor, and (dJ/dt) v by kinematics."""
     model, parent = pin.Model(), 0
@@ -319,11 +272,3 @@ def test_from_pinocchio_acceleration_level_gives_the_constrained_acceleration(ki
 
     np.testing.assert_allclose(accelerate("acceleration"), exact, atol=1e-8 * np.abs(exact).max())
     assert np.abs(accelerate("velocity") - exact).max() > 1e-3 * np.abs(exact).max()  # Its error does not depend on dt.
-
-
-def test_from_pinocchio_acceleration_level_of_contacts_is_refused():
-    model, models, q, v = robot()
-    with pytest.raises(lv.CapabilityError, match="only anchors have an acceleration level"):
-        problem_of(model, models, q, v, level="acceleration")
-    with pytest.raises(lv.InputError, match="level"):
-        problem_of(model, models[:1], q, v, level="force")

@@ -147,32 +147,6 @@ def test_recorder_that_is_killed_leaves_no_line_without_a_file(tmp_path, monkeyp
     assert [path.name for path in tmp_path.glob("*.npz")] == list(recorder.files)
 
 
-def test_read_recorded_state_of_a_file_that_numpy_cannot_load_says_so(tmp_path):
-    (tmp_path / "states").mkdir()
-    np.savez(tmp_path / "states" / "a.npz", q=np.array([None], object))
-    (tmp_path / "states" / "b.npz").write_bytes(b"no archive")
-    for name in ("a.npz", "b.npz"):
-        with pytest.raises(lv.InputError, match=f"cannot read the state .*{name}"):
-            lv.io.read_recorded_state(tmp_path, name)
-
-
-def test_arguments_and_folders_are_checked(tmp_path):
-    with pytest.raises(lv.InputError, match="nothing would be recorded"):
-        lv.io.Recorder(tmp_path / "a")
-    with pytest.raises(lv.InputError, match="when is 3"):
-        lv.io.Recorder(tmp_path / "a", when=3)
-    with lv.io.Recorder(tmp_path / "a", every=1) as recorder:
-        with pytest.raises(lv.InputError, match="another"):  # the folder is locked
-            lv.io.Recorder(tmp_path / "a", every=1)
-        recorder.add(step_of([0.1]))
-        with pytest.raises(lv.InputError, match=r"state 'q' has shape \(3,\); a first dimension of 1 worlds"):
-            recorder.add(step_of([0.1]), state={"q": np.zeros(3)})
-    with pytest.raises(lv.InputError, match="holds 1 problem files"):
-        lv.io.Recorder(tmp_path / "a", every=1)
-    with lv.io.Recorder(tmp_path / "a", every=1, replace=True) as recorder:
-        assert not list((tmp_path / "a").glob("*.npz"))
-
-
 def test_recorder_writes_json_without_nan(tmp_path):
     """JSON has no NaN: a time that is not known is null, and readers take it as missing."""
     with lv.io.Recorder(tmp_path / "all", every=1) as recorder:

@@ -108,16 +108,6 @@ def make_row_of_boxes(n, options=""):
     return model, data
 
 
-@pytest.mark.parametrize(("n", "is_known"), [(19, True), (25, False)])
-def test_record_of_more_islands_than_mujoco_counts_has_no_iterations(tmp_path, n, is_known):
-    model, data = make_row_of_boxes(n)
-    lv.io.record(model, data, tmp_path, 10, every=10)
-    (line,) = map(json.loads, (tmp_path / "engine.jsonl").read_text().splitlines())
-    assert data.nisland == n
-    assert line["iterations"] == (np.sum(data.solver_niter) if is_known else None)
-    assert line["noslip_iterations"] == (0 if is_known else None)
-
-
 def test_record_with_noslip_separates_its_iterations(tmp_path):
     lines = []
     for options in ("", 'noslip_iterations="5" noslip_tolerance="0"'):
@@ -169,26 +159,3 @@ def test_controls_are_played_drawn_or_called(tmp_path):
         lv.io.record(model, data, tmp_path, 1, replace="no")
     with pytest.raises(lv.InputError, match="steps is 0"):
         lv.io.record(model, data, tmp_path, 0)
-
-
-HUGE = b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000, 1), }".ljust(117) + b"\n"
-CONTROLS = {
-    "an archive": lambda path: np.savez(path, a=np.zeros((3, 1)), b=np.zeros(2)),
-    "words": lambda path: np.save(path, np.array([["a"]])),
-    "objects": lambda path: np.save(path, np.array([[None]]), allow_pickle=True),
-    "one row": lambda path: np.save(path, np.zeros(3)),
-    "a head cut short": lambda path: path.write_bytes(b"\x93NUMPY"),
-    "more than memory": lambda path: path.write_bytes(b"\x93NUMPY\x01\x00\x76\x00" + HUGE),
-    "a folder": lambda path: path.mkdir(),
-    "nothing": lambda path: None,
-}
-
-
-@pytest.mark.parametrize("make", CONTROLS.values(), ids=CONTROLS)
-def test_controls_of_another_thing_are_refused_by_name(tmp_path, make):
-    (tmp_path / "model.xml").write_text(scene())
-    path = tmp_path / "controls.npy"
-    make(path)
-    path = next(tmp_path.glob("controls*"), path)  # NumPy gives an archive a suffix of its own
-    with pytest.raises(lv.InputError, match="control"):
-        recording.record_file(tmp_path / "model.xml", tmp_path / "out", 3, control=str(path))

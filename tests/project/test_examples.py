@@ -196,14 +196,6 @@ def test_the_planar_engine_holds_its_joints_and_its_circles(drawn):
         assert f"{words} {lines} lines" in page.read_text(encoding="utf-8")
 
 
-def test_example_with_an_unknown_panel_lists_the_panels(tmp_path):
-    with pytest.raises(
-        SystemExit, match=r"name the figure after a panel \(paths, speed\), or engine_2d for all panels"
-    ):
-        example("engine_2d").main(str(tmp_path / "spead.png"))
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_the_planar_engine_runs_when_it_is_copied_alone(tmp_path):
     copy = tmp_path / "engine_2d.py"
     copy.write_text(example("engine_2d").__loader__.get_source("engine_2d"), encoding="utf-8")

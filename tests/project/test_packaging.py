@@ -25,21 +25,19 @@ import lavender_ext
 from lavender.io.stored import write_atomically
 
 ROOT = Path(__file__).resolve().parent.parent.parent
-KERNELS = Path(lavender_ext.__file__).parent
-MODULES = sorted(".".join(path.relative_to(KERNELS).with_suffix("").parts) for path in KERNELS.rglob("*.pyx"))
 
 
-def test_version_is_the_installed_one_and_in_the_changelog():
+def test_version_equals_the_installed_one_and_has_changes():
     assert lavender.__version__ == importlib.metadata.version("lavender-contact")
     assert f"## [{lavender.__version__}]" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
 
 
-def test_what_is_not_built_says_what_to_do(tmp_path):
+def test_import_without_built_kernels_names_the_command(tmp_path):
     # A fresh clone hides an installed lavender from whoever starts Python in it. Without site-packages (-S), since
     # an editable installation finds its kernels even so.
     # Other tests may be writing modules and byte code meanwhile.
     rest = shutil.ignore_patterns("*.so", "*.pyd", "*.wasm", "*.part", "__pycache__")
-    for folder in (KERNELS, Path(lavender.__file__).parent):
+    for folder in (Path(lavender_ext.__file__).parent, Path(lavender.__file__).parent):
         shutil.copytree(folder, tmp_path / folder.name, ignore=rest)
     env = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     done = python("-S", "-c", "import lavender", status=1, cwd=tmp_path, env=env)
@@ -48,7 +46,7 @@ def test_what_is_not_built_says_what_to_do(tmp_path):
     assert "pip install -e ." in last
 
 
-def test_a_folder_of_the_same_name_beside_does_not_hide_the_package(tmp_path):
+def test_import_next_to_an_empty_folder_of_the_same_name_finds_the_package(tmp_path):
     # As Python started in the parent of a clone: an empty package comes before what only a finder knows.
     if "__editable___lavender" in "".join(getattr(f, "__module__", "") for f in sys.meta_path):
         pytest.skip("installed before setup.py asked for a .pth file: pip install -e . again")
@@ -57,7 +55,7 @@ def test_a_folder_of_the_same_name_beside_does_not_hide_the_package(tmp_path):
     assert done.stdout.strip() == lavender.__version__
 
 
-def test_no_text_offers_the_package_of_someone_else():
+def test_texts_with_pip_install_name_this_distribution():
     # `lavender` on PyPI is another project; ours is installed as lavender-contact.
     offers = re.compile(r"pip install[^\n`&|;]*?[ '\"]lavender(?![\w-])|\blavender\[\w")
     texts = [
@@ -77,7 +75,7 @@ def test_no_text_offers_the_package_of_someone_else():
     assert not offers.search("pip install 'lavender-contact[wasm]'")
 
 
-def test_links_of_the_metadata_stand_below_an_address_that_is_known_and_nowhere_else(tmp_path):
+def test_metadata_links_with_and_without_an_address_are_absolute_or_absent(tmp_path):
     pytest.importorskip("Cython", reason="setup.py imports it (extra: test)")
 
     def metadata(**env):
@@ -99,52 +97,18 @@ def test_links_of_the_metadata_stand_below_an_address_that_is_known_and_nowhere_
     assert len(links) >= 6 and all(link.startswith("https://") for link in links)
 
 
-def test_the_citation_names_this_version_and_licence():
+def test_citation_file_names_this_version_and_licence():
     said = dict(re.findall(r"^([\w-]+): (.+)$", (ROOT / "CITATION.cff").read_text("utf-8"), re.MULTILINE))
     assert said["version"] == lavender.__version__
     assert said["license"] == tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["license"]
     assert {"cff-version", "message", "title"} <= set(said)
 
 
-def test_classifiers_claim_only_platforms_that_were_run():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-    systems = [line for line in project["classifiers"] if line.startswith("Operating System")]
-    assert systems == ["Operating System :: POSIX :: Linux"]
-    page = (ROOT / "docs" / "install.md").read_text("utf-8")
-    assert "| macOS, Windows | compiled by clang, not linked and not run |" in page
-
-
-def test_the_lock_file_names_what_the_package_asks_for():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-    asked = {re.split(r"[<>=]", line)[0] for line in project["dependencies"]}
-    lock = dict(re.findall(r"^([\w-]+)==(\S+)$", (ROOT / "docs" / "versions.txt").read_text("utf-8"), re.MULTILINE))
-    extras = project["optional-dependencies"]
-    needed = asked | {re.split(r"[<>=]", x)[0] for name in ("qp", "fclib", "mujoco") for x in extras[name]}
-    assert needed <= set(lock)
-
-
-def test_workflows_run_what_is_here():
+def test_workflows_name_files_that_exist():
     said = "".join(path.read_text("utf-8") for path in (ROOT / ".github" / "workflows").glob("*.yml"))
     named = set(re.findall(r"\.ci/[\w.]+|tests/[\w/.]+", said))
     assert ".ci/run" in named
     assert [name for name in named if not (ROOT / name).exists()] == []
-
-
-def test_types_ship():
-    assert (Path(lavender.__file__).parent / "py.typed").exists()
-
-
-@pytest.mark.parametrize("name", MODULES)
-def test_kernel_is_compiled_from_source_that_ships(name):
-    spec = importlib.util.find_spec(f"lavender_ext.{name}")
-    assert spec is not None
-    assert spec.origin.endswith((".so", ".pyd"))
-    assert (KERNELS / f"{name.replace('.', '/')}.pyx").exists()
-
-
-def test_command_is_installed():
-    (entry,) = importlib.metadata.entry_points(group="console_scripts", name="lavender")
-    assert callable(entry.load())
 
 
 def declared(table):
@@ -154,7 +118,7 @@ def declared(table):
     return {name.lower() for name in re.findall(r'"([A-Za-z0-9_-]+)[>"]', block)}
 
 
-def test_every_import_is_declared():
+def test_imports_of_the_package_are_declared():
     # Anything that lavender imports at all stands in pyproject.toml under its own name.
     known = declared("dependencies") | declared("fclib") | declared("qp")
     known |= declared("cluster") | declared("peers") | declared("mujoco") | declared("torch") | declared("jax")
@@ -176,13 +140,13 @@ def test_every_import_is_declared():
 
 
 @pytest.mark.parametrize("name", ["report", "test"])
-def test_readme_command_is_one_line_from_a_fresh_clone(name):
+def test_readme_command_starts_from_a_fresh_clone(name):
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     (line,) = re.findall(rf"^<!-- command: {name} -->\n```sh\n(.+)\n```$", text, re.MULTILINE)
     assert line.startswith("python3 -m venv .venv && .venv/bin/pip install ")
 
 
-def test_debug_build_differs_in_checks_alone():
+def test_debug_build_differs_in_two_checks():
     from lavender_ext.build_options import COMPILE_FLAGS, directives
 
     differ = {name for name, value in directives(debug=True).items() if value != directives()[name]}
@@ -193,7 +157,7 @@ def test_debug_build_differs_in_checks_alone():
 
 @pytest.mark.skipif(sys.platform == "win32" or not shutil.which("cc"), reason="needs a C compiler")
 @pytest.mark.parametrize("fast", ["-ffast-math", "-Ofast", "-funsafe-math-optimizations"])
-def test_cflags_do_not_change_how_numbers_are_rounded(fast, tmp_path):
+def test_cflags_with_fast_math_keep_rounding(fast, tmp_path):
     """They stand before our own flags, where a module is compiled and where it is linked."""
     from lavender_ext.build_options import COMPILE_FLAGS, LINK_FLAGS
 
@@ -204,7 +168,7 @@ def test_cflags_do_not_change_how_numbers_are_rounded(fast, tmp_path):
     assert "crtfastmath" not in done.stderr
 
 
-def test_without_a_compiler_nothing_is_translated_first(tmp_path):
+def test_build_without_a_compiler_fails_before_translation(tmp_path):
     """Two minutes of it ended in "[Errno 2] No such file or directory"."""
     pytest.importorskip("Cython", reason="setup.py imports it (extra: test)")
     words = ("setup.py", "-q", "build_ext", "--build-lib", tmp_path, "--build-temp", tmp_path)
@@ -220,7 +184,7 @@ def test_without_a_compiler_nothing_is_translated_first(tmp_path):
     assert "apt install python3-dev" in python("-c", code, status=1, env=env, timeout=60.0).stderr
 
 
-def test_what_is_being_written_is_in_no_distribution(tmp_path):
+def test_manifest_of_temporary_files_excludes_them(tmp_path):
     # The names that both writers use, beside files of the package.
     names = []
     write_atomically(tmp_path / "a.c", lambda part: part.write_text(names.append(part.name) or ""))
@@ -242,7 +206,7 @@ def test_what_is_being_written_is_in_no_distribution(tmp_path):
     assert done.stdout.split() == [*kept]
 
 
-def test_a_build_that_is_killed_leaves_no_word_that_its_files_are_current(tmp_path):
+def test_build_that_is_killed_leaves_no_stamp(tmp_path):
     pytest.importorskip("Cython", reason="the build translates the kernels (extra: test)")
     for folder in ("lavender", "lavender_ext"):
         (tmp_path / folder).symlink_to(ROOT / folder)
@@ -266,25 +230,7 @@ def test_a_build_that_is_killed_leaves_no_word_that_its_files_are_current(tmp_pa
     assert not stamp.exists()
 
 
-def test_only_our_own_sources_make_a_translation_old():
-    """pip unpacks Cython anew for each build, later than whatever was translated with the same before."""
-    pytest.importorskip("Cython", reason="the build translates the kernels (extra: test)")
-    code = """if True:
-        import runpy, sys
-        from Cython.Build.Dependencies import create_dependency_tree
-
-        sys.argv = ["setup.py", "-q", "--name"]
-        runpy.run_path("setup.py")
-        tree = create_dependency_tree()
-        for path in tree.all_dependencies("lavender_ext/core/order.pyx"):
-            print(tree.timestamp(path), path)"""
-    times = [line.partition(" ")[::2] for line in python("-c", code).stdout.splitlines()[1:]]
-    never = {path for time, path in times if float(time) == 0.0}
-    assert never == {path for _, path in times if "Includes" in path}
-    assert 0 < len(never) < len(times)
-
-
-def test_a_build_of_the_package_ships_the_modules(tmp_path, module, newton_module):
+def test_build_wasm_ships_both_modules(tmp_path, module, newton_module):
     pytest.importorskip("Cython", reason="the build translates the kernels (extra: test)")
     # As `pip wheel --no-build-isolation` runs it: built, or taken from the checkout where it is of these sources.
     shipped = tmp_path / "lavender" / "sim" / "web"

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from extreme_problems import SPECIAL
 from hypothesis import given, reject
-from invalid_values import Call, make_tests_of_calls
 from worked import after, python
 
 import lavender as lv
@@ -25,110 +24,6 @@ CARRIED = ("setting", "x", "q", "v", "cache_key", "cache_impulse", "cache_local"
 def trajectory(sim, steps):
     """Return the bytes of the positions after each step."""
     return [sim.step()[0]["positions"].tobytes() for _ in range(steps)]
-
-
-# -- public calls ------------------------------------------------------------------------------------------------
-
-
-def on_scene(method):
-    """Call a method of a new scene with one sphere, which a rejected call leaves as it was."""
-
-    def call(**arguments):
-        scene = lv.Scene()
-        scene.add_sphere()
-        try:
-            return getattr(scene, method)(**arguments)
-        except lv.LavenderError:
-            assert (scene.n_bodies, scene.n_joints) == (1, 0)
-            raise
-
-    return call
-
-
-def on_simulation(method):
-    """Call a method of a new simulation."""
-    return lambda **arguments: getattr(lv.Simulation("stack"), method)(**arguments)
-
-
-UP = np.array([0.0, 0.0, 1.0])
-JOINT = {"a": 0, "b": -1}
-JOINT_NAMES = {"kind": "joint", "a": "body", "b": "body"}
-BODY = {"mass": 1.0, "friction": 0.5, "restitution": 0.5, "patch_radius": 0.1, "position": np.ones(3),
-        "quaternion": np.array([1.0, 0.0, 0.0, 0.0]), "velocity": np.ones(3),
-        "angular_velocity": np.ones(3)}  # fmt: skip
-
-CALLS = {
-    "Scene": Call(
-        lv.Scene,
-        {"name": "stack", "n": 3, "gravity": np.array([0.0, 0.0, -9.81]), "warm_start": False}
-        | dict.fromkeys(("dt", "friction", "restitution", "patch_radius", "rolling_radius", "slop", "margin",
-                         "restitution_threshold", "max_substep", "mass", "size"), 0.25)
-        | dict.fromkeys(("substeps", "solver_iterations", "position_iterations", "seed"), 4),
-        {"name": "scene"},
-    ),
-    "Scene.add_body": Call(on_scene("add_body"), BODY | {"inertia": np.ones(3)}),
-    "Scene.add_box": Call(on_scene("add_box"), BODY | {"size": np.ones(3)}),
-    "Scene.add_box, static": Call(on_scene("add_box"), {"static": True}),
-    "Scene.add_plane": Call(on_scene("add_plane"), {"normal": UP, "offset": 0.5}),
-    "Scene.add_sphere": Call(on_scene("add_sphere"), BODY | {"radius": 0.5}),
-    "Scene.add_joint": Call(
-        on_scene("add_joint"),
-        JOINT | {"kind": "hinge", "anchor": np.zeros(3), "axis": UP, "hertz": 0.5, "damping": 1.0, "collide": True},
-        JOINT_NAMES,
-    ),
-    "Scene.add_joint, distance": Call(
-        on_scene("add_joint"),
-        JOINT | {"kind": "distance", "anchor_a": np.zeros(3), "anchor_b": UP, "length": 0.5}, JOINT_NAMES,
-    ),
-    "Scene.with_parameters": Call(lv.Scene("stack").with_parameters, {"dt": 0.01, "solver_iterations": 8}),
-    "Simulation": Call(
-        lv.Simulation,
-        {"scene": "stack", "report_residual": True, "report_motion": True},
-    ),
-    "Simulation.reset": Call(on_simulation("reset"), {"seed": 1}),
-    "Simulation.restore": Call(on_simulation("restore"), {"snapshot": lv.Simulation("stack").snapshot()}),
-    "Simulation.set_solver_iterations": Call(
-        on_simulation("set_solver_iterations"), {"n": 8}, {"n": "solver_iterations"}
-    ),
-    "Simulation.set_velocity": Call(
-        on_simulation("set_velocity"), {"body": 1, "velocity": np.ones(3), "angular_velocity": np.ones(3)}
-    ),
-    "Simulation.set_warm_start": Call(on_simulation("set_warm_start"), {"flag": True}, {"flag": "warm_start"}),
-    "Simulation.step": Call(on_simulation("step"), {"action": None}),
-}  # fmt: skip
-
-#: Public calls that are not in the table, and why.
-NOT_CALLED = {
-    "Snapshot": "a result: the package makes it",
-    "Simulation.write_problem": "for the package's own use",
-    **dict.fromkeys(
-        ("Simulation.load", "Simulation.record", "Simulation.save", "Snapshot.load",
-         "Snapshot.save"),
-        "a file: test_invalid_files.py of tests/cli",
-    ),
-    "Simulation.view": "a server",
-}  # fmt: skip
-
-
-(
-    test_every_public_call_of_the_engine_is_in_the_table,
-    test_malformed_arguments_are_rejected_by_name,
-    test_arrays_in_any_memory_layout_give_the_same_result,
-) = make_tests_of_calls("sim", CALLS, NOT_CALLED)
-
-
-@pytest.mark.parametrize(
-    ("call", "name"),
-    [
-        (lambda: lv.Scene(friction=1e-61), "friction"),
-        (lambda: lv.Scene(gravity=1e61), "gravity"),
-        (lambda: lv.Scene().add_box(mass=1e-61), "mass"),
-    ],
-    ids=["friction", "gravity", "mass"],
-)
-def test_numbers_out_of_range_are_rejected_by_name_and_limit(call, name):
-    with pytest.raises(lv.InputError, match=rf"{name}.*e[+-]60"):
-        call()
 
 
 # -- scenes that are stepped --------------------------------------------------------------------------------------
@@ -575,28 +470,4 @@ def test_coincident_spheres_touch_or_are_rejected():
     python("-X", "faulthandler", "-c", COINCIDENT)
 
 
-def test_more_contacts_than_memory_holds_are_rejected():
-    sim = lv.Simulation(lv.Scene("stack", n=2))
-    sim.state.head[HEAD["need_contacts"]] = 2**28
-    with pytest.raises(lv.InputError, match="GiB"):
-        sim.state.with_larger_buffers()
-
-
 # -- numbers at the edge of float64 --------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("scale", [1e-12 * 1.01, 1e-5, 1.0, 1e59])
-def test_directions_of_any_length_are_normalised(scale):
-    scene = lv.Scene()
-    body = scene.add_box(quaternion=np.array([1.0, -1.0, 0.5, 0.25]) * scale)
-    np.testing.assert_allclose(
-        scene.bodies[body].quaternion, np.array([1.0, -1.0, 0.5, 0.25]) / 1.5206906325745548, rtol=1e-15
-    )
-    plane = scene.add_plane((scale, 0.0, 0.0))
-    assert scene.bodies[plane].shape.normal == (1.0, 0.0, 0.0)
-
-
-def test_reset_reports_no_residual_and_does_not_fail():
-    sim = lv.Simulation("stack", report_residual=True)
-    assert "residual" in sim.step()[4]
-    assert "residual" not in sim.reset()[1]

@@ -51,17 +51,3 @@ def test_a_prepared_auto_records_only_if_requested():
     assert second.history is None
     assert first.history.iterations.tolist() == third.history.iterations.tolist()
     assert first.impulse.tobytes() == third.impulse.tobytes()
-
-
-def test_programs_with_a_singular_matrix_record_start_and_end():
-    problem = lv.Problem.from_qp(np.diag([1.0, 0.0]), [-1.0, 1.0], lb=[0.0, 0.0])
-    solution = lv.solve(problem, history=True)
-    assert solution.success
-    assert solution.history.iterations[-1] == solution.iterations
-    assert solution.history.relative[-1] == solution.residual.relative
-
-
-def test_the_plot_names_the_solver_of_each_stage():
-    history = lv.solve(lv.suite.case("box_stackF(n=10)").problem, history=True).history
-    labels = [text.get_text() for text in history.plot().axes[0].get_legend().get_texts()]
-    assert labels == ["start", "anderson", "newton"]

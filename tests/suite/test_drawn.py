@@ -7,11 +7,8 @@ import pytest
 
 import benchmarks.random_families as drawn
 import lavender as lv
-from benchmarks.random_families.wild import FORMS, LAWS, MASSES, STRUCTURES
-from lavender.base.errors import UnknownName
 
 SEEDS = range(400)
-LOTS = ("drawn",)  # families half of whose structures are for judging
 
 
 def family(name):
@@ -48,25 +45,6 @@ def test_every_structure_is_drawn_and_none_is_one_of_another_family(cases, name)
     assert not structures & set().union(*others)
     assert {case.problem.law for case in cases} >= {"lcp", "coulomb", "cone"}
     assert {case.problem.operator for case in cases} == {"rows", "matrix", "generalized"}
-
-
-@pytest.mark.parametrize("name", ["wild"], indirect=True)
-def test_everything_that_wild_names_is_drawn(cases):
-    told = [f" {case.reason.replace(',', ' ').replace(':', ' ')} " for case in cases]
-    for words in (STRUCTURES, MASSES, LAWS, FORMS):
-        assert [word for word in words if not any(f" {word} " in reason for reason in told)] == []
-
-
-@pytest.mark.parametrize("lot_name", LOTS)
-def test_a_lot_takes_half_of_the_worlds_and_of_the_matrices_and_a_part_draws_its_own_alone(lot_name):
-    make, lot = family(lot_name)
-    assert len(lot.JUDGED & set(lot.WORLDS)) == len(lot.WORLDS) // 2
-    assert len(lot.JUDGED & set(lot.MATRICES)) == len(lot.MATRICES) // 2
-    assert set(lot.STRUCTURES) == lot.TUNED | lot.JUDGED
-    for part in ("tuned", "judged"):
-        assert {structure(make(seed=s, rows=60, part=part)) for s in range(80)} == getattr(lot, part.upper())
-    with pytest.raises(UnknownName, match="judged"):
-        make(part="jugded")
 
 
 @pytest.mark.parametrize("seed", range(0, 400, 20))

@@ -226,20 +226,6 @@ def test_arrays_that_are_adopted_are_shared_and_read_only():
         assert not kept.flags.writeable
 
 
-def test_contact_with_rows_of_two_kinds_of_contacts_needs_tangents():
-    with pytest.raises(lv.InputError, match=r"3 contacts with one tangent each, or 2 contacts with two: .*tangents=1"):
-        lv.Problem.contact(np.eye(6), np.ones(6), mu=[0.5, 0.5, 0.5])
-    planar = lv.Problem.contact(np.eye(6), np.ones(6), mu=[0.5, 0.5, 0.5], tangents=1)
-    assert planar.cones.n_tangents.tolist() == [1, 1, 1]
-    assert lv.Problem.contact(np.eye(6), np.ones(6), 0.5, tangents=1) == planar
-    assert lv.Problem.contact(np.eye(4), np.ones(4), mu=[0.5, 0.5]).cones.n_tangents.tolist() == [1, 1]
-    assert lv.Problem.contact(np.eye(6), np.ones(6), mu=[0.5, 0.5]).cones.n_tangents.tolist() == [2, 2]
-    with pytest.raises(lv.InputError, match="6 rows for 2 contacts; each contact needs a normal row, 1 tangent rows"):
-        lv.Problem.contact(np.eye(6), np.ones(6), mu=[0.5, 0.5], tangents=1)
-    with pytest.raises(lv.InputError, match="tangents is 3"):
-        lv.Problem.contact(np.eye(4), np.ones(4), mu=[0.5], tangents=3)
-
-
 @pytest.mark.parametrize(
     ("rows", "bounds", "tangents"),
     [

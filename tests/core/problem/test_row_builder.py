@@ -1,7 +1,5 @@
 """`RowBuilder`: closed-form solutions, two dimensions as a plane of three, keys, and agreement of all solvers."""
 
-import re
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -300,35 +298,11 @@ def test_a_slop_or_a_tolerance_keeps_a_stack_at_rest():
     assert largest_velocity_of_a_stack(0.0, tol=1e-6, max_iter=10_000) < 1e-4
 
 
-def test_equations_that_the_help_cites_are_in_it():
-    notes = lv.RowBuilder.__doc__.split("Notes\n")[1]
-    for owner in (lv.RowBuilder, *vars(lv.RowBuilder).values()):
-        for number in re.findall(r"eq\. (\d)", getattr(owner, "__doc__", None) or ""):
-            assert f"({number})\n" in notes
-
-
-def test_a_builder_without_blocks_gives_an_empty_problem():
-    assert planar().problem().m == 0
-    empty = lv.RowBuilder([], [], np.zeros((0, 3)), DT, np.zeros((0, 2)))
-    assert empty.problem().m == 0
-
-
 def test_a_tangent_can_be_chosen():
     builder = spatial(np.zeros((1, 6)), np.zeros((1, 3)))
     builder.contact(-1, 0, (0.0, 0.0, -1.0), (0.0, 0.0, 1.0), mu=1.0, tangent=(3.0, 3.0, 1.0))
     expected = [np.sqrt(0.5), np.sqrt(0.5), 0.0]
     np.testing.assert_allclose(builder.problem().rows.tangent[0], expected, rtol=0.0, atol=1e-15)
-
-
-@pytest.mark.parametrize(("length", "cause"), [(None, "coincide and length is None"), (0.0, "length is 0")])
-def test_rod_of_length_zero_raises_an_error_that_recommends_ball(length, cause):
-    builder = spatial(np.zeros((1, 6)), np.zeros((1, 3)))
-    point = (0.0, 0.0, 1.0)
-    lengths = {} if length is None else {"length": [1.0, length]}
-    with pytest.raises(lv.InputError, match=f"{cause}.*use ball"):
-        builder.distance(-1, 0, point, point, length)
-    with pytest.raises(lv.InputError, match=f"distance 1: .*{cause}"):
-        builder.joints("distance", [(-1, 0)] * 2, anchor_a=[(1.0, 0.0, 0.0), point], anchor_b=[point] * 2, **lengths)
 
 
 def test_rod_with_coinciding_anchors_pushes_b_along_z():
@@ -394,49 +368,3 @@ def test_arrays_of_blocks_have_the_bits_of_single_calls(dimensions, seed):
     first, second = single.problem(), arrays.problem()
     assert first == second and first.b.tobytes() == second.b.tobytes()
     assert [first.names[0], *first.names] == [second.names[0], *second.names]
-
-
-def test_array_calls_repeat_one_vector_and_one_number():
-    builder, pairs = spatial(np.zeros((2, 6)), np.eye(2, 3)), [(-1, 0), (-1, 1)]
-    builder.contacts(pairs, np.eye(2, 3), (0.0, 0.0, 1.0), mu=0.5, names=["left", "right"])
-    builder.joints("hinge", pairs, anchor=np.zeros((2, 3)), axis=[0.0, 0.0, 1.0], feature=[3, 4])
-    problem = builder.problem()
-    assert problem.names == ("hinge 3 of world and body 0", "hinge 4 of world and body 1", "left", "right")
-    assert problem.cones.mu[2:].tolist() == [0.5, 0.5]
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"bodies": [(-1, 0), (1, 1)]}, "contact 1: a and b are both body 1"),
-        ({"bodies": [(-1, 0), (1, 2)]}, "contact 1: b is 2; the number of one of the 2 bodies"),
-        ({"normals": [(0.0, 0.0, 1.0), (0.0, 0.0, 2.0)]}, "contact 1: normal has length 2"),
-        ({"mu": [0.5, -0.5]}, "contact 1: mu is -0.5"),
-        ({"restitution": 2.0}, "contact 0: restitution is 2; 0 to 1 is needed"),
-        ({"tangents": (0.0, 0.0, 3.0)}, "contact 0: tangent .* parallel to the normal"),
-        ({"feature": [70_000, 1]}, "contact 0: feature is 70000"),
-        ({"bodies": [(-1, 0), (-1, 0)], "feature": [1, 1]}, "contact 1: an earlier one of the same bodies"),
-        ({"points": np.zeros((3, 3))}, r"point has shape \(3, 3\)"),
-        ({"names": ["one"]}, "names has 1 entries for 2"),
-    ],
-)
-def test_invalid_arrays_are_rejected_and_add_nothing(change, message):
-    builder = spatial(np.zeros((2, 6)), np.eye(2, 3))
-    arguments = {"bodies": [(-1, 0), (-1, 1)], "points": np.eye(2, 3), "normals": (0.0, 0.0, 1.0)}
-    with pytest.raises(lv.InputError, match=message):
-        builder.contacts(**arguments | change)
-    assert builder.problem().m == 0
-    keys = builder.contacts(**arguments)
-    assert [builder.rows_of(int(key)) for key in keys] == [slice(0, 1), slice(1, 2)]
-
-
-def test_joints_reject_arguments_that_their_method_does_not_have():
-    builder = spatial(np.zeros((1, 6)), np.zeros((1, 3)))
-    with pytest.raises(TypeError, match="unexpected keyword argument 'axis'"):
-        builder.joints("ball", [(-1, 0)], anchor=np.zeros(3), axis=np.zeros(3))
-    with pytest.raises(TypeError, match="missing a required argument: 'anchor'"):
-        builder.joints("hinge", [(-1, 0)], axis=np.ones(3))
-    with pytest.raises(lv.InputError, match="hinge 0: axis is None"):
-        builder.joints("hinge", [(-1, 0)], anchor=np.zeros(3))
-    with pytest.raises(lv.UnknownName, match="unknown block_type 'contact'"):
-        builder.joints("contact", [(-1, 0)])

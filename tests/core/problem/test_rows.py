@@ -177,21 +177,3 @@ def test_carry_random_keys_equals_an_assignment_by_a_dict(seed):
         if i is not None and old.kind[i] == new.kind[j]:
             wanted[new.ptr[j] : new.ptr[j + 1]] = impulse[old.ptr[i] : old.ptr[i + 1]]
     assert np.array_equal(now.carry((before, impulse)), wanted)
-
-
-def test_repr_of_rows_is_one_line_with_its_counts():
-    rows = lv.Rows(
-        inv_mass=np.ones(2), inv_inertia=np.tile(np.eye(3), (2, 1, 1)), v_free=np.zeros((2, 6)),
-        jac=np.ones((3, 12)), joint_ptr=[0, 3], joint_body=[[-1, 0]], contact_body=[[0, 1]],
-        normal=[[0.0, 0.0, 1.0]], tangent=[[1.0, 0.0, 0.0]], arm_a=[[0.0, 0.0, 0.0]], arm_b=[[0.0, 0.0, 0.0]],
-    )  # fmt: skip
-    assert repr(rows) == "<Rows of 2 bodies, 1 joints with 3 rows, 1 contacts>"
-
-
-@pytest.mark.parametrize(
-    "joints", [{}, {"joint_ptr": [0, 5]}, {"joint_body": [[0, 1]]}, {"joint_ptr": [0, 3], "joint_body": [[0, 1]]}]
-)
-def test_rows_with_joint_rows_that_do_not_fit_raise_an_error_that_names_joint_ptr(joints):
-    bodies = {"inv_mass": np.ones(2), "inv_inertia": np.tile(np.eye(3), (2, 1, 1)), "v_free": np.zeros((2, 6))}
-    with pytest.raises(lv.InputError, match=r"jac has 5 joint rows.*joint_ptr=\[0, 5\] and joint_body=\[\[a, b\]\]"):
-        lv.Rows(**bodies, jac=np.ones((5, 12)), **joints)

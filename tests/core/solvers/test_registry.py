@@ -34,12 +34,6 @@ def test_specs_are_copied_and_pickled(again):
     assert again(named("another", options={"x": "a number"})).options == {"x": "a number"}
 
 
-def test_a_missing_package_is_named_with_what_installs_it():
-    spec = dataclasses.replace(SPEC, requires=("numpy", "no_such_module_1"), install="no-such-package")
-    assert spec.missing() == "needs no_such_module_1: pip install no-such-package"
-    assert dataclasses.replace(SPEC, requires=("numpy",)).missing() is None
-
-
 def test_a_factory_that_is_not_there_or_makes_no_solver_is_named(register, tmp_path, monkeypatch):
     for factory in ("no_such_module_1:Solver", "math:Solver"):
         register(lv.SolverSpec("absent", factory, {"lcp"}, summary="of a test"), replace=True)
@@ -102,13 +96,6 @@ def test_the_row_whose_impulse_is_not_finite_is_named(plug_in):
     assert solution.message == "the impulse of row 2 is nan"
 
 
-def test_refused_is_no_claim_of_a_solver(plug_in):
-    # It is said of the data of a world: callers that meet it do not look at the residual.
-    solution = lv.solve(TINY, plug_in(lambda problem, impulse: lv.Claim(lv.Status.INVALID_PROBLEM, 1)))
-    assert solution.status is lv.Status.NUMERICAL_ERROR
-    assert "claims the status INVALID_PROBLEM" in solution.message
-
-
 @pytest.mark.parametrize("where", ["prepare", "update", "run"])
 def test_a_plug_in_that_would_end_the_process_raises_an_error(where, register):
     def method(name, result):
@@ -138,23 +125,7 @@ def test_a_plug_in_without_update_is_prepared_anew(register):
     assert solver.solve(lv.Problem.lcp(np.eye(2), [2.0, 3.0])).impulse.tolist() == [2.0, 3.0]
 
 
-@pytest.mark.parametrize("factory", [None, object(), "module", "module:", ":Solver", "a:b:c"])
-def test_spec_with_a_factory_that_cannot_be_called_or_imported_raises(factory):
-    with pytest.raises(lv.InputError, match=r"factory of solver 'mine' is .*'module:attribute'"):
-        named("mine", factory=factory)
-
-
 # -- names ------------------------------------------------------------------------------------------
-
-
-def test_an_unknown_name_tells_the_nearest():
-    with pytest.raises(lv.UnknownName, match="did you mean 'newton'") as raised:
-        lv.get("newtn")
-    assert isinstance(raised.value, KeyError)
-    assert str(lv.UnknownName("case", "x", ["one", "two", "one"])).endswith("known: one, two")
-    for senseless in ("", None, 7, ["pgs"]):
-        with pytest.raises(lv.UnknownName):
-            lv.get(senseless)
 
 
 def test_capabilities_select():

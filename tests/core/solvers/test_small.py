@@ -1,6 +1,5 @@
 """Problems of few rows take a compiled way: it must not show, but in time."""
 
-import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -201,16 +200,3 @@ def test_a_limit_that_does_not_bind_changes_no_bit(name):
     without, within = lv.solve(fresh(problem)), lv.solve(fresh(problem), time_limit=60.0)
     assert without.success or without.certificate is not None
     assert without.impulse.tobytes() == within.impulse.tobytes() and without.work == within.work
-
-
-@pytest.mark.parametrize("solver", ["auto", "newton", "sequential_impulses"])
-def test_solution_of_few_rows_reads_its_residual_without_the_claim(solver):
-    solution = lv.solve(draw("rows coulomb", 3), solver)
-    assert solution.success
-    relative = solution.residual.relative
-    assert "_rest" in vars(solution)  # The claim, its work and its stages are not computed yet.
-    assert relative == lv.residual(draw("rows coulomb", 3), solution.impulse).relative
-    stored = pickle.loads(pickle.dumps(solution))
-    assert "_rest" not in vars(solution)
-    assert stored.residual.relative == relative
-    assert np.array_equal(stored.residual.error, solution.residual.error)

@@ -2,8 +2,6 @@
 
 import dataclasses
 import gc
-import inspect
-import pickle
 import signal
 import threading
 import time
@@ -120,18 +118,6 @@ def test_prepared_solve_of_another_velocity_keeps_the_targets():
         assert prepared.problem.generalized.v_free.tolist() == velocity.tolist()
 
 
-def test_prepared_solve_rejects_a_problem_with_b_and_a_velocity_of_a_matrix():
-    problem = lv.Problem.lcp(np.eye(2), [1.0, -1.0])
-    prepared = lv.prepare(problem)
-    with pytest.raises(lv.InputError, match=r"problem is given with b or v_free.*problem\.updated\(b="):
-        prepared.solve(problem, b=[1.0, 2.0])
-    with pytest.raises(lv.InputError, match="only in a problem in generalised coordinates"):
-        prepared.solve(v_free=[1.0, 2.0])
-    with pytest.raises(lv.InputError, match=r"b \[m/s\] has shape \(3,\)"):
-        prepared.solve(b=np.ones(3))
-    assert prepared.solve().impulse.tolist() == [1.0, 0.0]
-
-
 def test_problems_that_differ_in_b_share_memory_of_the_operator_and_free_each_other():
     problem = lv.Problem.from_jacobian(np.eye(3), np.eye(3), -np.ones(3), mu=0.5)
     lv.solve(problem)
@@ -141,12 +127,6 @@ def test_problems_that_differ_in_b_share_memory_of_the_operator_and_free_each_ot
         seen.append(weakref.ref(prepared.problem))
     gc.collect()
     assert [ref() is not None for ref in seen] == [False] * 4 + [True]
-
-
-def test_solve_shows_signature_documentation_and_module_of_its_definition():
-    assert str(inspect.signature(lv.solve)).startswith("(problem: 'Problem', solver: 'str' = 'auto', *surplus")
-    assert "Warm start" in lv.solve.__doc__
-    assert pickle.loads(pickle.dumps(lv.solve)) is lv.solve
 
 
 @pytest.mark.parametrize("tol", [1e-6, np.float64(1e-6)])

@@ -156,8 +156,3 @@ def test_a_box_grips_more_on_the_diagonal(more):
         speed = g * (np.sin(above) - grip * np.cos(above)) * 1.0
         assert slope(above, turned, "box", **more) == pytest.approx(speed, rel=0.02)
     assert slope(np.arctan(mu) + 0.05, np.pi / 4, "disk", **more) > 0.3
-
-
-def test_what_no_scene_of_boxes_has_is_told():
-    with pytest.raises(lv.InputError, match="neither torsional nor rolling friction"):
-        lv.Simulation(lv.Scene("spinner", friction_shape="box"))

@@ -264,15 +264,6 @@ def test_open_a_written_scene_steps_as_the_native_engine_and_its_table_is_downlo
     np.testing.assert_allclose(table[:, 0], scene.parameters.dt * np.arange(1, 41))
 
 
-@pytest.mark.parametrize("text", ["{}", "no JSON", '{"lavender_scene": 1, "layout": {}, "scene": {}}'])
-def test_open_another_file_names_it_and_keeps_the_scene(visit, tmp_path, text):
-    (tmp_path / "other.json").write_text(text)
-    v = visit("#stack")
-    v.page.set_input_files("#file", tmp_path / "other.json")
-    v.page.wait_for_function("document.querySelector('#failure').textContent.includes('other.json')")
-    assert v.js("lavender.scene.name") == "stack"
-
-
 def test_plots_hold_the_native_errors(visit):
     v = visit()
     for _ in range(10):
@@ -380,14 +371,6 @@ def test_phone_without_network(visit):
     assert all(colors_in(v, i) > 10 for i in (0, 1))  # background, faces, edges, marks: something is drawn
 
 
-def test_a_page_that_cannot_start_says_so(new_page, address):
-    page = new_page()
-    page.route("**/scenes.json", lambda route: route.fulfill(body="{", content_type="application/json"))
-    page.goto(address)
-    page.wait_for_selector("#failure:not([hidden])")
-    assert page.locator("#failure").text_content().startswith("The page could not start")
-
-
 def test_a_lost_state_is_named(visit):
     v = visit()
     v.js("lavender.sides[1].simulation.array('v')[6] = Infinity")
@@ -395,11 +378,6 @@ def test_a_lost_state_is_named(visit):
     assert "Side B: the state of" in v.page.locator("#failure").text_content()
     v.page.click("#reset")
     assert v.page.locator("#failure").is_hidden()
-
-
-def test_reduced_motion_opens_at_rest(visit):
-    v = visit("", reduced_motion="reduce")
-    assert v.page.locator("#play").get_attribute("aria-pressed") == "false"
 
 
 def test_without_the_module_of_newton_both_sides_sweep(new_page, address):
