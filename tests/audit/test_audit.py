@@ -39,7 +39,7 @@ def own_errors(path, world, steps, seed=0, spread=0.1):
 
 
 @pytest.mark.parametrize("options", [EARLY, f'{EARLY} cone="elliptic"', EARLY + ' jacobian="sparse"'])
-def test_numbers_equal_the_judge_on_each_step(boxes, options):
+def test_audit_of_two_worlds_equals_the_judge_on_each_step(boxes, options):
     path = boxes(options)
     found = audit(path, worlds=2, steps=30, workers=1)
     for world in range(2):
@@ -53,7 +53,7 @@ def test_numbers_equal_the_judge_on_each_step(boxes, options):
     assert found.is_unconverged.any()
 
 
-def test_workers_change_no_bit(boxes, monkeypatch):
+def test_audit_with_two_workers_has_the_bits_of_one(boxes, monkeypatch):
     monkeypatch.setattr(module, "STEPS_PER_TASK", 20)
     path = boxes(EARLY)
     one, two = (audit(path, worlds=4, steps=20, workers=n) for n in (1, 2))
@@ -62,7 +62,7 @@ def test_workers_change_no_bit(boxes, monkeypatch):
     assert [(w.world, w.step) for w in one.worst] == [(w.world, w.step) for w in two.worst]
 
 
-def test_the_worst_can_be_gone_back_to(boxes, tmp_path):
+def test_audit_worst_states_give_the_same_impulses_in_mujoco(boxes, tmp_path):
     path = boxes(EARLY)
     found = audit(path, worlds=3, steps=25, workers=1)
     found.write(tmp_path / "out")
@@ -102,7 +102,7 @@ def make_frames(change):
     return frames
 
 
-def test_audit_of_float32_tells_its_floor_from_an_early_stop(boxes, monkeypatch):
+def test_audit_of_float32_separates_rounding_from_an_early_stop(boxes, monkeypatch):
     planted = {3, 9, 12}
 
     def change(arrays, step):
@@ -115,7 +115,7 @@ def test_audit_of_float32_tells_its_floor_from_an_early_stop(boxes, monkeypatch)
     assert (found.numbers[0, 0] > 1e-9).sum() > len(planted)  # rounding leaves errors that float64 would not
 
 
-def test_a_world_of_another_engine_that_diverges_does_not_end_the_audit(boxes, monkeypatch):
+def test_audit_of_a_world_that_diverges_judges_the_other_worlds(boxes, monkeypatch):
     """MJX and MuJoCo Warp go on with numbers that are not finite."""
 
     def change(arrays, step):
@@ -139,7 +139,7 @@ def test_a_world_of_another_engine_that_diverges_does_not_end_the_audit(boxes, m
         (None, "simulating trial worlds", (1, 25), 25),
     ],
 )
-def test_ctrl_c_before_the_first_results_of_workers_returns_steps_of_world_0(
+def test_audit_stopped_before_results_of_workers_returns_steps_of_world_0(
     boxes, tmp_path, worlds, phase, shape, judged
 ):
     def watch(event):
@@ -155,7 +155,7 @@ def test_ctrl_c_before_the_first_results_of_workers_returns_steps_of_world_0(
     assert "Stopped before the end" in found.page.write(tmp_path / "out").read_text()
 
 
-def test_ctrl_c_before_the_first_step_is_raised(boxes):
+def test_audit_stopped_before_the_first_step_raises_keyboard_interrupt(boxes):
     def watch(event):
         raise KeyboardInterrupt
 
@@ -163,12 +163,12 @@ def test_ctrl_c_before_the_first_step_is_raised(boxes):
         audit(boxes(EARLY), worlds=3, steps=25, workers=1, watch=watch)
 
 
-def test_what_is_close_enough_may_still_not_be_accepted(boxes):
+def test_audit_with_a_large_threshold_still_reports_the_largest_error(boxes):
     found = audit(boxes(EARLY), worlds=1, steps=10, workers=1, threshold=1e3)
     assert not found.is_unconverged.any() and found.max_velocity_error == found.numbers[0].max() > 1e-3
 
 
-def test_a_world_in_which_mujoco_ends_in_an_error_is_not_judged_from_there_on(boxes, monkeypatch):
+def test_audit_of_a_world_that_ends_in_a_mujoco_error_judges_only_steps_before(boxes, monkeypatch):
     step = mj.mj_step
 
     def dies(boxes, data):
@@ -198,7 +198,7 @@ RUNAWAY = """<mujoco><option timestep="0.01"/><worldbody><geom type="plane" size
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("threshold", [1e-6, 1e3])  # What is close enough to the user need not be exact.
 @pytest.mark.parametrize("options", ["", 'solver="PGS" iterations="1"'])
-def test_a_blow_up_after_exact_solves_has_its_cause_outside_the_solver(tmp_path, monkeypatch, options, threshold):
+def test_audit_of_a_divergence_after_exact_solves_blames_the_model(tmp_path, monkeypatch, options, threshold):
     monkeypatch.chdir(tmp_path)  # MuJoCo writes a log there
     (tmp_path / "runaway.xml").write_text(RUNAWAY.format(gain=60).replace('"0.01"', f'"0.01" {options}'))
     found = audit("runaway.xml", worlds=3, steps=60, workers=1, threshold=threshold)
@@ -216,7 +216,7 @@ def test_a_blow_up_after_exact_solves_has_its_cause_outside_the_solver(tmp_path,
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_a_world_that_diverges_in_its_last_step_is_counted(tmp_path, monkeypatch):
+def test_audit_of_a_world_that_diverges_in_its_last_step_counts_it(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "runaway.xml").write_text(RUNAWAY.format(gain=60))
     steps = 1 + audit("runaway.xml", worlds=1, steps=60, workers=1, spread=0.0).divergences[0].step
@@ -225,7 +225,7 @@ def test_a_world_that_diverges_in_its_last_step_is_counted(tmp_path, monkeypatch
     assert audit("runaway.xml", worlds=1, steps=steps - 1, workers=1, spread=0.0).n_diverged == 0
 
 
-def test_rows_and_contacts_are_those_of_the_run(boxes):
+def test_audit_rows_and_contacts_equal_those_of_mujoco(boxes):
     path = boxes()
     found = audit(path, worlds=2, steps=60, workers=1)
     made = mj.MjModel.from_xml_path(str(path))
@@ -241,7 +241,7 @@ def test_rows_and_contacts_are_those_of_the_run(boxes):
     assert found.totals["contacts"]["share"] == np.mean(found.contacts > 0)
 
 
-def test_an_audit_of_steps_without_contact_says_so(tmp_path):
+def test_audit_of_steps_without_contact_is_unmet(tmp_path):
     (tmp_path / "high.xml").write_text(BOXES.format(options="").replace("0 0 0.099", "0 0 9").replace("0.32", "20"))
     found = audit(tmp_path / "high.xml", worlds=2, steps=20, workers=1)
     assert "Only 0 of 40 steps judged have contact (0 %), fewer than 20 %" in words_of(found) and found.is_unmet
@@ -252,7 +252,7 @@ def test_an_audit_of_steps_without_contact_says_so(tmp_path):
 
 
 @pytest.mark.parametrize("names", [("state",), ("qpos", "qvel", "act", "ctrl", "qacc_warmstart", "world", "step")])
-def test_an_audit_starts_again_from_the_states_of_an_audit(boxes, tmp_path, names):
+def test_audit_from_stored_states_repeats_their_errors(boxes, tmp_path, names):
     path = boxes(EARLY)
     found = audit(path, worlds=3, steps=25, workers=1)
     found.write(tmp_path / "out")
@@ -264,7 +264,7 @@ def test_an_audit_starts_again_from_the_states_of_an_audit(boxes, tmp_path, name
     assert again.numbers[0, 3, 0] != again.numbers[0, 0, 0]
 
 
-def test_physics_vectors_are_states_without_warm_start_and_controls(boxes):
+def test_read_states_of_physics_vectors_misses_warm_start_and_controls(boxes):
     made = mj.MjModel.from_xml_path(str(boxes()))
     vector = np.concatenate([made.qpos0, np.zeros(made.nv)])
     for kind, missing in (("PHYSICS", ("warm start", "controls")), ("INTEGRATION", ())):
@@ -280,7 +280,7 @@ KEYFRAMES = """<keyframe><key qpos="0 0 .099 1 0 0 0  0 0 .5 1 0 0 0  0" ctrl=".
   <key qpos="0 0 2 1 0 0 0  0 0 3 1 0 0 0  0"/></keyframe></mujoco>"""
 
 
-def test_worlds_start_from_keyframes(tmp_path):
+def test_audit_from_keyframes_starts_worlds_in_them(tmp_path):
     (tmp_path / "keyed.xml").write_text(BOXES.format(options="").replace("</mujoco>", KEYFRAMES))
     found = audit(tmp_path / "keyed.xml", worlds=2, steps=1, workers=1, states="keyframes")
     assert found.contacts[:, 0].tolist() == [4, 0]
@@ -306,7 +306,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("given", "words"), REFUSED)
-def test_audit_refuses_wrong_arguments_by_name(boxes, tmp_path, monkeypatch, given, words):
+def test_audit_with_a_wrong_argument_raises_an_error_that_names_it(boxes, tmp_path, monkeypatch, given, words):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "torn.npz").write_bytes(b"PK torn")
     if isinstance(given.get("states"), dict):
@@ -317,7 +317,7 @@ def test_audit_refuses_wrong_arguments_by_name(boxes, tmp_path, monkeypatch, giv
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_a_world_that_mujoco_begins_anew_ends_there(boxes, monkeypatch, tmp_path):
+def test_audit_of_a_world_that_mujoco_resets_ends_there(boxes, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)  # MuJoCo writes a log there
     found = audit(boxes(), worlds=2, steps=10, workers=1, spread=1e12)
     assert (found.verdict[1, 1:] == AUDIT_VERDICTS.index("not judged")).all()
@@ -325,7 +325,7 @@ def test_a_world_that_mujoco_begins_anew_ends_there(boxes, monkeypatch, tmp_path
     assert [(d.world, d.step, d.is_outside) for d in found.divergences] == [(1, 0, True)]
 
 
-def test_mujoco_s_own_warnings_are_counted_and_not_printed(boxes, monkeypatch, tmp_path, capfd):
+def test_audit_with_warnings_of_mujoco_counts_them_without_printing(boxes, monkeypatch, tmp_path, capfd):
     monkeypatch.chdir(tmp_path)
     handler = mj.get_mju_user_warning()
     found = audit(boxes(), worlds=3, steps=5, workers=1, spread=1e12)

@@ -48,7 +48,7 @@ def test_audit_judges_the_changed_model_in_memory_and_as_mjb_alike(boxes, tmp_pa
     assert not np.allclose(audit(boxes(EARLY), worlds=1, steps=30, workers=1).numbers[0, 0], expected)
 
 
-def test_control_hold_keeps_the_controls_of_the_start_state(boxes, tmp_path):
+def test_audit_with_control_hold_keeps_the_controls_of_the_start_state(boxes, tmp_path):
     path = boxes(EARLY)
     model = mj.MjModel.from_xml_path(str(path))
     states = {"qpos": model.qpos0[None], "qvel": np.zeros((1, model.nv)), "ctrl": np.full((1, model.nu), 0.7)}
@@ -147,7 +147,7 @@ WELDED = """<mujoco><worldbody><body name="hand" mocap="true" pos="0 0 1"><geom 
   <equality><weld name="grip" body1="hand" body2="arm"/></equality></mujoco>"""
 
 
-def test_states_that_violate_a_weld_are_named():
+def test_read_states_that_violate_a_weld_names_it():
     """As gymnasium's Fetch does, the weld is changed after loading, and the states belong to the changed weld."""
     model = mj.MjModel.from_xml_string(WELDED)
     qpos = model.qpos0.copy()
@@ -158,7 +158,7 @@ def test_states_that_violate_a_weld_are_named():
     assert read_states(mj, model, states).misfit == ""
 
 
-def test_states_of_a_model_with_other_options_fit(boxes, tmp_path):
+def test_read_states_of_a_model_with_other_options_accepts_them(boxes, tmp_path):
     audit(boxes(EARLY), worlds=2, steps=30, workers=1).write(tmp_path)
     model = mj.MjModel.from_xml_string(BOXES.format(options='solver="CG" iterations="3"'))
     assert read_states(mj, model, tmp_path / "states.npz").misfit == ""
@@ -171,7 +171,7 @@ def test_states_of_a_model_with_other_options_fit(boxes, tmp_path):
 # -- against another model -----------------------------------------------------------------------------------
 
 
-def test_against_judges_the_other_model_on_the_same_states(boxes, tmp_path):
+def test_audit_against_another_model_judges_both_on_the_same_states(boxes, tmp_path):
     path, other = boxes(EARLY), tmp_path / "other.xml"
     other.write_text(BOXES.format(options='solver="Newton" iterations="100" tolerance="1e-15"'))
     found = audit(path, worlds=2, steps=30, workers=1, against=other)
@@ -201,7 +201,7 @@ def test_against_judges_the_other_model_on_the_same_states(boxes, tmp_path):
 
 
 @pytest.mark.parametrize("worlds", [4, None])
-def test_an_interrupted_audit_resumes_with_the_numbers_of_an_uninterrupted_one(boxes, tmp_path, monkeypatch, worlds):
+def test_audit_resumed_after_ctrl_c_equals_an_uninterrupted_one(boxes, tmp_path, monkeypatch, worlds):
     monkeypatch.setattr(module, "STEPS_PER_TASK", 20)
     monkeypatch.setattr(module, "choose_world_count", lambda duration, processes: 4)
     path, judged = boxes(EARLY), []

@@ -24,7 +24,7 @@ def step_of(errors, claimed, mass=1.0, nan=()):
     return lv.io.EngineStep(batch, impulse, lv.io.Claims(np.array(claimed, bool), np.full(n, 3), {}))
 
 
-def test_every_outcome_is_counted(tmp_path):
+def test_audit_steps_counts_each_outcome_of_claims(tmp_path):
     steps = [
         step_of([0.0, 0.2, 0.0, 0.3, 0.0, 0.0], [1, 1, 0, 0, 1, 0], nan=[4, 5]),
         step_of([0.0, 0.1, 1e-6, 0.0, 0.0, 0.0], [1, 1, 0, 1, 1, 0], nan=[4, 5]),
@@ -44,13 +44,13 @@ def test_every_outcome_is_counted(tmp_path):
     assert (np.load(tmp_path / "records.npz")["converged"] == result.converged).all()
 
 
-def test_rounding_is_not_an_error():
+def test_audit_steps_of_float32_rounding_counts_no_error():
     step = step_of([1e-7], [1])
     step.batch.precision = "float32"
     assert audit_steps([step], threshold=1e-9).claim_counts["claimed and right"] == 1
 
 
-def test_ctrl_c_keeps_the_steps_so_far():
+def test_audit_steps_stopped_by_ctrl_c_keeps_the_steps_so_far():
     def steps():
         yield step_of([0.0], [1])
         raise KeyboardInterrupt
@@ -59,7 +59,7 @@ def test_ctrl_c_keeps_the_steps_so_far():
     assert result.is_stopped and result.n_processed == 1
 
 
-def test_states_before_the_worst_answers_are_written(tmp_path):
+def test_audit_steps_writes_the_states_before_the_worst_answers(tmp_path):
     steps = [
         step_of([0.0, 0.2, 0.0], [1, 1, 0])._replace(state={"joint_q": np.array([[0.0], [1.0], [2.0]])}),
         step_of([0.0, 0.0, 0.3], [1, 1, 0])._replace(state={"joint_q": np.array([[3.0], [4.0], [5.0]])}),
@@ -72,7 +72,7 @@ def test_states_before_the_worst_answers_are_written(tmp_path):
     assert list(states) == ["joint_q"] and states["joint_q"].shape == (len(found), 1)
 
 
-def test_scenes_of_newton_start_from_states(tmp_path):
+def test_step_scene_of_newton_starts_from_stored_states(tmp_path):
     """The worst answers of an audit occur again when it starts from the states that it wrote."""
     pytest.importorskip("newton")
     scene = "boxes_stacked_on_plane"

@@ -28,7 +28,7 @@ def dominant(explanation):
 
 
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
-def test_below_the_friction_angle_a_block_creeps_because_friction_is_soft(cone):
+def test_slip_below_the_friction_angle_is_softness_of_friction(cone):
     angle = 0.3  # tan 0.309 < 0.5
     explanation = explain_slip_of_states(block(angle, option=f'cone="{cone}"'), steps=600).explanations[0]
     assert set(explanation.causes) == {"softness of friction"}
@@ -37,7 +37,7 @@ def test_below_the_friction_angle_a_block_creeps_because_friction_is_soft(cone):
     assert all(v.relative <= 1e-9 for v in explanation.variants[1:] if not v.note)
 
 
-def test_creep_has_the_speed_of_the_softened_row():
+def test_slip_of_a_creeping_block_has_the_speed_of_the_softened_row():
     """A steady creep v of n equal contacts has b v + R f = 0 on tangent rows, aref = -b v, f = m g sin(angle) / n."""
     angle = 0.2
     model = block(angle, option='cone="elliptic"')
@@ -53,7 +53,7 @@ def test_creep_has_the_speed_of_the_softened_row():
     assert explanation.variants[0].speeds == pytest.approx(np.full(data.ncon, speed), rel=0.02)
 
 
-def test_above_the_friction_angle_the_load_is_too_large():
+def test_slip_above_the_friction_angle_is_sliding_at_the_limit():
     angle, friction = 0.6, 0.5  # tan 0.684 > 0.5
     steps = 150
     explanation = explain_slip_of_states(block(angle, friction, 'cone="elliptic"'), steps=steps).explanations[0]
@@ -62,7 +62,7 @@ def test_above_the_friction_angle_the_load_is_too_large():
     assert explanation.variants[-1].speeds == pytest.approx(np.full(len(explanation.contacts), expected), rel=0.05)
 
 
-def test_iterations_that_are_missing_are_the_cause():
+def test_slip_with_one_iteration_is_unfinished_solving():
     model = block(0.3, option='cone="elliptic" solver="PGS" iterations="1" tolerance="0" impratio="1000"')
     exact = block(0.3, option='cone="elliptic" impratio="1000"')
     assert dominant(explain_slip_of_states(exact, steps=40).explanations[0]) != "unfinished solving"
@@ -84,7 +84,7 @@ def slide(velocity, cones, friction="coulomb", compliance=None):
     )
 
 
-def test_the_convex_relaxation_is_a_cause():
+def test_slip_under_the_cone_law_has_the_part_of_the_relaxation():
     # Coulomb: the normal impulse is 1 N s, friction 0.5: 2 - 0.5 = 1.5 m/s remain. The relaxation lifts the particle
     # with v_n = mu v_t, and takes (2 - 0.5) / (1 + 0.25) = 1.2 m/s.
     problem = slide([2.0, 0.0], lv.Cones.contacts(0.5), friction="cone")
@@ -95,7 +95,7 @@ def test_the_convex_relaxation_is_a_cause():
     assert explanation.parts["sliding at the friction limit"] == pytest.approx([1.5])
 
 
-def test_the_shape_of_the_cone_is_a_cause():
+def test_slip_in_a_box_has_the_part_of_the_shape():
     # A box bounds each tangent by 0.5 N s, a disk their norm: along the diagonal 0.707 or 0.5 m/s are lost.
     problem = slide([1.0, 1.0], lv.Cones.contacts(0.5).shaped("box"))
     explanation = explain_slip(problem, lv.solve(problem, tol=1e-9).impulse)
@@ -105,7 +105,7 @@ def test_the_shape_of_the_cone_is_a_cause():
 
 
 @pytest.mark.parametrize(("grip", "cause"), [(30.0, "softness of friction"), (6.0, "sliding at the friction limit")])
-def test_a_gripper_holds_a_box_or_drops_it(grip, cause):
+def test_slip_of_a_gripped_box_depends_on_the_grip_force(grip, cause):
     # Two fingers press with `grip` [N] each: friction 2 * 0.5 * grip against a weight of 9.81 N.
     model = mujoco.MjModel.from_xml_string(f"""<mujoco><option timestep="0.002" cone="elliptic"/>
       <default><geom friction="0.5 0.005 0.0001"/></default><worldbody>
@@ -121,7 +121,7 @@ def test_a_gripper_holds_a_box_or_drops_it(grip, cause):
 
 
 @pytest.mark.parametrize("option", ['cone="elliptic"', 'cone="pyramidal"', 'cone="elliptic" impratio="10"'])
-def test_every_variant_is_solved_and_judged(option):
+def test_slip_variants_are_solved_to_their_tolerance(option):
     """Each solution has a relative residual of at most 1e-9, and an engine that converged has the same velocity."""
     for angle in (0.2, 0.6):
         explanation = explain_slip_of_states(block(angle, option=option), steps=100).explanations[0]
@@ -173,7 +173,7 @@ def test_explain_slip_of_states_diverging_step_is_left_out():
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_settings_are_compared_only_from_states_from_which_the_present_one_does_not_diverge():
+def test_slip_remedies_start_only_from_states_that_do_not_diverge():
     model, states = make_diverging_states([1.0, 0.0])
     states["qvel"][0, 0] = 2.0  # The diverging state slides faster.
     result = explain_slip_of_states(model, states)
@@ -182,7 +182,7 @@ def test_settings_are_compared_only_from_states_from_which_the_present_one_does_
     assert [r.later for r in result.worst.remedies] == pytest.approx([r.later for r in alone.remedies], nan_ok=True)
 
 
-def test_settings_are_simulated_from_all_states_with_the_fastest_contact():
+def test_slip_remedies_start_from_all_states_with_the_fastest_contact():
     model = block(0.2, friction=0.4, option='cone="elliptic"')
     speeds = np.array([0.5, 1.0, 0.2])
     model.qpos0[2] -= 0.0001  # The box touches the slope in its first step.

@@ -23,7 +23,7 @@ def fewer(monkeypatch):
     keep_values(monkeypatch, mujoco_settings, "MUJOCO", {1e-6, 1e-12, 2, 3, 25}, {"Newton", "CG"})
 
 
-def test_the_own_setting_is_measured_as_it_ran_and_worlds_are_held_back(boxes, monkeypatch):
+def test_tune_measures_the_present_setting_on_half_of_the_worlds(boxes, monkeypatch):
     fewer(monkeypatch)
     path = boxes(EARLY)
     found = tune(path, worlds=4, steps=30, repeats=1)
@@ -37,7 +37,7 @@ def test_the_own_setting_is_measured_as_it_ran_and_worlds_are_held_back(boxes, m
     assert all(m.mean_step_time > 0.0 for m in found.measured)
 
 
-def test_the_converged_run_does_not_move_away_from_itself(boxes):
+def test_tune_of_the_converged_setting_has_no_motion_error(boxes):
     runs = Runs.of_model(boxes(), 1, 20)
     stage = Stage.from_stretches_of_runs(runs, [0], 10)
     same = stage.judge_setting(Setting.from_options(mj, runs.model, **mujoco_settings.CONVERGED_OPTIONS))
@@ -45,7 +45,7 @@ def test_the_converged_run_does_not_move_away_from_itself(boxes):
 
 
 @pytest.mark.parametrize("options", ["", 'solver="CG" cone="elliptic" jacobian="sparse" impratio="3"'])
-def test_a_line_means_in_a_model_what_was_measured(options):
+def test_option_line_pasted_into_a_model_gives_the_measured_options(options):
     plain = mj.MjModel.from_xml_string(BOXES.format(options=options))
     for setting in [*list_first_settings(mj, plain), *mujoco_settings.list_variants(mj, plain, Setting())]:
         text = setting.option_line.removeprefix("<option").removesuffix("/>")
@@ -90,7 +90,7 @@ def test_no_line_is_recommended_if_few_steps_have_contact(with_contact, is_enoug
     assert not replace(found, sizes=StepSizes(0 * contacts, 0 * contacts, False)).lines
 
 
-def test_what_is_chosen():
+def test_tuning_chooses_the_faster_and_the_more_accurate_setting():
     now = measured(10.0, 1e-3)
     quick, loose = measured(8.0, 1e-3, iterations=9), measured(2.0, 1e-1, iterations=1)
     exact, slow = measured(10.2, 1e-5, tolerance=1e-9), measured(20.0, 1e-9, tolerance=1e-15)
@@ -113,7 +113,7 @@ def test_errors_on_the_worlds_held_back_do_not_change_the_choice():
         assert not any("not measured" in line for line in after.lines)
 
 
-def test_of_equally_fast_settings_the_largest_iteration_limit_is_recommended():
+def test_tuning_of_equally_fast_settings_chooses_the_largest_iteration_limit():
     now, few, many, slow = (
         measured(10.0, 1e-3, iterations=15), measured(7.0, 3e-16, iterations=3),
         measured(7.2, 4e-16, iterations=10), measured(8.0, 1e-17, iterations=99),
@@ -124,7 +124,7 @@ def test_of_equally_fast_settings_the_largest_iteration_limit_is_recommended():
     assert chosen(now, few, measured(7.2, 2e-6, iterations=10)).faster is few
 
 
-def test_a_smaller_worst_error_does_not_hide_a_larger_median():
+def test_tuning_rejects_a_setting_with_a_larger_median_error():
     now, quick = measured(10.0, 1e-4), measured(8.0, 1e-3, iterations=9)
     now.error[0] = 1e-1
     assert quick.error.max() < now.error.max() and chosen(now, quick).faster is None
@@ -132,7 +132,7 @@ def test_a_smaller_worst_error_does_not_hide_a_larger_median():
     assert chosen(now, quick).faster is quick
 
 
-def test_the_fastest_setting_within_a_limit_of_the_error_is_recommended(tmp_path):
+def test_tuning_with_an_error_limit_chooses_the_fastest_setting_within_it(tmp_path):
     now, quick = measured(10.0, 1e-1), measured(8.0, 1e-2, iterations=9)
     rare, good = measured(11.0, 1e-5, tolerance=1e-5), measured(12.0, 1e-5, tolerance=1e-6)
     rare.error[0] = 0.5  # One step in a hundred: the limit is for every step.
@@ -160,7 +160,7 @@ def test_the_fastest_setting_within_a_limit_of_the_error_is_recommended(tmp_path
 
 
 @pytest.mark.parametrize(("limit", "is_met"), [(1e-6, True), (0.0, False)])
-def test_the_limit_of_the_error_holds_on_the_worlds_held_back(boxes, monkeypatch, limit, is_met):
+def test_tune_with_an_error_limit_meets_it_on_held_back_worlds(boxes, monkeypatch, limit, is_met):
     keep_values(monkeypatch, mujoco_settings, "MUJOCO", {1e-3, 1e-6, 1e-12, 2, 3, 25}, {"Newton", "CG"})
     found = tune(boxes(EARLY), worlds=4, steps=30, repeats=1, max_velocity_error=limit)
     choice = found.limit_choice
@@ -173,7 +173,7 @@ def test_the_limit_of_the_error_holds_on_the_worlds_held_back(boxes, monkeypatch
     assert "held back: not measured" not in "".join(found.lines)
 
 
-def test_mujoco_s_defaults_are_measured_and_named(boxes, monkeypatch):
+def test_tune_measures_the_default_options_of_mujoco(boxes, monkeypatch):
     fewer(monkeypatch)
     path = boxes('solver="CG" iterations="4" ls_iterations="8" tolerance="1e-3"')
     found = tune(path, worlds=2, steps=10, repeats=1, max_velocity_error=1e3)
@@ -191,7 +191,7 @@ def test_mujoco_s_defaults_are_measured_and_named(boxes, monkeypatch):
     assert not any(m.setting.is_default for m in tune(boxes(), worlds=2, steps=10, repeats=1).measured)
 
 
-def test_noise_is_no_gain_and_what_is_within_the_threshold_is_enough():
+def test_tuning_ignores_gains_within_noise_or_threshold():
     now, noise = measured(10.0, 1e-9), measured(9.8, 1e-9, iterations=9)
     found = chosen(now, noise, measured(10.0, 1e-12, tolerance=1e-12))
     assert found.faster is None and found.closer is None
@@ -244,7 +244,7 @@ def test_ctrl_c_before_the_first_round_returns_the_present_setting(boxes, monkey
         assert "Stopped before the end" in html_of(found, tmp_path)
 
 
-def test_a_setting_with_which_mujoco_ends_in_an_error_is_left_out(boxes, monkeypatch):
+def test_tune_leaves_out_a_setting_that_ends_mujoco_in_an_error(boxes, monkeypatch):
     fewer(monkeypatch)
     run = Stage.run_stretches
 
@@ -261,7 +261,7 @@ def test_a_setting_with_which_mujoco_ends_in_an_error_is_left_out(boxes, monkeyp
         tune(boxes(), worlds=2, steps=10, repeats=1)
 
 
-def test_an_interrupted_tuning_reuses_the_settings_judged(boxes, monkeypatch, tmp_path):
+def test_tune_resumed_after_ctrl_c_reuses_judged_settings(boxes, monkeypatch, tmp_path):
     fewer(monkeypatch)
     path, judged, judge_setting = boxes(EARLY), [], Stage.judge_setting
     monkeypatch.setattr(

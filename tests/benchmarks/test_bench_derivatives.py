@@ -9,7 +9,7 @@ from benchmarks import derivatives
 from lavender import suite
 
 
-def test_a_derivative_agrees_with_differences_and_a_wrong_one_would_not(monkeypatch):
+def test_bench_derivative_agrees_with_differences_and_a_wrong_one_does_not(monkeypatch):
     problem = suite.case("pyramidF(k=2, sliding=0.5)").problem.relaxed("cone")
     found = derivatives.compared("suite", problem)
     assert derivatives.agrees(found) and found.off < 1e-6
@@ -23,7 +23,7 @@ def test_a_derivative_agrees_with_differences_and_a_wrong_one_would_not(monkeypa
     assert not derivatives.agrees(derivatives.compared("suite", problem))
 
 
-def test_a_border_is_flagged_and_nothing_is_compared_across_it():
+def test_bench_derivative_at_a_switch_is_flagged_and_not_compared():
     a = np.eye(3)
     edge = lv.Problem.contact(a, [10.0, 5.0, 0.0], mu=[0.5])
     found = derivatives.compared("made", edge)
@@ -34,7 +34,7 @@ def test_a_border_is_flagged_and_nothing_is_compared_across_it():
     assert "| coulomb | matrix | 2 | 50.0% | 0 | 1 | 1 of 1 | 0 of 0 |" in table
 
 
-def test_a_direction_that_is_refused_is_flagged():
+def test_bench_derivative_of_a_rejected_direction_is_flagged():
     twice = lv.Problem.linear(np.ones((2, 2)), [1.0, 1.0])  # one row given twice
     found = derivatives.compared("made", twice)
     assert found.flagged == "refused" and np.isnan(found.off)

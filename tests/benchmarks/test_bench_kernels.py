@@ -34,7 +34,7 @@ def test_the_bare_row_sweep_is_pgs():
     np.testing.assert_allclose(lam, impulse, rtol=0, atol=1e-13 * np.abs(impulse).max())
 
 
-def test_the_pile_stands_where_it_says():
+def test_bench_pile_has_its_documented_overlap():
     for contacts in (1, 50, 3_000):
         problem = core_problems.lattice_pile(contacts)
         assert 0.5 * contacts <= problem.n_blocks <= 1.5 * contacts + 3
@@ -58,7 +58,7 @@ def test_cases_give_time_work_and_residual(case):
 
 
 @pytest.mark.parametrize("name", COUNTED)
-def test_what_is_counted_runs(name):
+def test_bench_kernel_cases_run_the_counted_work(name):
     made = job(name)
     made.call()
     assert made.work >= 1.0

@@ -89,7 +89,7 @@ def _hangs(problem, limit):
     ("runs", "kept", "note", "patience"),
     [(_dies, 0, "died", 600.0), (_raises, 1, "no more", 600.0), (_hangs, 1, "without an answer", 4.0)],
 )
-def test_a_contestant_that_fails_costs_its_own_runs(runs, kept, note, patience, monkeypatch):
+def test_race_with_a_failing_solver_keeps_other_runs(runs, kept, note, patience, monkeypatch):
     monkeypatch.setattr(race, "PATIENCE", patience)
     problem = suite.case("two_particles").problem
     ((result,),) = race.race([("a", problem)], [Contestant("x", True, runs)], limit=0.1, rounds=1)

@@ -20,7 +20,7 @@ def test_a_box_stands_in_every_engine_that_is_installed(name):
     assert (found.sweeps > 0) == bool(ENGINES[name].sweeps) and found.substeps >= 1
 
 
-def test_ours_is_what_the_scene_says_and_its_centres_are_the_boxes():
+def test_bench_stand_of_lavender_has_the_parameters_of_the_scene():
     asked = Tower(3, 1 / 60, sweeps=8, substeps=2, order="top_down", seconds=3.0)
     found = measure("lavender", asked)
     assert (found.engine, found.sweeps, found.substeps) == ("lavender, top_down", 8, 2)

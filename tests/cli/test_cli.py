@@ -25,7 +25,7 @@ TOLD = {"capture_output": False, "stderr": subprocess.PIPE}  # where the output 
 QUICK = ("--tolerances", "1e-3", "1e-6", "--budgets", "2", "4", "--repeats", "1", "--no-figures")
 
 
-def test_a_contradicted_claim_is_marked(lavender, path, plug_in):
+def test_report_and_check_of_a_false_claim_mark_it_contradicted(lavender, path, plug_in):
     plug_in(lambda problem, impulse: lv.Claim(lv.Status.CONVERGED, 1), "liar", laws={"lcp"})
     code, out, _ = lavender("report", path, "--solvers", "liar", *QUICK[:3], *QUICK[-3:], "--tables")
     assert code == 0
@@ -36,7 +36,7 @@ def test_a_contradicted_claim_is_marked(lavender, path, plug_in):
     assert "claim contradicted" in out and "1 claims are contradicted" in out
 
 
-def test_contract_checks_a_solver_and_explains_what_it_does_not_meet(lavender, plug_in, tmp_path):
+def test_contract_of_a_false_solver_ends_with_1_and_names_unmet_requirements(lavender, plug_in, tmp_path):
     code, out, _ = lavender("contract", "sor")
     assert code == 0 and "NOT MET" not in out
     assert "orders_change_the_sweep" not in out  # sor has orders
@@ -71,7 +71,7 @@ def options_of_real_numbers():
 
 @pytest.mark.parametrize("asked", ["nan", "-1"])
 @pytest.mark.parametrize(("command", "option"), list(options_of_real_numbers()))
-def test_a_number_that_means_nothing_ends_every_command_with_2(lavender, command, option, asked):
+def test_command_with_nan_or_a_negative_number_ends_with_2(lavender, command, option, asked):
     with open("m.xml", "w") as file:
         file.write(scene())
     code, _, err = lavender(command, *RUNS[command], f"{option}={asked}")
@@ -80,7 +80,7 @@ def test_a_number_that_means_nothing_ends_every_command_with_2(lavender, command
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="the device that is always full is Linux's")
-def test_a_full_disk_behind_stdout_is_one_line():
+def test_command_with_full_stdout_prints_one_error_line():
     with open("/dev/full", "w") as full:
         done = python("-m", "lavender", "solvers", status=cli.EXIT_BAD_INPUT, stdout=full, **TOLD)
     assert done.stderr.startswith("lavender: ")
@@ -88,7 +88,7 @@ def test_a_full_disk_behind_stdout_is_one_line():
 
 
 @pytest.mark.skipif(os.name != "posix", reason="a call in the child is of POSIX")
-def test_a_stdout_that_was_closed_is_no_error():
+def test_command_with_closed_stdout_prints_no_error():
     closes = "import os, sys; os.close(1); os.execv(sys.executable, [sys.executable, *sys.argv[1:]])"
     assert python("-c", closes, "-m", "lavender", "run", "stack", "--steps", "2", **TOLD).stderr == ""
 
@@ -118,7 +118,7 @@ def test_help_is_quick_and_names_every_command():
     )
 
 
-def test_solve_says_by_its_exit_code_what_came_of_it(lavender, path, tmp_path):
+def test_solve_command_exit_code_follows_the_status(lavender, path, tmp_path):
     assert lavender("solve", path)[0] == 0  # auto
     assert "auto: CONVERGED" in lavender("solve", path)[1]
     assert "8 rows" in lavender("solve", "stack(n=8)", "--solver", "direct")[1]
@@ -136,7 +136,7 @@ def test_solve_says_by_its_exit_code_what_came_of_it(lavender, path, tmp_path):
         assert lavender("solve", tmp_path / "wrong.npz", "--solver", "pgs", *more)[0] == cli.EXIT_UNMET
 
 
-def test_an_answer_is_not_written_over_its_problem(lavender, path):
+def test_solve_command_with_output_equal_to_the_problem_ends_with_2(lavender, path):
     before = path.read_bytes()
     link = path.with_name("link.npz")
     link.symlink_to(path)
@@ -148,7 +148,7 @@ def test_an_answer_is_not_written_over_its_problem(lavender, path):
 # -- what nobody should ask for ---------------------------------------------------------------------------
 
 
-def test_a_line_without_end_is_refused(tmp_path):
+def test_read_records_with_an_endless_line_raises(tmp_path):
     path = tmp_path / "records.jsonl"
     with path.open("wb") as stream:
         stream.truncate(2**27)
@@ -158,7 +158,7 @@ def test_a_line_without_end_is_refused(tmp_path):
 
 @pytest.mark.parametrize("tail", [b"", b"torn", b"x" * 70_000, b"x" * 65_536])
 @pytest.mark.parametrize("reasons", [[], ["why"] * 3, ["y" * 65_400, "why"], ["y" * 70_000]])
-def test_a_torn_line_is_cut_wherever_it_begins(tmp_path, reasons, tail):
+def test_store_with_a_torn_last_line_cuts_it(tmp_path, reasons, tail):
     entries = [
         {"kind": "skip", "run": "run", "case": f"case {i}", "reason": reason} for i, reason in enumerate(reasons)
     ]
@@ -208,7 +208,7 @@ def test_ctrl_c_before_the_first_result_ends_with_130_and_a_reason(tmp_path, mon
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="signals of POSIX")
-def test_ctrl_c_that_a_library_makes_another_error_of_ends_with_130():
+def test_ctrl_c_converted_to_another_error_ends_with_130():
     code = """
 import signal, click, lavender as lv
 from lavender.cli import main, solvers
@@ -229,7 +229,7 @@ for error in (ValueError("Invalid bounding box"), lv.InputError("mujoco cannot b
     assert "Invalid bounding box" in said and "mujoco cannot be imported" in said
 
 
-def test_doctor_tells_what_looks_wrong_in_a_problem(lavender, path, tmp_path):
+def test_doctor_of_a_problem_with_duplicates_lists_them(lavender, path, tmp_path):
     assert lavender("doctor", path)[:2] == (0, "1 problems checked, none with diagnostics\n")
     code, out, _ = lavender("doctor", path, "duplicated(k=3)")
     assert (code, out.splitlines()[-1]) == (1, "2 problems checked, 1 with diagnostics")
@@ -257,7 +257,7 @@ def _must_not_begin(*_, **__):
         ("run stack --record {}/sub", "lavender.sim.engine.Simulation.step"),
     ],
 )
-def test_what_cannot_be_written_is_refused_before_the_work(lavender, monkeypatch, tmp_path, words, work):
+def test_command_with_an_unwritable_output_ends_with_2_before_work(lavender, monkeypatch, tmp_path, words, work):
     (tmp_path / "file").write_text("")
     monkeypatch.setattr(work, _must_not_begin)
     for place in ("file",) if "/sub" in words else ("file", "absent"):  # a folder is made, with its parents
@@ -277,11 +277,11 @@ def _unread(*words):
 
 
 @pytest.mark.parametrize("words", ["solvers", "explain toy_stack"])
-def test_a_pipe_that_nobody_reads_ends_a_command_quietly(words):
+def test_command_with_a_closed_pipe_prints_no_error(words):
     assert _unread(*words.split()) == ""
 
 
-def test_files_are_written_whoever_reads(path, tmp_path):
+def test_command_with_a_closed_pipe_writes_its_files(path, tmp_path):
     made = [tmp_path / name for name in ("x.csv", "x.npz")]
     assert _unread("run", "stack", "--steps", 3, "--trace", made[0]) == ""
     assert _unread("solve", path, "--output", made[1]) == ""
@@ -316,7 +316,7 @@ def test_check_judges_a_stored_answer_for_the_precision_it_was_made_in(lavender,
         ("lv.suite; print(lv.cross_check(lcp, ['pgs', 'direct']))", "agrees"),
     ],
 )
-def test_without_packages_a_sentence_names_what_to_install(call, message):
+def test_call_without_an_optional_package_names_the_command_to_install_it(call, message):
     names = ["click", "rich", "joblib", "matplotlib", "filelock"]
     code = f"import sys\nfor name in {names}: sys.modules[name] = None\nimport lavender as lv\n"
     code += f"lcp = lv.Problem.lcp([[2.0]], [1.0])\n{call}"

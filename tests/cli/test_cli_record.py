@@ -13,7 +13,7 @@ from lavender.judge.residuals import AT_FLOOR
 PGS = 1e-6  # as in test_io_mujoco.py
 
 
-def test_what_a_robot_does_not_feel_is_close_enough_and_the_threshold_is_the_users(lavender, tmp_path):
+def test_record_verdict_follows_the_threshold_of_the_user(lavender, tmp_path):
     """All but exact answers are above the floor of float64, which rounding alone sets."""
     model = mj.MjModel.from_xml_string(scene(solver="PGS").replace('"1e-15"', '"1e-12"'))
     found = lv.io.record(model, mj.MjData(model), tmp_path / "a", 30)

@@ -22,7 +22,7 @@ from lavender.report import Event
 from lavender.report.store import select_cases, select_skips
 
 
-def test_the_command_shows_the_way_and_gives_it_as_data(lavender):
+def test_explain_command_prints_stages_and_json(lavender):
     code, shown, _ = lavender("explain", "stack(n=200)", "granularF(n=4)")
     assert code in (0, None)
     assert "newton is counted to take" in shown and "granularF(n=4)" in shown and "admm" in shown
@@ -57,7 +57,7 @@ def test_lists_take_commas_or_blanks_and_files_may_follow(lavender, path, tmp_pa
     assert set(runs.loc[runs["mode"] == "budget", "max_iter"]) == {3, 5}
 
 
-def test_a_file_of_a_folder_that_cannot_be_read_is_named_and_costs_itself_alone(lavender, path):
+def test_command_on_a_folder_with_an_unreadable_file_names_it_and_reads_the_rest(lavender, path):
     (path.parent / "[bold]x.npz").write_bytes(b"PK")
     more = {"check": ("--solvers", "direct"), "report": ("--solvers", "pgs", *QUICK, "--tables")}
     for command in ("check", "doctor", "explain", "report"):
@@ -139,7 +139,7 @@ if "popen_loky" in " ".join(sys.orig_argv):
 
 @pytest.mark.nightly
 @pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="signals of POSIX")
-def test_ctrl_c_while_workers_of_a_campaign_start_is_answered_by_the_command_alone(tmp_path):
+def test_ctrl_c_while_workers_start_is_handled_by_the_command_only(tmp_path):
     """The terminal sends the signal to all of its processes, where the first worker begins its imports."""
     (tmp_path / "sitecustomize.py").write_text(WORKER)
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
@@ -154,7 +154,7 @@ ARM = """<mujoco><option timestep="0.01"/><worldbody><geom type="plane" size="1 
 <body pos="0 0 {height}"><freejoint/><geom type="{kind}" size=".1 .1 .1"/></body></worldbody></mujoco>"""
 
 
-def test_models_of_one_file_name_are_kept_apart(lavender, tmp_path):
+def test_report_of_two_models_of_one_file_name_keeps_both(lavender, tmp_path):
     pytest.importorskip("mujoco")
     for name, kind in (("h1", "box"), ("g1", "sphere")):
         (tmp_path / name).mkdir()
@@ -172,7 +172,7 @@ def test_models_of_one_file_name_are_kept_apart(lavender, tmp_path):
     assert {p.name for p in (tmp_path / "o" / "recorded").iterdir()} == folders
 
 
-def test_steps_that_could_not_be_recorded_are_counted(lavender, tmp_path, monkeypatch):
+def test_report_counts_steps_that_were_not_recorded(lavender, tmp_path, monkeypatch):
     """In the terminal, the records and the exit code, at once, found recorded, as a campaign and in a check."""
     recording = pytest.importorskip("lavender.io.recording")
     pytest.importorskip("mujoco")
@@ -207,7 +207,7 @@ def test_steps_that_could_not_be_recorded_are_counted(lavender, tmp_path, monkey
     assert (code, "left out" in out) == (0, False)
 
 
-def test_a_model_is_recorded_again_when_what_it_is_made_of_has_changed(lavender, tmp_path, monkeypatch):
+def test_report_of_a_model_records_again_if_an_included_file_changed(lavender, tmp_path, monkeypatch):
     mujoco, recording = pytest.importorskip("mujoco"), pytest.importorskip("lavender.io.recording")
     if not hasattr(mujoco, "mju_getXMLDependencies"):
         pytest.skip("this MuJoCo does not tell what a model includes")

@@ -20,7 +20,7 @@ from lavender.sim.web import pages
     [("--iterations", "8", "--no-warm-start"), ("--set", "solver_iterations=8", "--set", "warm_start=false")],
     ids=["options", "set"],
 )
-def test_lavender_run_shows_a_line_and_writes_what_was_asked_for(lavender, tmp_path, asked):
+def test_run_command_writes_the_requested_files(lavender, tmp_path, asked):
     paths = [tmp_path / name for name in ("trace.csv", "figure.svg", "problems")]
     words = ["run", "stack", *asked, "--steps", "12", "--set", "n=2", "--order", "top_down", "--residual"]
     files = ["--trace", paths[0], "--plot", paths[1], "--record", paths[2]]
@@ -88,7 +88,7 @@ ROOT = HERE.parents[1]
 CHECK = ROOT / "tests" / "sim" / "web" / "check_wasm_exports.mjs"
 
 
-def test_lavender_web_check_says_what_it_needs_and_ends_as_its_script_does(tmp_path, monkeypatch):
+def test_web_check_command_ends_with_the_status_of_its_script(tmp_path, monkeypatch):
     monkeypatch.setattr(pages, "get_or_build_module", lambda say, name: name.encode())
     monkeypatch.setattr(pages, "ROOT", tmp_path)
     with pytest.raises(LavenderError, match="part of a checkout"):

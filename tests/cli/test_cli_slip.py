@@ -10,7 +10,7 @@ SLOPE = """<mujoco><option timestep="0.002" gravity="5.5 0 -8.1" cone="elliptic"
   </worldbody></mujoco>"""
 
 
-def test_the_table_names_the_cause(lavender, tmp_path):
+def test_slip_command_prints_the_cause(lavender, tmp_path):
     (tmp_path / "slope.xml").write_text(SLOPE)
     code, output, error = lavender("slip", tmp_path / "slope.xml", "--steps", 15)
     assert code == 0, error
@@ -19,7 +19,7 @@ def test_the_table_names_the_cause(lavender, tmp_path):
     assert code == 2 and "hand" in error
 
 
-def test_a_geom_that_touches_nothing_is_named(lavender, tmp_path):
+def test_slip_command_on_a_geom_without_contact_ends_with_1(lavender, tmp_path):
     (tmp_path / "slope.xml").write_text(SLOPE.replace("0 0 .05", "0 0 5"))
     code, output, _ = lavender("slip", tmp_path / "slope.xml", "--contact", "box")
     assert code == 1 and "'box' touches nothing with friction in these states." in output

@@ -13,7 +13,7 @@ from lavender.audit.tune import mujoco_settings as tuning
 pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[mujoco]'")
 
 
-def test_an_audit_accepts_or_does_not(lavender, boxes, tmp_path):
+def test_audit_command_exit_code_follows_the_error_limit(lavender, boxes, tmp_path):
     words = ("--worlds", 2, "--steps", 20, "--workers", 1, "--out", tmp_path / "out", "--max-velocity-error", "1e-3")
     code, out, _ = lavender("audit", boxes(EARLY), *words)
     assert code == 1 and "stopped before convergence" in out

@@ -12,7 +12,7 @@ from lavender.report import doctor, machine
 NEEDED = {"lavender", "python", "platform", "cpu", "cores", "versions", "build", "backends", "self_test", "same_bits"}
 
 
-def test_it_says_what_a_report_of_a_bug_needs_and_finds_every_bit():
+def test_doctor_prints_versions_and_confirms_bits():
     done = CliRunner().invoke(cli, ["doctor", "--json"])
     assert done.exit_code == 0, done.output
     found = json.loads(done.output)
@@ -25,7 +25,7 @@ def test_it_says_what_a_report_of_a_bug_needs_and_finds_every_bit():
     assert {k: found["build"][k] for k in facts if k != "clock"} == {k: facts[k] for k in facts if k != "clock"}
 
 
-def test_another_bit_is_told_and_is_status_1(monkeypatch):
+def test_doctor_with_a_changed_bit_ends_with_1(monkeypatch):
     name = next(iter(doctor.HASHES))
     monkeypatch.setitem(doctor.HASHES, name, "0" * 16)
     done = CliRunner().invoke(cli, ["doctor"])
@@ -34,7 +34,7 @@ def test_another_bit_is_told_and_is_status_1(monkeypatch):
     assert f"{len(doctor.HASHES) - 1} of {len(doctor.HASHES)} give their bits" in done.output
 
 
-def test_one_sweep_less_is_seen_in_every_part(monkeypatch):
+def test_doctor_with_one_sweep_less_fails_every_part(monkeypatch):
     before = doctor.run_self_test()
     assert before == doctor.run_self_test() == doctor.HASHES
     assert len(set(before.values())) == len(before)

@@ -129,7 +129,7 @@ def test_only_regular_files_are_read_or_replaced(kind, suffix, call, results, tm
 
 
 @each_call
-def test_what_names_no_file_is_rejected_and_nothing_is_written(suffix, call, results, tmp_path):
+def test_file_call_with_a_value_that_is_not_a_path_raises_and_writes_nothing(suffix, call, results, tmp_path):
     """A number is not the descriptor of an open file, which is neither read nor closed."""
     path = tmp_path / "p.npz"
     lv.Problem.lcp([[2.0]], [1.0]).save(path)
@@ -155,7 +155,7 @@ def test_files_of_ten_gigabytes_are_rejected_before_they_are_read(suffix, call, 
 
 
 @each_writer
-def test_a_link_stays_and_the_file_behind_it_is_replaced(suffix, call, results, tmp_path):
+def test_write_through_a_link_replaces_its_target(suffix, call, results, tmp_path):
     (tmp_path / "far").mkdir()
     names = (f"far/target{suffix}", f"link{suffix}", f"second{suffix}")
     target, link, second = (tmp_path / name for name in names)
@@ -173,7 +173,7 @@ def test_a_link_stays_and_the_file_behind_it_is_replaced(suffix, call, results, 
 
 @each_writer
 @pytest.mark.parametrize("is_renamed", [False, True], ids=["writing", "renaming"])
-def test_a_full_disk_leaves_the_file_of_before(is_renamed, suffix, call, results, tmp_path, monkeypatch):
+def test_write_on_a_full_disk_keeps_the_old_file(is_renamed, suffix, call, results, tmp_path, monkeypatch):
     if suffix == ".jsonl":
         pytest.skip("records are added to the file")
     path = tmp_path / f"there{suffix}"
@@ -521,7 +521,7 @@ def test_records_of_any_content_are_shown_or_rejected(tmp_path, entries, kind):
         "\ufffe",
     ],
 )
-def test_lines_that_are_no_records_are_rejected_by_number(tmp_path, text):
+def test_read_records_of_a_malformed_line_names_its_number(tmp_path, text):
     (tmp_path / "records.jsonl").write_text(f"{text}\n")
     with pytest.raises(lv.InputError, match="line 1"):
         report.read(tmp_path)

@@ -135,7 +135,7 @@ def solved(name):
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("name", SOLVERS)
-def test_every_way_to_solve_has_the_bits_of_a_fresh_solve(name, way):
+def test_solve_in_another_way_has_the_bits_of_a_fresh_solve(name, way):
     chosen = solved(name)[:9] if way == "eight threads" else solved(name)
     for problem, options, expected in chosen:
         assert facts(WAYS[way](fresh(problem), name, **options)) == expected, problem

@@ -239,7 +239,7 @@ ERRORS = {
     ("call", "words", "error"),
     [pytest.param(call, words, error, id=words) for error, cases in ERRORS.items() for call, words in cases],
 )
-def test_a_wrong_argument_raises_an_error_with_these_words(call, words, error):
+def test_wrong_arguments_together_raise_an_error_with_these_words(call, words, error):
     with pytest.raises(error, match=words) as raised:
         call()
     assert type(raised.value) is not lv.InputError or isinstance(raised.value, ValueError)

@@ -18,7 +18,7 @@ def solution(problem):
     return lv.solve(problem, "pgs", tol=1e-8, history=True)
 
 
-def test_plot_shows_the_worst_rows_and_the_history(solution):
+def test_plot_of_a_solution_shows_worst_rows_and_history(solution):
     worst, history = solution.plot(rows=3).axes
     widths = [bar.get_width() for bar in worst.patches]
     assert widths == sorted(solution.residual.velocity_by_row)[-3:]

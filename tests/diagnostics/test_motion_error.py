@@ -52,7 +52,7 @@ def test_motion_error_is_the_energy_and_the_largest_speeds_of_the_velocity_diffe
     ],
     ids=["matrix", "asymmetric", "indefinite", "infeasible"],
 )
-def test_motion_error_without_a_number_is_none_and_says_why(problem, none, some, word):
+def test_motion_error_without_velocities_is_none_with_a_note(problem, none, some, word):
     e = lv.motion_error(problem, np.zeros(problem.m))
     assert [getattr(e, name) for name in none] == [None] * len(none)
     assert all(getattr(e, name) > 0.1 for name in some)

@@ -26,7 +26,7 @@ def box_on_corners(mu=None, points=4):
 
 
 @pytest.mark.parametrize("as_given", [lambda p: p, as_matrix])
-def test_a_cube_on_four_points(as_given):
+def test_redundancy_of_a_cube_on_four_points_is_known(as_given):
     """Rank 3 of the normals; 6 with friction: a rigid body has six motions."""
     found = redundancy(as_given(box_on_corners()))
     assert found.rank == 3
@@ -37,7 +37,7 @@ def test_a_cube_on_four_points(as_given):
     assert redundancy(as_given(box_on_corners(0.5))).rank == 6
 
 
-def test_the_second_of_two_equal_hinges_is_named():
+def test_redundancy_of_two_equal_hinges_names_the_second():
     rng = np.random.default_rng(3)
     jac = rng.normal(size=(5, 12))
     rows = lv.Rows(
@@ -69,7 +69,7 @@ def test_ranks_of_matrices_by_hand(a, b, rank):
 
 
 @given(seed=seeds)
-def test_an_indefinite_matrix_has_its_rank_and_nothing_unique(seed):
+def test_redundancy_of_an_indefinite_matrix_has_its_rank(seed):
     rng = np.random.default_rng(seed)
     m, r = int(rng.integers(2, 12)), int(rng.integers(2, 12))
     g, signs = rng.normal(size=(m, r)), rng.permutation([1.0, -1.0, *rng.choice([1.0, -1.0], r - 2)])

@@ -39,18 +39,18 @@ def kinds(problem, impulse=None):
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_a_sound_step_is_silent(name):
+def test_diagnose_of_a_correct_step_reports_nothing(name):
     problem = SCENES[name]
     assert lv.diagnose(problem) == ()
     assert lv.diagnose(made(problem, *given(problem))) == ()
 
 
-def test_the_built_in_suite_is_silent():
+def test_diagnose_of_the_suite_reports_nothing():
     assert [c.name for c in suite.cases("default") if lv.diagnose(c.problem)] == []
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_flipped_normals_are_told(name):
+def test_diagnose_of_flipped_normals_reports_them(name):
     rows, target = given(SCENES[name])
     rows["normal"] *= -1.0
     assert "normals" in kinds(made(SCENES[name], rows, target))
@@ -63,7 +63,7 @@ def test_flipped_normals_are_told(name):
 
 
 @pytest.mark.parametrize("name", ["stack", "pit"])
-def test_opposed_and_repeated_contacts_are_told(name):
+def test_diagnose_of_opposed_or_repeated_contacts_reports_them(name):
     problem = SCENES[name]
     rows, _ = given(problem)
     for sign, kind in ((1.0, "duplicate rows"), (-1.0, "opposed normals")):
@@ -74,7 +74,7 @@ def test_opposed_and_repeated_contacts_are_told(name):
         assert kind in kinds(lv.Problem.from_rows(lv.Rows(**twice), mu=0.5))
 
 
-def test_joint_targets_behind_those_of_contacts_are_told():
+def test_diagnose_of_targets_in_wrong_order_reports_them():
     problem = SCENES["bridge"]
     rows, target = given(problem)
     mj = len(rows["jac"])
@@ -84,7 +84,7 @@ def test_joint_targets_behind_those_of_contacts_are_told():
     assert kinds(made(problem, rows, np.roll(target, -mj))) == {"targets"}
 
 
-def test_masses_for_their_inverses_are_told():
+def test_diagnose_of_masses_given_as_inverses_reports_them():
     for name in ("stack", "pit"):  # the bridge's planks have 1 kg and 1 m, where both readings are ordinary
         rows, target = given(SCENES[name])
         rows["inv_mass"], rows["inv_inertia"] = 1.0 / rows["inv_mass"], np.linalg.inv(rows["inv_inertia"])
@@ -98,7 +98,7 @@ def test_masses_for_their_inverses_are_told():
     assert found[0].data["bodies"] == [3]
 
 
-def test_a_depth_with_the_wrong_sign_is_told():
+def test_diagnose_of_a_depth_of_wrong_sign_reports_targets():
     rows, _ = given(SCENES["stack"])
     rows["v_free"][:] = (0.0, 0.0, -9.81 / 60, 0.0, 0.0, 0.0)
     target = np.zeros(SCENES["stack"].m)
@@ -107,7 +107,7 @@ def test_a_depth_with_the_wrong_sign_is_told():
         assert kinds(made(SCENES["stack"], rows, target)) == wanted
 
 
-def test_friction_keys_and_forces_are_told():
+def test_diagnose_of_duplicate_keys_forces_and_large_friction_reports_them():
     problem = SCENES["stack"]
     doubled = np.array(problem.key)
     doubled[5] = doubled[7]
@@ -129,7 +129,7 @@ def boxes(n=3):
     return np.kron(np.eye(n), j), np.kron(np.eye(n), mass), np.tile(problem.rows.v_free.ravel(), n)
 
 
-def test_generalised_coordinates_out_of_order_are_told():
+def test_diagnose_of_wrong_row_order_in_j_reports_it():
     j, mass, v = boxes()
     cones = lv.Cones.contacts(0.5, count=12)
 
@@ -156,7 +156,7 @@ def test_generalised_coordinates_out_of_order_are_told():
     assert kinds(problem(np.concatenate([j[:18], j[:18]]))) == {"duplicate rows"}
 
 
-def test_a_matrix_with_opposed_rows_is_told():
+def test_diagnose_of_a_matrix_with_opposed_rows_reports_it():
     a = np.eye(6)
     a[3:, :3] = a[:3, 3:] = np.diag([-1.0, 1.0, 1.0])
     problem = lv.Problem.contact(a, [0.3, 0.0, 0.0, 0.1, 0.0, 0.0], mu=[0.5, 0.5])
@@ -166,7 +166,7 @@ def test_a_matrix_with_opposed_rows_is_told():
 
 @pytest.mark.parametrize("size", [0.0, 1e-50, 1e50])
 @pytest.mark.parametrize("what", ["arm_a", "arm_b", "inv_mass", "inv_inertia", "v_free"])
-def test_numbers_of_any_size_are_looked_at(what, size):
+def test_diagnose_of_extreme_numbers_does_not_raise(what, size):
     for name in SCENES:
         rows, target = given(SCENES[name])
         try:
@@ -211,7 +211,7 @@ def test_masses_in_place_of_inverse_masses_are_found_in_space_only(mass, size):
     assert [s.kind for s in lv.diagnose(space.problem())] == ["masses"]
 
 
-def test_a_bounce_before_the_surfaces_meet_is_no_gap_of_the_wrong_sign():
+def test_diagnose_of_a_bounce_with_a_gap_reports_nothing():
     dt, fall, e = 0.01, np.array([-2.0, -3.0]), 0.5
     gap = np.array([0.01, 0.02])  # m, closed within the step
 
@@ -243,7 +243,7 @@ def pressed(law, form):
 
 @pytest.mark.parametrize("form", ["bodies", "J and M", "A"])
 @pytest.mark.parametrize("law", ["lcp", "coulomb", "cone"])
-def test_who_fights_is_named_and_the_compliance_that_is_advised_gives_an_answer(law, form):
+def test_conflict_names_its_blocks_and_compliance_removes_it(law, form):
     problem = pressed(law, form)
     for name in ("auto",) if law == "coulomb" else ("auto", "newton"):
         solution = lv.solve(problem, name)

@@ -72,7 +72,7 @@ def test_no_python_header_and_nothing_but_sqrt_and_moves_of_memory(folder, share
         ),
     ],
 )
-def test_what_computes_otherwise_does_not_compile_and_says_why(folder, compiler, flag, sign):
+def test_c_library_with_flags_that_change_numbers_does_not_compile(folder, compiler, flag, sign):
     done = subprocess.run(
         [compiler, flag, "-fsyntax-only", folder / "lavender.c"], capture_output=True, text=True, check=False
     )
@@ -92,7 +92,7 @@ def test_checksums_are_of_the_files(folder):
         assert hashlib.sha256((folder / name).read_bytes()).hexdigest() == value
 
 
-def test_what_is_there_and_is_another_is_not_replaced_unasked(tmp_path, folder):
+def test_export_does_not_replace_other_files(tmp_path, folder):
     (tmp_path / "lavender.h").write_text("mine")
     with pytest.raises(LavenderError, match="--replace"):
         export.write(tmp_path)
@@ -125,7 +125,7 @@ def test_cmake_builds_installs_and_is_found(folder, tmp_path):
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("name, what", [("gcc", "address,undefined"), ("clang", "memory")])
-def test_sanitizers_have_nothing_to_say(folder, tmp_path, name, what):
+def test_c_library_passes_sanitizers(folder, tmp_path, name, what):
     flags = ["-std=c11", "-O0", "-g1", f"-fsanitize={what}", "-fno-sanitize-recover=all", "-I", folder]
     if name == "gcc":  # a third of the time to compile: calls in place of code, a signal in place of words
         flags += ["-fno-sanitize=null,object-size,pointer-overflow", "-fsanitize-undefined-trap-on-error"]

@@ -152,7 +152,7 @@ def test_every_method_has_the_bits_of_the_package(library, at):
     ("name", "friction"),
     [("pgs", "coulomb"), ("block_gauss_seidel", "cone"), ("anderson", "coulomb"), ("nncg", "cone"), ("newton", "cone")],
 )
-def test_what_float64_loses_by_an_ill_conditioned_m_is_no_claim(library, name, friction):
+def test_c_library_claims_on_ill_conditioned_mass_are_those_of_the_package(library, name, friction):
     """The residual is refined in the library as well: with the package's status, and at its floor where it is."""
     count = 0
     for seed in range(8):
@@ -206,7 +206,7 @@ def test_options_are_those_of_the_package(library, method, asked, words):
 
 
 @pytest.mark.parametrize("method", ["sequential_impulses", "pgs", "anderson", "nncg", "jacobi"])
-def test_room_is_what_a_method_takes_where_nothing_is_guessed(library, method):
+def test_c_workspace_size_exceeds_the_need_by_at_most_five_percent(library, method):
     looked = 0
     for given in GIVEN:
         problem, options = library.problem(given), library.options(method)
@@ -221,7 +221,7 @@ def test_room_is_what_a_method_takes_where_nothing_is_guessed(library, method):
 
 @pytest.mark.parametrize("method", ["direct", "lemke"])
 @pytest.mark.parametrize("n_bodies", [3, 100, 2000])
-def test_room_of_pivots_counts_the_bodies_that_no_row_moves(library, method, n_bodies):
+def test_c_workspace_of_pivots_counts_unmoved_bodies(library, method, n_bodies):
     rows = lv.Rows(
         np.ones(n_bodies), np.tile(np.eye(3), (n_bodies, 1, 1)), np.ones((n_bodies, 6)),
         jac=np.tile(np.eye(12)[6], (2, 1)), joint_ptr=[0, 1, 2], joint_body=[[-1, 0], [-1, 1]],
@@ -421,7 +421,7 @@ def motion(library, solver, impulse, reference):
     return out
 
 
-def test_frames_of_float32_are_made_whole_as_the_package_does(library):
+def test_c_frames_in_float32_are_corrected_like_the_package(library):
     rng = np.random.default_rng(4)
     tower = self_test_problem().rows
     axes = np.linalg.qr(rng.normal(size=(12, 3, 3)))[0].astype(np.float32).astype(float)

@@ -150,7 +150,7 @@ def test_the_rigid_answer_is_near_saps(approximation):
     assert np.median(gaps) < 0.1  # 0.6 % where it was written; 1 would be no relation at all
 
 
-def test_what_is_not_known_is_refused():
+def test_from_drake_of_unsupported_input_raises():
     _, _, plant, context = robot(sampled=True)
     with pytest.raises(lv.CapabilityError, match="SetUseSampledOutputPorts"):
         lv.io.from_drake(plant, context)
@@ -163,7 +163,7 @@ def test_what_is_not_known_is_refused():
         lv.io.from_drake(plant, context, correction=2.0)
 
 
-def test_velocities_that_do_not_add_up_are_refused(monkeypatch):
+def test_from_drake_of_inconsistent_velocities_raises(monkeypatch):
     _, _, plant, context = robot()
     honest = drake.compute_free_motion
     monkeypatch.setattr(drake, "compute_free_motion", lambda *a: (honest(*a)[0], honest(*a)[1] + 1e-3))

@@ -76,7 +76,7 @@ def test_a_state_that_is_not_finite_harms_no_other():
 
 
 @pytest.mark.parametrize("jacobian", ["dense", "sparse"])
-def test_a_row_of_zeros_is_where_mujoco_has_it(jacobian):
+def test_from_mujoco_many_keeps_rows_of_zeros(jacobian):
     """A tendon along the arm that it holds: dense, MuJoCo counts its row, allots room and leaves it out."""
     model = mj.MjModel.from_xml_string(f"""<mujoco><option jacobian="{jacobian}"/><worldbody>
       <site name="a" pos="1 0 0"/>
@@ -91,7 +91,7 @@ def test_a_row_of_zeros_is_where_mujoco_has_it(jacobian):
 
 
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
-def test_surfaces_that_move_are_in_the_problem(cone):
+def test_from_mujoco_many_of_moving_surfaces_has_their_speed(cone):
     """A conveyor: its speed is in efc_vel and in aref, not in J v."""
     try:
         model = mj.MjModel.from_xml_string(f"""<mujoco><option cone="{cone}" tolerance="0"/><worldbody>
@@ -175,7 +175,7 @@ def test_a_triangle_of_the_mass_and_the_time_step_in_an_array_make_the_same_worl
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("junk", [np.nan, np.inf])
-def test_what_stands_behind_the_rows_that_count_is_not_read(junk):
+def test_from_efc_does_not_read_rows_above_nefc(junk):
     model = mj.MjModel.from_xml_string(scene())
     given = stacked(model, states_of(model, 3), np.float32)
     clean = lv.io.from_efc(**given)
@@ -187,15 +187,6 @@ def test_what_stands_behind_the_rows_that_count_is_not_read(junk):
         np.testing.assert_array_equal(impulse[i], np.r_[clean.impulse[i, :m], np.zeros(len(impulse[i]) - m)])
     many, same = lv.solve_many(batch, impulse=impulse), lv.solve_many(clean.batch, impulse=clean.impulse)
     np.testing.assert_array_equal(many.impulse, same.impulse)
-
-
-def contact(given, k, change):
-    """The contacts with another array in place k: world, efc_address, dim, friction."""
-    return {"contacts": tuple(change(x) if i == k else x for i, x in enumerate(given["contacts"]))}
-
-
-def contacts(given, change):
-    return {"contacts": tuple(map(change, given["contacts"]))}
 
 
 def test_the_law_of_contacts_can_be_coulombs():

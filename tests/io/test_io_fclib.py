@@ -187,7 +187,7 @@ def test_both_forms_are_read_as_local(tmp_path):
 # -- refused --------------------------------------------------------------------------------------
 
 
-def test_what_fclib_cannot_hold_is_named(tmp_path):
+def test_save_to_fclib_of_unsupported_data_names_it(tmp_path):
     rows = soft(global_problem())
     named = lv.Problem(rows.b, rows.cones, rows=rows.rows, names=["x"] * 8, key=range(8))
     single = np.eye(3, dtype=np.float32)
@@ -226,7 +226,7 @@ def test_what_fclib_cannot_hold_is_named(tmp_path):
         lavender.io.save(None, tmp_path / "p.hdf5")
 
 
-def test_files_that_mix_kinds_or_miss_a_moment_are_told(tmp_path):
+def test_load_of_fclib_with_mixed_kinds_raises(tmp_path):
     path = tmp_path / "r.hdf5"
     plain, rolls = local_problem(), random_contact_problem(5, rolling=True, spin=False, joints=0)
     rolls = lv.Problem(rolls.b, rolls.cones, rolls.delassus())
@@ -268,7 +268,7 @@ def test_a_singular_mass_matrix_is_refused(tmp_path):
         lavender.io.load(make(tmp_path / "p.h5", f=np.zeros(2), w=np.zeros(3), mu=[0.5], **parts))
 
 
-def test_a_flipped_bit_of_any_array_is_told(tmp_path):
+def test_load_of_fclib_with_a_flipped_bit_raises(tmp_path):
     """HDF5 has no checksum of its own: without one such a file is another problem."""
     problem = local_problem()
     path = tmp_path / "p.hdf5"
@@ -292,7 +292,7 @@ def test_a_flipped_bit_of_any_array_is_told(tmp_path):
                     lavender.io.read(path)
 
 
-def test_nothing_outside_the_file_is_read(tmp_path):
+def test_load_of_fclib_with_links_reads_no_other_file(tmp_path):
     secret = tmp_path / "secret.bin"
     np.arange(3.0).tofile(secret)
     with h5py.File(tmp_path / "other.h5", "w") as file:

@@ -77,7 +77,7 @@ def normals_first(joints, bounded, limits, contacts):
 
 
 @pytest.mark.parametrize("model", ["mixed", "stacks", "dvi"])
-def test_problems_are_the_engines(model):
+def test_from_kamino_problems_equal_the_matrix_of_the_engine(model):
     solver, _ = load(model)
     step = lv.io.from_kamino(solver, verify=True)
     assert step.claims.converged.shape == (len(step.batch),)

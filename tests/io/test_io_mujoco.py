@@ -48,7 +48,7 @@ def test_friction_slides_and_sticks_in_the_scene():
     assert min(ratio) < 0.99
 
 
-def test_what_solvers_here_find_is_the_acceleration_of_mujoco():
+def test_solve_of_a_mujoco_step_gives_its_acceleration():
     model, data = state()
     problem = lv.io.from_mujoco(model, data)
     solution = lv.solve(problem, "admm", tol=1e-10, max_iter=100_000)
@@ -116,7 +116,7 @@ def test_coefficients_that_differ_are_made_round_without_changing_the_problem(co
     assert np.abs(found - data.qacc).max() < 1e-5 * (1 + np.abs(data.qacc).max())
 
 
-def test_the_problem_knows_velocities_and_keys_and_starts_from_nothing():
+def test_from_mujoco_has_velocities_keys_and_no_guess():
     model, data = state()
     problem = lv.io.from_mujoco(model, data)
     assert problem.operator == "generalized"
@@ -144,7 +144,7 @@ def test_the_problem_knows_velocities_and_keys_and_starts_from_nothing():
 @pytest.mark.parametrize("integrator", ["EULER", "RK4", "IMPLICIT", "IMPLICITFAST"])
 @pytest.mark.parametrize("solver", ["NEWTON", "CG", "PGS"])
 @pytest.mark.parametrize("jacobian", ["dense", "sparse"])
-def test_where_mujoco_stopped_early_the_problem_is_the_same_and_its_answer_is_judged(jacobian, solver, integrator):
+def test_from_mujoco_after_an_early_stop_has_the_same_problem(jacobian, solver, integrator):
     model, data = state(jacobian=jacobian)
     model.opt.integrator = getattr(mj.mjtIntegrator, f"mjINT_{integrator}")
     model.opt.solver = getattr(mj.mjtSolver, f"mjSOL_{solver}")
@@ -228,7 +228,7 @@ FLEXES = {
 
 @pytest.mark.parametrize("kind", FLEXES)
 @pytest.mark.parametrize(("cone", "condim"), [("pyramidal", 3), ("elliptic", 1), ("elliptic", 3), ("elliptic", 4)])
-def test_what_bends_is_moved_as_mujoco_moves_it(cone, condim, kind):
+def test_solve_of_a_flex_gives_the_acceleration_of_mujoco(cone, condim, kind):
     more, edge = FLEXES[kind]
     try:
         model = mj.MjModel.from_xml_string(CLOTH.format(cone=cone, condim=condim, more=more, edge=edge))

@@ -167,11 +167,6 @@ def test_an_archive_that_hides_its_size_is_refused(tmp_path):
         lavender.io.load(path)
 
 
-# Of whom entries of these names are, before a kernel reads them.
-OF = {"A_": lv.Problem.linear(sp.eye_array(4, format="csr"), np.ones(4))}
-OF |= dict.fromkeys(("rows_", "compliance"), random_contact_problem(1))
-
-
 def test_a_program_with_a_singular_hessian_comes_back_and_its_form_is_checked(tmp_path):
     given = {
         "P": np.diag([1.0, 0.0]),

@@ -18,7 +18,7 @@ FILES = sorted(p.name for s in ("*.npz", "*.hdf5") for p in FOLDER.glob(s))
 AT_FLOOR = {"fc3d_2cubes_t0.hdf5", "gfc3d_TwoRods1.hdf5", "gmp_GMP6.npz"}
 
 
-def test_the_folder_is_the_one_meant(problem_dir):
+def test_reference_folder_has_the_expected_files(problem_dir):
     assert problem_dir == FOLDER
     assert len(FILES) == 69
     assert sum(name.startswith("rfc3d_") for name in FILES) == 4
@@ -98,7 +98,7 @@ HARD = ["fc3d_2cubes_t0", "fc3d_OneObject-i100000-499", "fc3d_LMGC_100_PR_PerioB
 
 
 @pytest.mark.parametrize("name", HARD)
-def test_real_friction_problems(problem_dir, name):
+def test_admm_solves_fclib_problems(problem_dir, name):
     pytest.importorskip("h5py")
     solution = lv.solve(lv.load(problem_dir / f"{name}.hdf5"), "admm", tol=1e-8, max_iter=5000)
     assert solution.success, solution

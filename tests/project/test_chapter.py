@@ -101,14 +101,14 @@ CLAIMS = claims(CLAIMS_TEXT)[0]
 
 
 @pytest.mark.parametrize("command", sorted(CLAIMS))
-def test_numbers_are_what_the_command_prints(command):
+def test_chapter_numbers_equal_those_of_the_command(command):
     assert f"`{command}`" in PAGE
     for numbers, tolerance, line in CLAIMS[command]:
         check(numbers, tolerance, line, printed(command))
 
 
 @pytest.mark.parametrize("section", SECTIONS[1:], ids=re.findall(r"^#+ (.*)\n", PAGE, re.MULTILINE))
-def test_no_number_stands_unclaimed_and_no_claim_without_its_number(section):
+def test_chapter_numbers_and_claims_match_one_to_one(section):
     by, others = claims(section)
     stand = set(NUMBER.findall(CODE.sub(" ", COMMENT.sub("", section))))
     assert claimed(by) | others <= stand <= claimed(CLAIMS) | others

@@ -27,7 +27,7 @@ def drawn(tmp_path, capsys):
     return draw
 
 
-def test_rows_that_no_body_asks_for_are_not_there(drawn):
+def test_example_scene_has_only_declared_rows(drawn):
     module = drawn("what_a_row_costs")
     contacts = 4 * module.BOXES
     rows = {
@@ -162,7 +162,7 @@ def test_mass_and_friction_are_found_to_what_the_noise_allows(drawn):
     assert left < 0.5 * module.NOISE**2
 
 
-def test_a_push_gets_across_the_switch_only_where_it_looks_for_it(drawn):
+def test_example_push_crosses_the_switch_only_with_the_distance_to_it(drawn):
     found = drawn("planned_push").numbers()
     assert (
         found["gradient descent"]["errors"][-1] == found["gradient descent"]["errors"][0]

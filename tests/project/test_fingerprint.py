@@ -9,7 +9,7 @@ def run(*arguments, seed="0", status=0):
     return python(ROOT / ".ci" / "fingerprint", *arguments, status=status, env={**os.environ, "PYTHONHASHSEED": seed})
 
 
-def test_the_same_in_another_process_and_a_change_is_named(tmp_path):
+def test_fingerprint_is_the_same_in_another_process_and_names_a_change(tmp_path):
     file, only = tmp_path / "then.txt", ("--only", "box_stackF(n=10)")
     run(*only, "--out", file)
     before = file.read_text()

@@ -55,7 +55,7 @@ def environment(tmp_path_factory):
     return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))}
 
 
-def test_is_found_by_name_and_solves_beside_a_plug_in_that_is_broken(environment, tmp_path):
+def test_plugin_example_next_to_a_broken_plug_in_solves(environment, tmp_path):
     info = tmp_path / "broken-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
@@ -88,7 +88,7 @@ SPEC = replace(APGD_SPEC, name="faulty", factory=Faulty)
 """
 
 
-def test_a_faulty_plug_in_costs_its_checks_alone_and_gets_sentences(environment, tmp_path):
+def test_plugin_example_with_a_fault_fails_only_its_checks(environment, tmp_path):
     info = tmp_path / "faulty-1.0.dist-info"
     info.mkdir()
     (tmp_path / "faulty.py").write_text(FAULTY)

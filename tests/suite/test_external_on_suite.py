@@ -31,7 +31,7 @@ def test_impulse_form_with_singular_a_is_solved_with_a_shift_that_the_message_na
 
 
 @pytest.mark.parametrize("name", BACKENDS)
-def test_no_backend_begins_what_it_could_not_even_be_handed_in_time(name, monkeypatch):
+def test_backend_under_a_limit_below_its_set_up_is_not_called(name, monkeypatch):
     """A program was formed outside the clock: 10 ms of 8,000 rows under a limit of one."""
     problem = suite.case("granular(n=6)").problem
     lv.residual(problem, problem.start())
@@ -43,7 +43,7 @@ def test_no_backend_begins_what_it_could_not_even_be_handed_in_time(name, monkey
     assert late.impulse.tobytes() == problem.start().tobytes()
 
 
-def test_a_backend_that_looks_at_the_clock_too_late_is_ended(clock):
+def test_backend_that_exceeds_its_limit_is_ended(clock):
     """DAQP looks at it rarely: on these rows it takes seconds. All else is outside the clock, which stands still."""
     if "daqp" not in BACKENDS:
         pytest.skip("daqp is not installed")

@@ -16,7 +16,7 @@ from lavender.suite import box_stack
 
 
 @pytest.mark.parametrize(("ratio", "speed"), [(1.0, 0.5), (1e3, 0.0), (1e3, 0.5), (1e6, 0.5)])
-def test_coulomb_with_mass_ratios(ratio, speed):
+def test_admm_under_coulomb_with_mass_ratios_converges(ratio, speed):
     # Sweeps do not get below 1e-2 here in 20,000.
     problem = box_stack(4, ratio, "coulomb", speed).problem
     solution = lv.solve(problem, "admm", tol=1e-7, max_iter=20_000)
@@ -36,7 +36,7 @@ def test_coulomb_with_mass_ratios(ratio, speed):
         lambda: wild(seed=7921).problem,
     ],
 )
-def test_turns_say_what_ran_and_what_came_of_it(problem):
+def test_auto_stages_sum_to_the_work_and_end_at_the_residual(problem):
     problem = problem()
     solution = lv.solve(problem, "auto", tol=1e-6)
     assert solution.success, solution

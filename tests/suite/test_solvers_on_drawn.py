@@ -10,7 +10,7 @@ from benchmarks.random_families import wild
 from lavender import registry
 
 
-def test_under_a_limit_nothing_long_is_begun_in_setting_up():
+def test_admm_under_a_short_limit_forms_no_matrix():
     """A of J and M is not formed, and a matrix of many entries not analysed, where that would end too late."""
     problem = wild(seed=109, rows=3000).problem
     assert problem.operator == "generalized"

@@ -13,7 +13,7 @@ from lavender import suite
 
 
 @pytest.mark.parametrize("form", GIVEN)
-def test_nobody_honest_is_accused(form, plug_in):
+def test_correct_claims_at_any_mass_ratio_are_confirmed(form, plug_in):
     """Who solves A as it was formed is excused by rounding in its forming, at any ratio of masses."""
     for ratio in ("1", "1e4", "1e8"):
         rows = suite.case(f"box_stack(n=3, mass_ratio={ratio})").problem
@@ -73,7 +73,7 @@ def test_floor_over_bodies_is_that_of_the_formula(kind, scale):
         assert found.roundoff_floor == pytest.approx(max(energy, velocity), rel=1e-12, abs=0.0)  # sums in another order
 
 
-def test_a_step_that_goes_wrong_is_undone():
+def test_anderson_step_that_raises_the_residual_is_undone():
     # Faces on faces with friction: mixing overshoots and is restarted, and the residual falls all the same.
     problem = lv.suite.case("box_stackF(n=6, sliding=0.5)").problem
     solution = lv.solve(problem, "anderson", tol=0.0, max_iter=400)
@@ -81,7 +81,7 @@ def test_a_step_that_goes_wrong_is_undone():
     assert solution.residual.relative < lv.solve(problem, "pgs", tol=0.0, max_iter=400).residual.relative
 
 
-def test_what_a_callback_raises_comes_through():
+def test_exception_of_a_callback_is_raised_by_solve():
     class Enough(Exception):
         pass
 
@@ -94,7 +94,7 @@ def test_what_a_callback_raises_comes_through():
 
 @pytest.mark.parametrize("name", ["pgs", "sequential_impulses", "nncg", "anderson"])
 @pytest.mark.parametrize("tol", [1e-2, 1e-5])
-def test_checks_end_a_run_soon_after_it_is_there(name, tol):
+def test_sweeps_end_soon_after_the_tolerance_is_met(name, tol):
     problem = lv.suite.case("granular(n=3)").problem
     there = 0
     while lv.solve(problem, name, tol=0.0, max_iter=there).residual.relative > tol:

@@ -60,7 +60,7 @@ def stalled(problems):
 
 
 @pytest.mark.slow
-def test_less_than_two_of_a_hundred_that_stalled_would_have_got_on(stalled):
+def test_stalled_claims_are_wrong_in_less_than_two_percent(stalled):
     wrong = [claim for claim in stalled if claim[4] < 0.5 * claim[3]]
     assert len(stalled) >= 50, "hardly anything stalls: nothing is tested"
     assert len(wrong) < 0.02 * len(stalled), wrong
@@ -83,7 +83,7 @@ RESTS = [
 
 
 @pytest.mark.parametrize(("text", "options", "sweeps"), RESTS)
-def test_what_rests_is_told_within_twice_the_sweeps(text, options, sweeps):
+def test_sweeps_without_progress_are_stalled_within_twice_the_sweeps(text, options, sweeps):
     problem = suite.case(text).problem
     for name, before in sweeps.items():
         solution = lv.solve(problem, name, **options)
@@ -92,7 +92,7 @@ def test_what_rests_is_told_within_twice_the_sweeps(text, options, sweeps):
 
 
 @pytest.mark.parametrize("name", ["pgs", "sequential_impulses", "block_gauss_seidel"])
-def test_what_falls_slowly_goes_on_to_its_budget_and_says_how_slowly(name):
+def test_slow_sweeps_use_their_budget_and_report_the_rate(name):
     problem = after(15, "stack").constraint_problem()
     solution = lv.solve(problem, name, max_iter=1000)
     assert solution.status is lv.Status.MAX_ITERATIONS and solution.iterations == 1000

@@ -24,7 +24,7 @@ def test_the_set_is_listed_and_every_family_is_used():
     ("name", "rank"),
     [("duplicated(k=64)", 1), ("slab(n=10)", 3), ("slabF(n=2)", 6), ("four_bar", 17), ("ring(n=8)", 27)],
 )
-def test_ranks(name, rank):
+def test_hard_problems_have_their_documented_rank(name, rank):
     problem = suite.case(name).problem
     assert np.linalg.matrix_rank(problem.dense(), tol=1e-11 * problem.d.max()) == rank
 
@@ -59,7 +59,7 @@ def test_painleve_meets_the_condition_of_the_paradox():
 @pytest.mark.parametrize(
     "name", ["arch", "arch(n=25)", "card_house", "card_house(levels=5)", "big_box(mass_ratio=400)", "slab(n=5)"]
 )
-def test_structures_stand(name):
+def test_hard_structures_at_rest_do_not_move_and_need_their_friction(name):
     case = suite.case(name)
     v = case.problem.velocity(case.reference.impulse)
     # Loads of tens of kilograms on bodies of one: rounding of impulses is 1e-15 of a metre per second each.

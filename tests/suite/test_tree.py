@@ -59,7 +59,7 @@ FIRST = {
 
 
 @pytest.mark.parametrize("name", FIRST)
-def test_each_line_is_reached_and_named(name):
+def test_explain_reaches_each_branch_of_auto(name):
     make, expected = FIRST[name]
     problem = make()
     stages = lv.explain(problem).stages
@@ -76,7 +76,7 @@ def test_each_line_is_reached_and_named(name):
     }
 
 
-def test_explain_counts_nothing_anew_and_refuses_what_is_none():
+def test_explain_is_reproducible_and_rejects_wrong_input():
     problem = suite.granular(n=3, friction="coulomb").problem
     first, second = lv.explain(problem), lv.explain(suite.granular(n=3, friction="coulomb").problem)
     assert first == second and json.loads(json.dumps(first.data()))["rows"] == problem.m
@@ -97,7 +97,7 @@ def test_explain_counts_nothing_anew_and_refuses_what_is_none():
         (lambda: random_generalized_problem(1, "cone", n=6, compliance=True, contacts=3), ("newton",)),
     ],
 )
-def test_a_small_problem_is_told_by_who_solves_it(make, names):
+def test_explain_of_a_small_problem_names_its_solver(make, names):
     problem = make()
     told = lv.explain(problem).small
     assert told and all(name in told for name in names), told
@@ -115,7 +115,7 @@ def test_a_small_problem_is_told_by_who_solves_it(make, names):
     ],
     ids=lambda make: f"{make.func.__name__}{make.args}",
 )
-def test_what_only_late_turns_solve_is_solved(make):
+def test_auto_solves_problems_that_only_late_stages_solve(make):
     solution = lv.solve(make().problem, tol=1e-6)
     assert solution.success, solution.stages
 
@@ -167,7 +167,7 @@ def test_squeezed_bodies_are_proved_to_have_no_solution_before_all_go_in_turn():
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e47])
-def test_a_velocity_that_rows_move_by_dust_alone_is_in_no_ones_way(unit):
+def test_auto_with_a_velocity_moved_by_1e_47_only_proves_the_conflict(unit):
     """Two contacts push apart what cannot part; a third has a tangent of one velocity, and of another by 1e-47.
 
     With J of 1e47 the problem is stated, as M is as large, and no mass of 1 can stand for that M.
@@ -184,7 +184,7 @@ def test_a_velocity_that_rows_move_by_dust_alone_is_in_no_ones_way(unit):
     assert found.status is lv.Status.INFEASIBLE or unit > 1.0
 
 
-def test_cones_that_sweeps_do_not_take_have_steps_that_do():
+def test_auto_on_round_cones_runs_newton_or_admm():
     general = random_generalized_problem(0, "cone", n=8, compliance=False, contacts=4, tangents=5)
     assert {stage.solver for stage in lv.explain(general).stages} <= {"newton", "admm", "certificate"}
     matrix = lv.Problem(general.b, general.cones, general.csr, friction="cone")

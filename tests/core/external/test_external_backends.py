@@ -48,7 +48,7 @@ class Finder:
 
 
 @pytest.mark.parametrize("name", BACKENDS)
-def test_nothing_is_printed_or_looked_for_and_threads_run_one_each(name, capfd, monkeypatch):
+def test_backend_prints_nothing_imports_nothing_and_runs_in_threads(name, capfd, monkeypatch):
     """HiGHS greets where it is made; a fork while a module is looked for waits for ever for it."""
     for problem in (lv.Problem.linear(*spd(6)), lv.Problem.lcp(*spd(4))):
         if registry.get(name).refuses(problem) is not None:
@@ -82,7 +82,7 @@ def test_asymmetric_and_negative_diagonals_are_refused_with_the_reason(name):
 
 @pytest.mark.parametrize("name", BACKENDS)
 @pytest.mark.parametrize("b", [[0.0, 0.0], [0.0, -1.0]])
-def test_where_doing_nothing_is_right_no_rounding_of_a_backend_is_a_false_claim(name, b):
+def test_backend_on_a_problem_at_rest_returns_exactly_zero(name, b):
     """Nothing is left to be relative to: an impulse of 1e-12 has an infinite residual."""
     solution = lv.solve(lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], b), name)
     assert solution.success and solution.claim_check == "confirmed" and not solution.impulse.any()
@@ -90,7 +90,7 @@ def test_where_doing_nothing_is_right_no_rounding_of_a_backend_is_a_false_claim(
 
 @pytest.mark.parametrize("name", BACKENDS)
 @pytest.mark.parametrize("linear", [True, False])
-def test_infeasible_is_claimed_with_a_proof_or_marked(name, linear):
+def test_backend_claim_of_infeasibility_has_a_certificate(name, linear):
     a, b = np.array([[1.0, -1.0], [-1.0, 1.0]]), np.array([1.0, 1.0])
     problem = lv.Problem.linear(a, b) if linear else lv.Problem.lcp(a, b)
     solution = lv.solve(problem, name, max_iter=500)
@@ -115,7 +115,7 @@ def test_contradicting_rows_are_proved_in_the_velocity_form(name):
 
 
 @pytest.mark.parametrize("name", BACKENDS)
-def test_nothing_to_solve(name):
+def test_backend_on_empty_or_fixed_problems_is_not_called(name):
     empty = lv.Problem.lcp(np.zeros((0, 0)), [])  # no row is bounded: its law is linear
     if registry.get(name).refuses(empty) is None:
         assert lv.solve(empty, name).success
@@ -156,7 +156,7 @@ def test_dual_holds_the_backends_own_multipliers(name, form):
 
 
 @pytest.mark.parametrize("name", BACKENDS)
-def test_warm_start_is_used_where_the_spec_says_so(name):
+def test_backend_uses_a_start_if_its_spec_says_so(name):
     problem = lv.Problem.lcp(*spd(40, seed=5))
     cold = lv.solve(problem, name, tol=1e-6)
     warm = lv.solve(problem, name, tol=1e-6, impulse=lv.solve(problem, "direct").impulse)
@@ -172,7 +172,7 @@ APART = [b.name for b in backends.BACKENDS if not b.stoppable and b.name in BACK
 
 
 @pytest.mark.parametrize("name", BACKENDS)
-def test_under_a_time_limit_a_backend_runs_in_a_process_of_its_own(name, monkeypatch):
+def test_backend_with_a_time_limit_runs_in_a_separate_process(name, monkeypatch):
     from lavender.external import isolated
 
     problem = lv.Problem.lcp(*spd(12, seed=3))
@@ -213,7 +213,7 @@ def test_a_backend_that_does_not_end_is_ended_and_the_next_call_finds_another():
 
 
 @pytest.mark.skipif(not APART, reason="no backend without a time limit is installed")
-def test_the_process_is_kept_and_its_death_costs_one_call_at_most():
+def test_isolated_process_is_reused_and_replaced_after_its_death():
     from lavender.external.isolated import idle_processes
 
     problem = lv.Problem.lcp(*spd(5))
@@ -229,7 +229,7 @@ def test_the_process_is_kept_and_its_death_costs_one_call_at_most():
 
 
 @pytest.mark.skipif(not APART, reason="no backend without a time limit is installed")
-def test_errors_of_a_process_of_its_own_are_told():
+def test_isolated_process_errors_equal_those_of_a_direct_call():
     problem = lv.Problem.lcp(*spd(5))
     with pytest.raises(lv.InputError, match="isolate"):
         lv.solve(problem, APART[0], isolate="yes")
@@ -318,7 +318,7 @@ def test_claim_that_the_judge_rejects_is_repeated_once_and_then_contradicted(reg
         (True, False, "not proven", "not proven: no certificate was given"),  # too many rows for our own search
     ],
 )
-def test_a_claim_of_infeasibility_without_a_certificate_is_checked_by_our_own(
+def test_backend_claim_of_infeasibility_without_a_certificate_is_checked_by_auto(
     feasible, search, check, words, register, monkeypatch
 ):
     answers(register, Answer(lv.Status.INFEASIBLE, "infeasible"))

@@ -30,7 +30,7 @@ assert len(GIVEN) == 3
 EVERY = (True,) * 6
 
 
-def test_the_adjoint_is_summed_over_what_was_repeated():
+def test_gradient_of_broadcast_arguments_is_summed():
     jac, mass, free, mu, target, soft = GIVEN[0]
     made = make_step((jac, mass, free, mu, target, soft), None, "coulomb", "auto", 1e-12)
     frees = np.stack([free, free + 1e-3])
@@ -64,7 +64,7 @@ def twice(by_mu):
     assert by_mu(jac, 2.0 * np.eye(3), np.array([2.0, 0.0, -1.0]), np.array([0.4, 0.4])) == pytest.approx(-1.0)
 
 
-def test_what_is_not_asked_for_need_not_exist():
+def test_gradient_not_requested_is_not_computed():
     def by_mu(*given):
         given = (*given, np.zeros(6), np.zeros(6))
         made = make_step(given, None, "coulomb", "auto", 1e-12)
@@ -100,7 +100,7 @@ def test_gradcheck_of_torch(given):
     assert torch.autograd.gradcheck(function, tensors, eps=1e-6, atol=1e-6)
 
 
-def test_torch_asks_for_what_requires_a_gradient():
+def test_torch_layer_computes_only_required_gradients():
     torch, solve = torch_and_solve()
 
     def by_mu(*given):
@@ -157,7 +157,7 @@ def test_check_grads_of_jax(given):
     check_grads(function, tuple(map(jax.numpy.asarray, given)), order=1, modes=["rev"], eps=1e-6, atol=1e-5, rtol=1e-5)
 
 
-def test_jax_asks_for_what_is_differentiated():
+def test_jax_layer_computes_only_required_gradients():
     jax, solve = jax_and_solve()
 
     def by_mu(*given):

@@ -112,7 +112,7 @@ def test_states_fit_impulse_and_slack(kind):
 # -- where it does not exist ------------------------------------------------------------------------------------
 
 
-def test_of_rows_that_repeat_others_velocities_are_told_and_impulses_refused():
+def test_derivative_of_dependent_rows_gives_velocities_and_rejects_impulses():
     p = table()
     d = lv.derivative(p, lv.solve(p, tol=1e-12))
     assert not d.unique.impulse.any() and d.unique.slack.all() and d.unique.velocity
@@ -131,7 +131,7 @@ def test_of_rows_that_repeat_others_velocities_are_told_and_impulses_refused():
         _ = t.impulse
 
 
-def test_a_switch_is_flagged_within_the_error_of_the_answer():
+def test_derivative_near_a_switch_is_flagged():
     a = np.array([[2.0, 0.9, 0.0], [0.9, 1.0, 0.0], [0.0, 0.0, 1.0]])
     edge = np.array([10.0, 5.0, 0.0])  # N s, on the rim, about to slide
 
@@ -272,7 +272,7 @@ def test_every_factor_gives_the_same_gradients(kind, operator, monkeypatch):
             assert abs(one - other).max() <= 1e-9 * size, name
 
 
-def test_an_order_of_elimination_changes_nothing():
+def test_gradient_with_reordered_mass_is_unchanged():
     # a hub that stands last fills in: M's factor has velocities in another order
     rng, n = np.random.default_rng(0), 60
     mass = 4.0 * np.eye(n)
@@ -294,7 +294,7 @@ def test_an_order_of_elimination_changes_nothing():
     assert np.array_equal(both.v_free, one.v_free)
 
 
-def test_what_changes_one_of_several_rows_that_share_a_load_is_refused():
+def test_derivative_by_one_of_several_redundant_rows_raises():
     """A box that slides on four corners: raise one, and it stands on three; which ones depends on the sign."""
     at = [(x, y, -0.5) for x in (-0.5, 0.5) for y in (-0.5, 0.5)]
     jac = np.array([np.r_[d, np.cross(r, d)] for r in at for d in np.eye(3)[[2, 0, 1]]])

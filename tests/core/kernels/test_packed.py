@@ -29,7 +29,7 @@ def tangled(seed, contacts, joints, bodies=None, kind="disks"):
 @pytest.mark.parametrize("order", ["given", "reverse", "bottom_up", "top_down", "local", "colored", "array"])
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("contacts", "joints"), [(19, 4), (25, 3), (301, 40), (30, 200)])
-def test_packed_runs_of_any_length_are_the_plain_ones(order, kind, contacts, joints):
+def test_packed_sweeps_of_any_length_have_the_bits_of_plain_ones(order, kind, contacts, joints):
     problem = tangled(contacts, contacts, joints, kind=kind)
     rng = np.random.default_rng(contacts)
     order = rng.permutation(problem.n_blocks) if order == "array" else order
@@ -44,7 +44,7 @@ def test_packed_runs_of_any_length_are_the_plain_ones(order, kind, contacts, joi
 @pytest.mark.parametrize("order", ["given", "reverse", "symmetric", "bottom_up", "colored", "array"])
 @pytest.mark.parametrize(("name", "options"), [("nncg", {}), ("nncg", {"convex": 20}), ("anderson", {})])
 @pytest.mark.parametrize(("contacts", "joints", "kind"), [(24, 0, "disks"), (301, 40, "spin"), (300, 40, "mixed")])
-def test_pairs_within_single_sweeps_are_the_plain_ones(order, name, options, contacts, joints, kind):
+def test_packed_pairs_in_single_sweeps_have_the_bits_of_plain_ones(order, name, options, contacts, joints, kind):
     problem = tangled(contacts, contacts, joints, kind=kind)
     is_named, rng = order != "array", np.random.default_rng(contacts)
     if not is_named:
@@ -73,7 +73,7 @@ def test_large_piles_pack_at_longer_runs_and_written_out(monkeypatch):
         ("anderson", "given", 1e-6),
     ],
 )
-def test_checks_between_packed_sweeps_see_what_they_would(name, order, tol):
+def test_checks_between_packed_sweeps_judge_the_same_iterates(name, order, tol):
     pile = lattice_pile(300)
     both = [prepare_sweeps(pile, name, packs, order=order) for packs in (True, False)]
     a, b = (prepared.solve(tol=tol, max_iter=300) for prepared in both)
@@ -81,7 +81,7 @@ def test_checks_between_packed_sweeps_see_what_they_would(name, order, tol):
     assert (a.status, a.iterations, a.impulse.tobytes()) == (b.status, b.iterations, b.impulse.tobytes())
 
 
-def test_a_new_problem_takes_over_the_room():
+def test_packed_workspace_is_reused_for_a_new_problem():
     problem = tangled(3, 120, 10)
     prepared = lv.prepare(problem, "sequential_impulses")
     prepared.solve(tol=0.0, max_iter=20)
@@ -96,7 +96,7 @@ def test_a_new_problem_takes_over_the_room():
 
 
 @pytest.mark.parametrize("name", ["sequential_impulses", "nncg"])
-def test_hostile_numbers_do_no_harm(name):
+def test_packed_sweeps_of_extreme_numbers_end(name):
     prepared = prepare_sweeps(lattice_pile(300), name)
     for bad in (np.nan, np.inf, 1e300, -1e300):
         prepared.solver.run(prepared.state, np.full(prepared.problem.m, bad), 40, 0.0)

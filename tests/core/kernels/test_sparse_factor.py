@@ -43,7 +43,7 @@ def definite(a):
 
 
 @pytest.mark.parametrize("n", [1, 47, 48, 49, 200])
-def test_a_full_factor_solves_and_counts_what_is_lost(n):
+def test_full_factor_solves_and_counts_lost_pivots(n):
     """Of rank n / 2 the pivots after it are roundings: a right side in the range is solved all the same.
 
     Backward errors |a x - b| / (|a| |x|) are n roundings, at rank n / 2 as many times more as the last pivot is small.
@@ -72,7 +72,7 @@ def test_a_full_factor_solves_and_counts_what_is_lost(n):
     pairs=st.lists(st.tuples(st.integers(0, 59), st.integers(0, 59)), max_size=250),
     heavy=st.integers(1, 9),
 )
-def test_every_vertex_has_one_place_in_any_graph(n, pairs, heavy):
+def test_ordering_of_any_graph_is_a_permutation(n, pairs, heavy):
     """`heavy`: rows of one pattern, which are one vertex of panels."""
     met = np.eye(n)
     for i, j in pairs:
@@ -143,7 +143,7 @@ def test_wide_supernodes_give_the_bits_of_two_lanes(lu):
 
 
 @given(seed=st.integers(0, 10**6), n=st.integers(1, 150), block=st.integers(1, 6), lu=st.booleans())
-def test_factors_solve_and_lanes_do_not_show(seed, n, block, lu):
+def test_sparse_factor_solves_with_the_same_bits_in_all_lanes(seed, n, block, lu):
     rng = np.random.default_rng(seed)
     a = mirrored(rng, n, block, rng.choice([0.005, 0.03, 0.2]))
     if lu:
@@ -172,7 +172,7 @@ def test_factors_solve_and_lanes_do_not_show(seed, n, block, lu):
     assert np.abs(error).max() <= 1e-9 * np.abs(s * b).max()
 
 
-def test_shifts_parts_and_lost_pivots():
+def test_sparse_factor_with_shifts_and_lost_pivots_solves():
     rng = np.random.default_rng(3)
     n = 90
     edge = np.flatnonzero(np.arange(n - 1) % 18 != 17)  # five paths: Laplacians of rank 17
@@ -224,7 +224,7 @@ def interrupt(_):
     raise KeyboardInterrupt
 
 
-def test_what_is_no_mirror_is_seen():
+def test_symmetric_pattern_of_an_asymmetric_matrix_is_false():
     a = sp.csr_array(np.array([[1.0, 2.0, 0.0], [0.0, 1.0, 0.0], [0.0, 1.0, 1.0]]))
     assert not has_symmetric_pattern(*raw(a))
     assert not has_symmetric_pattern(*raw(sp.csr_array(a.T)))

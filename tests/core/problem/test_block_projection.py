@@ -114,7 +114,7 @@ def test_projection_and_its_derivatives_equal_a_dense_twin(kind, law):
 
 
 @pytest.mark.parametrize("law", ["coulomb", "cone"])
-def test_not_a_number_is_not_hidden(law):
+def test_projection_of_nan_is_nan(law):
     cones = lv.Cones.contacts(np.full(1, 0.5))
     problem = lv.Problem(np.zeros(3), cones, np.eye(3), friction=law)
     linear = judge_and_linearise_impulse(problem, np.array([1.0, np.nan, 0.0]))

@@ -23,7 +23,7 @@ def free(seed, contacts=4, friction="coulomb", mu=None):
 # -- blocks ------------------------------------------------------------------------------------------------------------
 
 
-def test_one_shape_becomes_the_other_and_back():
+def test_cones_shaped_to_box_and_back_are_equal():
     disk = lv.Cones.free(2) + lv.Cones.contacts([0.5, 0.3]) + lv.Cones.contacts(0.4, 1)
     assert disk.shaped("box").shaped("disk") == disk
     assert disk.shaped("box").coefficients.tolist() == [[0, 0], [0, 0], [0.5] * 2, [0.3] * 2, [0.4] * 2]
@@ -36,7 +36,7 @@ def test_one_shape_becomes_the_other_and_back():
 
 
 @given(seed=seeds)
-def test_findex_comes_back_in_any_order(seed):
+def test_findex_round_trip_in_any_order_is_equal(seed):
     rng = np.random.default_rng(seed)
     bounded, contacts = int(rng.integers(0, 4)), int(rng.integers(0, 4))
     tangents = rng.integers(0, 3, contacts)
@@ -94,7 +94,7 @@ def test_pivoting_ends_nowhere_worse_than_it_starts(law, name, seed, iterations)
     assert end.residual.relative <= bound, end
 
 
-def test_a_solver_of_others_is_not_handed_a_box_it_knows_nothing_of():
+def test_plug_in_without_box_friction_refuses_boxes():
     spec = registry.SolverSpec("theirs", lambda: None, frozenset({"coulomb"}), "no boxes")
     assert "takes no boxes" in spec.refuses(free(1))
     assert spec.refuses(replace(free(1), cones=lv.Cones.contacts(0.5, count=4))) is None
@@ -122,7 +122,7 @@ def test_coefficients_come_back_and_equal_ones_are_a_disk():
     np.testing.assert_allclose(t[1:, 1:], [[0, 0.1], [0.3, 0.0], [0, 0]], atol=1e-15)
 
 
-def test_a_compliance_that_a_thin_ellipse_makes_less_than_one_may_be_is_none():
+def test_thin_ellipse_with_tiny_compliance_is_rigid():
     """1e-40 in rows that are 1e-12 as long, beside a d of 1e-24."""
     problem = lv.Problem.from_jacobian(
         np.eye(3), np.eye(3), [0.3, 0.2, -1.0], cones=lv.Cones.contacts([(0.5, 5e-13)]), compliance=[0.0, 0.0, 1e-40]
@@ -171,7 +171,7 @@ ELLIPSES = {
 
 
 @pytest.mark.parametrize("form", ELLIPSES)
-def test_what_comes_back_is_in_the_rows_of_the_problem(form):
+def test_ellipse_results_are_in_the_given_rows(form):
     problem = ELLIPSES[form](3, friction="cone")
     s, calls = problem.cones.stretch, []
     found = lv.solve(problem, "anderson", tol=1e-6, max_iter=5, callback=lambda n, x, r: calls.append((x, r)) and None)

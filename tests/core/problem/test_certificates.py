@@ -23,7 +23,7 @@ def opposed(eps):
 
 
 @pytest.mark.parametrize("name", lv.available(opposed(1.0)))
-def test_a_definite_matrix_is_never_called_infeasible(name):
+def test_certificate_of_a_definite_matrix_is_rejected(name):
     """Its solution is b.y over the slack: 2e12 N s in each row, which some find, and all others say they miss."""
     problem = opposed(1e-12)
     solution = lv.solve(problem, name)
@@ -39,7 +39,7 @@ def test_a_definite_matrix_is_never_called_infeasible(name):
 
 
 @pytest.mark.parametrize("name", ["auto", "direct", "newton", "lemke"])
-def test_what_is_proved_is_said(name):
+def test_infeasible_message_names_the_proof(name):
     near = "for data within rounding of yours; for yours every solution has an impulse of at least "
     for eps, words in ((0.0, "no solution, proved"), (2.0**-52, f"no solution {near}")):
         solution = lv.solve(opposed(eps), name)
@@ -67,7 +67,7 @@ def held(law, soft, form):
 
 @pytest.mark.parametrize("form", ["rows", "J and M"])
 @pytest.mark.parametrize("law", ["linear", "lcp", "coulomb", "cone"])
-def test_softness_is_told_apart_from_what_is_rigid(law, form):
+def test_infeasible_is_claimed_of_rigid_and_not_of_soft_rows(law, form):
     """However small R is, it is data: strictly convex problems have a solution, rigid ones here have none."""
     for name in OURS:
         for soft in (2e-18, 6e-16, 1e-12):
@@ -90,7 +90,7 @@ def test_softness_is_told_apart_from_what_is_rigid(law, form):
 
 @pytest.mark.parametrize("form", ["rows", "J and M"])
 @pytest.mark.parametrize("seed", [0, 1, 5, 6, 21, 30])
-def test_rigid_rows_that_contradict_each_other_are_found_among_those_that_yield(seed, form):
+def test_infeasible_rigid_rows_among_soft_ones_are_found(seed, form):
     """Masses on a line, held two by two; a linear program of the velocities tells which rows can be met at once."""
     rng = np.random.default_rng(seed)
     n, m = int(rng.integers(60, 90)), int(rng.integers(69, 96))
@@ -114,7 +114,7 @@ def test_rigid_rows_that_contradict_each_other_are_found_among_those_that_yield(
 
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("law", ["lcp", "coulomb", "cone"])
-def test_no_solution_has_less_impulse_than_a_direction_says(law, form):
+def test_impulse_bound_holds_for_every_solution(law, form):
     """(2) for any direction, of problems that are solved."""
     told = 0
     for seed in range(8):
@@ -156,7 +156,7 @@ def walking(seed, dust=2.78e-17):
 
 @pytest.mark.parametrize("name", lv.available(walking(0)))
 @pytest.mark.parametrize("form", ["matrix", "J and M"])
-def test_dust_beside_the_numbers_that_made_it_asks_nothing(form, name):
+def test_row_of_rounding_size_needs_no_impulse(form, name):
     for seed in range(3):
         dusty = walking(seed)
         problem = as_matrix(dusty) if form == "matrix" else dusty
@@ -171,7 +171,7 @@ def test_dust_beside_the_numbers_that_made_it_asks_nothing(form, name):
     assert lv.solve(as_matrix(real) if form == "matrix" else real, name).status is lv.Status.INFEASIBLE
 
 
-def test_an_empty_row_of_bodies_may_be_dust_as_well():
+def test_empty_row_of_bodies_of_rounding_size_needs_no_impulse():
     rows = random_contact_problem(3, tangents=0, spin=False).rows
     jac = rows.jac.copy()
     jac[0] = 0.0

@@ -22,7 +22,7 @@ ANEW = {
 
 
 @pytest.mark.parametrize("name", lv.available(external=False))
-def test_no_claim_is_contradicted_where_m_is_nearly_singular(name):
+def test_claims_on_nearly_singular_mass_are_confirmed(name):
     """A formed of J and M has lost what J and M still tell: claims hold in the form that was given."""
     count, wrong = 0, []
     for seed in range(40):
@@ -38,7 +38,7 @@ def test_no_claim_is_contradicted_where_m_is_nearly_singular(name):
     assert count >= 15 or "matrix" not in registry.get(name).operators, "nearly all were refused"
 
 
-def test_a_solver_that_does_nothing_is_stopped(plug_in):
+def test_solver_without_progress_is_stopped_as_stalled(plug_in):
     name = plug_in(lambda problem, impulse: says(lv.Status.MAX_ITERATIONS).__class__(lv.Status.MAX_ITERATIONS, 0),
                    resumable=True)  # fmt: skip
     solution = lv.solve(random_lcp(5), name, max_iter=10**9)
@@ -69,7 +69,7 @@ def test_every_array_of_a_problem_is_read_only(form):
             data[...] = 0.0
 
 
-def test_a_verdict_on_another_problem_is_not_taken(plug_in):
+def test_claim_with_a_residual_of_another_problem_is_contradicted(plug_in):
     from lavender.judge.residuals import judge_impulse
 
     def run(problem, impulse):
@@ -86,7 +86,7 @@ def test_a_verdict_on_another_problem_is_not_taken(plug_in):
 # -- no solution --------------------------------------------------------------------------------------
 
 
-def test_rows_that_contradict_each_other_cost_no_other_row_its_impulse(plug_in):
+def test_infeasible_rows_leave_impulses_of_other_rows(plug_in):
     """The largest velocity error is that of rows that cannot be met; it chose the zero impulse for all."""
 
     def run(problem, impulse):
@@ -100,7 +100,7 @@ def test_rows_that_contradict_each_other_cost_no_other_row_its_impulse(plug_in):
     np.testing.assert_array_equal(solution.impulse[:10], 0.1)
 
 
-def test_a_ray_of_lemke_does_not_blame_the_data():
+def test_lemke_ray_on_a_solvable_problem_is_stalled():
     """A solution of at most 0.2 N s exists: a small lower bound on all solutions does not mean contradicting rows."""
     m = [[0.0, 0.0, 30.0, 25.0], [0.0, 0.0, 10.0, 5.0], [25.0, 25.0, 0.0, 0.0], [15.0, 5.0, 0.0, 0.0]]
     problem = lv.Problem.lcp(m, np.ones(4))
@@ -135,7 +135,7 @@ def laws():
 
 @pytest.mark.parametrize("form", GIVEN)
 @pytest.mark.parametrize("status", [lv.Status.CONVERGED, lv.Status.ROUNDOFF_LIMIT])
-def test_a_liar_is_caught_in_every_form_and_law(form, status, plug_in):
+def test_false_claim_in_every_form_and_law_is_contradicted(form, status, plug_in):
     """A matrix is what docs/plugin.md shows; that A was formed of bodies, or of J and M, excuses rounding alone."""
     seen = set()
     for rows in laws():
@@ -199,7 +199,7 @@ def test_arrays_made_writable_by_a_solver_change_no_problem(form, plug_in):
     ids=repr,
 )
 @pytest.mark.parametrize("resumable", [False, True])
-def test_what_is_no_claim_is_a_numerical_error_that_names_the_solver(plug_in, claim, resumable):
+def test_invalid_claim_of_a_plug_in_is_a_numerical_error(plug_in, claim, resumable):
     problem = random_lcp(11)
     answer = lv.solve(problem, "pgs", tol=1e-9).impulse
 
@@ -219,7 +219,7 @@ def test_what_is_no_claim_is_a_numerical_error_that_names_the_solver(plug_in, cl
 @pytest.mark.filterwarnings("ignore:Setting the (shape|dtype):DeprecationWarning")
 @pytest.mark.parametrize("resumable", [False, True])
 @pytest.mark.parametrize("way", ["kept", "nan", "shape", "dtype", "best"])
-def test_what_a_plug_in_does_to_its_impulse_reaches_no_earlier_solution(register, way, resumable):
+def test_plug_in_that_changes_its_impulse_later_changes_no_solution(register, way, resumable):
     problem, kept = random_lcp(13), []
     answer = lv.solve(problem, "pgs", tol=1e-9).impulse
 
@@ -272,7 +272,7 @@ RUNAWAYS = {
 
 @pytest.mark.parametrize("problem", RUNAWAYS.values(), ids=RUNAWAYS)
 @pytest.mark.parametrize("name", lv.available(external=False))
-def test_nobody_solves_what_has_no_solution_by_running_away(name, problem):
+def test_unsolvable_problem_with_growing_impulses_is_not_accepted(name, problem):
     if registry.get(name).refuses(problem) is not None:
         return
     for budget in ({}, {"tol": 1e-9}, {"max_iter": 20_000}):  # one that was used up in vain asks for a proof, too

@@ -13,7 +13,7 @@ def moved(mass, v, *, target=0.0, compliance=0.0, lower=-np.inf, upper=np.inf):
     return problem.generalized.velocity_of(problem.velocity(lv.solve(problem, tol=1e-12).impulse)).item()
 
 
-def test_fields_of_springs_motors_limits_and_gaps_do_what_engines_mean():
+def test_fields_of_springs_motors_limits_and_gaps_have_their_documented_effect():
     """Each against the equation of motion, solved by hand."""
     rng = np.random.default_rng(0)
     for _ in range(50):
@@ -32,7 +32,7 @@ def test_fields_of_springs_motors_limits_and_gaps_do_what_engines_mean():
 
 
 @pytest.mark.parametrize("belt_is_a", [True, False])
-def test_what_lies_on_a_belt_is_carried_along(belt_is_a):
+def test_belt_target_moves_the_body_on_it(belt_is_a):
     """The belt runs on the world, once as the first body of the contact and once as the second."""
     v = np.array([[0.0, 0.0, -0.1, 0.0, 0.0, 0.0]])
     side = 1.0 if belt_is_a else -1.0

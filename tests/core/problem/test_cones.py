@@ -12,7 +12,7 @@ import lavender as lv
 from lavender.problem.cones import project_impulse
 
 
-def test_bounds_of_contact_rows_are_spelled_in_one_way():
+def test_cones_with_any_spelling_of_contact_bounds_are_equal():
     # They are never read: cones that differ there alone are equal.
     one = lv.Cones([0, 3], [1], [0.0, -1.0, -1.0], [9.0, 1.0, 1.0], [0.5], [0.0])
     two = lv.Cones([0, 3], [1], [5.0, 0.0, 0.0], [9.0, 0.0, 0.0], [0.5], [0.0])
@@ -23,7 +23,7 @@ def test_bounds_of_contact_rows_are_spelled_in_one_way():
 
 
 @given(seed=seeds, size=st.floats(1e-3, 1e3))
-def test_projection_is_feasible_keeps_what_is_and_is_a_projection(seed, size):
+def test_projection_is_feasible_idempotent_and_nearest(seed, size):
     cones = random_contact_problem(seed, joints=2, contacts=4).cones
     x = size * np.random.default_rng(seed).standard_normal(cones.n_rows)
     y = project_impulse(cones, x)

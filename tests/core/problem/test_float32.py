@@ -66,7 +66,7 @@ def test_a_solution_rounded_to_float32_is_at_its_floor_and_one_further_off_is_no
 # -- data in float32 ----------------------------------------------------------------------------------
 
 
-def test_j_and_m_in_float32_are_widened_exactly_and_say_so():
+def test_jacobian_in_float32_is_widened_exactly():
     p = robot(7, number=np.float32)
     assert p.precision == "float32"
     rng = np.random.default_rng(7)

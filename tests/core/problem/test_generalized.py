@@ -52,7 +52,7 @@ def test_rows_that_are_eliminated_together_have_the_bits_of_one_after_the_other(
     assert general.solve(x)[order].tobytes() == row_by_row(mass[np.ix_(order, order)], x[order]).tobytes()
 
 
-def test_every_way_to_give_j_and_m_is_one_problem():
+def test_from_jacobian_of_any_matrix_type_gives_one_problem():
     rng = np.random.default_rng(3)
     blocks = [tree_mass(rng, [-1, 0, 1]), tree_mass(rng, [-1, 0])]
     mass = sp.block_diag(list(map(sp.coo_array, blocks))).toarray()
@@ -71,7 +71,7 @@ def test_every_way_to_give_j_and_m_is_one_problem():
         assert not made.generalized.jac.data.flags.writeable
 
 
-def test_no_velocities_no_rows_and_rows_on_nothing():
+def test_from_jacobian_without_rows_or_velocities_is_solved():
     none = lv.Problem.from_jacobian(np.zeros((0, 3)), np.eye(3), np.ones(3), cones=lv.Cones.free(0))
     assert lv.solve(none, "newton").success
     assert np.array_equal(none.velocity([]), np.ones(3))
@@ -107,7 +107,7 @@ def test_newton_over_velocities_reaches_the_floor_or_tol(friction, soft, seed):
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("nv", [2, 3])
-def test_centres_stay_until_velocities_are_found_however_many_rows_these_have(nv, seed):
+def test_newton_over_velocities_continues_centering_with_many_rows(nv, seed):
     """Errors of velocities are errors of every row: measured by the rows' they were small before the first step."""
     rng = np.random.default_rng(seed)
     jac, v, cones = rng.normal(size=(1800, nv)), rng.normal(size=nv), lv.Cones.contacts(np.full(600, 0.5))
@@ -233,7 +233,7 @@ def test_many_small_trees_are_put_in_an_order_that_fills_in_little(seed):
     np.testing.assert_allclose(given.mass @ (v - given.v_free), problem.jacobian.T @ solution.impulse, atol=1e-11)
 
 
-def test_room_for_a_pattern_grows():
+def test_workspace_for_a_larger_pattern_grows():
     """More entries in a row than there is room for at first, of more columns than are kept dense for that."""
     problem = cloth(50, 0)
     assert lv.solve(problem, "newton", form="velocity", tol=1e-9).success

@@ -207,7 +207,7 @@ def test_a_placeholder_bound_does_not_satisfy_an_equality():
                 )
 
 
-def test_a_row_that_nothing_moves_has_no_scale_of_its_own():
+def test_row_of_zero_a_is_rounding_or_infeasible():
     """Its row of A is zero: b of 1e-17 beside numbers of 1 is rounding, b of 1e-3 has no solution."""
     for b, status in ((1e-17, lv.Status.CONVERGED), (1e-3, lv.Status.INFEASIBLE)):
         assert lv.solve(lv.Problem.lcp(np.diag([1.0, 0.0]), [1.0, b])).status is status
@@ -264,7 +264,7 @@ def test_residual_rounding_of_moving_immovable_bodies_is_satisfied():
     assert solution.success and solution.residual.relative < 1e-15
 
 
-def test_bodies_that_share_nothing_are_islands_in_every_form():
+def test_find_islands_of_separate_bodies_is_the_same_in_every_form():
     problem = random_contact_problem(3, tangents=2, spin=False)
     both, _ = rows_side_by_side(problem, random_contact_problem(4, tangents=2, spin=False))
     counts = [find_islands(convert(both))[0] for convert in FORMS.values()]

@@ -68,7 +68,7 @@ def error_of_the_pass(problem, lam):
 
 @pytest.mark.parametrize("m", [10, 100, 400])
 @pytest.mark.parametrize("sign", [0.0, 1.0])
-def test_the_floor_counts_what_long_rows_of_a_matrix_round(m, sign):
+def test_floor_of_long_matrix_rows_grows_with_their_length(m, sign):
     """Twice: floors are sums of one rounding for each term, and long sums round once for each partial sum."""
     for seed in range(3 if m < 400 else 1):
         rng = np.random.default_rng(seed)
@@ -80,7 +80,7 @@ def test_the_floor_counts_what_long_rows_of_a_matrix_round(m, sign):
 
 @pytest.mark.parametrize("friction", ["coulomb", "cone"])
 @given(seed=seeds)
-def test_the_floor_counts_what_bodies_round(friction, seed):
+def test_floor_over_bodies_counts_their_rounding(friction, seed):
     problem = random_contact_problem(seed, friction, bodies=8, joints=4, contacts=20)
     for tol in (1e-3, 1e-12):
         assert error_of_the_pass(problem, lv.solve(problem, tol=tol).impulse) <= 3.0
@@ -107,7 +107,7 @@ def test_every_form_has_one_matrix_one_slack_and_one_velocity(seed, kind):
 # -- diagonals, b = 0, floor ---------------------------------------------------------------------------
 
 
-def test_diagonal_falls_back_where_it_must():
+def test_diagonal_of_zero_or_negative_entries_uses_the_largest_of_the_row():
     a = np.array([[0.0, 3.0, 0.0], [3.0, -1.0, 0.0], [0.0, 0.0, 0.0]])
     np.testing.assert_array_equal(lv.Problem.lcp(a, np.zeros(3)).d, [3.0, 3.0, 3.0])
     tiny = np.array([[1e-12, 1.0], [1.0, 2.0]])
@@ -117,7 +117,7 @@ def test_diagonal_falls_back_where_it_must():
     np.testing.assert_array_equal(pair.d, [1.0, 5.5, 5.5])
 
 
-def test_lost_iterates_are_seen():
+def test_residual_of_an_impulse_that_is_not_finite_is_infinite():
     for friction in ("coulomb", "cone"):
         problem = random_contact_problem(1, friction)
         for bad in (np.nan, np.inf, -np.inf):
@@ -168,7 +168,7 @@ def test_floor_bounds_the_rounded_slider_between_tangents_of_unlike_mass(frictio
 @pytest.mark.parametrize("law", ["coulomb", "cone"])
 @pytest.mark.parametrize("kind", ["bounded rows", "normals", *CONTACTS])
 @given(seed=seeds)
-def test_certificates_are_what_the_twin_says_they_are(kind, law, seed):
+def test_certificate_check_equals_its_twin(kind, law, seed):
     """A y = 0, or not; y a tenth off the border of its cone to either side, or along normals alone."""
     rng = np.random.default_rng(seed)
     if kind == "bounded rows":
@@ -196,7 +196,7 @@ def test_certificates_are_what_the_twin_says_they_are(kind, law, seed):
     assert (check_certificate(problem, y) is None) == (reason is None), reason
 
 
-def test_a_sum_that_rounds_to_zero_proves_nothing():
+def test_certificate_of_a_sum_within_rounding_is_rejected():
     """A^T y is (0, 0, -2^-53), which impulses of 3e7 N s meet to 1e-9; exact zeros are a proof at the same b.y."""
     y, b = [1.0, 1.0, -1.0], np.array([1.0, 0.0, 1.0 - 3e-9])
     for small, proves in ((2.0**-53, False), (0.0, True)):
@@ -213,7 +213,7 @@ def test_a_sum_that_rounds_to_zero_proves_nothing():
         assert (check_certificate(opposed, [1.0, 1.0]) is None) is proves
 
 
-def test_bounds_that_are_huge_beside_the_step_are_seen():
+def test_residual_with_huge_bounds_counts_the_step():
     # w pushes into a bound on which lambda already sits: no error, however large the bound.
     for bound in (1e6, 1e60):
         problem = lv.Problem.lcp([[0.0, 0.0], [0.0, 1.0]], [1.0, 1.0], -bound, bound)
@@ -225,7 +225,7 @@ def test_bounds_that_are_huge_beside_the_step_are_seen():
 # -- nothing to do ----------------------------------------------------------------------------------
 
 
-def test_where_doing_nothing_is_right_nobody_solves_and_nobody_fails():
+def test_solve_at_rest_converges_without_iterations():
     a = np.diag([1.0, 2.0])
     for b, nothing in (
         ([-1.0, -2.0], True),  # separating: zero is the solution

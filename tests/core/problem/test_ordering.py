@@ -48,7 +48,7 @@ def test_colors_of_a_matrix_share_no_entry(seed):
                 assert not a[ptr[i] : ptr[i + 1], ptr[j] : ptr[j + 1]].any()
 
 
-def test_more_than_63_colors_are_found():
+def test_colors_of_a_dense_graph_exceed_63():
     """100 contacts of one body with 100 others: every one needs its own colour."""
     n = 100
     rows = touching(np.stack([np.zeros(n), np.arange(1, n + 1)], axis=1))

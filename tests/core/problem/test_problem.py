@@ -19,7 +19,7 @@ I2 = np.eye(2)
 # -- classes and forms -----------------------------------------------------------------------------------
 
 
-def test_the_class_follows_from_the_blocks():
+def test_law_follows_from_the_kinds_of_blocks():
     assert lv.Problem.linear(I2, [1, 1]).law == "linear"
     assert lv.Problem.lcp(I2, [1, 1]).law == "lcp"
     assert lv.Problem.lcp(I2, [1, 1], lower=-np.inf).law == "linear"
@@ -128,7 +128,7 @@ def test_problems_and_solutions_are_copied_and_pickled_after_use(again):
         assert result.work == solution.work
 
 
-def test_ctrl_c_from_a_real_signal():
+def test_ctrl_c_by_a_signal_ends_a_solve_as_interrupted():
     code = (
         "import _thread, threading, numpy as np, lavender as lv\n"
         "problem = lv.Problem.lcp(np.eye(3) * 2 - np.eye(3, k=1) - np.eye(3, k=-1), [1.0, 1.0, 1.0])\n"

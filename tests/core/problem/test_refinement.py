@@ -135,7 +135,7 @@ def test_sweeps_end_where_float64_loses_the_residual(name):
     assert count >= 2 or name not in AT_THE_FLOOR
 
 
-def test_a_residual_that_no_floor_excuses_is_no_claim():
+def test_residual_above_the_floor_is_not_converged():
     """Above 1e-5 nothing is at its floor: the message names the reason, and the budget is not used up."""
     seen = 0
     for seed in range(30):

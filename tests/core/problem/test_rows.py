@@ -64,7 +64,7 @@ def outcome(given):
 
 @pytest.mark.parametrize("what", SPOILT)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_quick_looks_end_as_the_long_way(what, seed):
+def test_quick_checks_of_sweeps_equal_full_residuals(what, seed):
     given = spoilt(seed, SPOILT[what])
     quick = outcome(given)
     with pytest.MonkeyPatch.context() as patch:
@@ -87,7 +87,7 @@ def _fault_or_frame(*arrays, find=checks.find_body_fault):
     return (fault, index) if fault else ("frame", 0)
 
 
-def test_float32_is_taken_and_made_whole():
+def test_rows_in_float32_are_widened_exactly():
     rng = np.random.default_rng(3)
     n, turn = rng.normal(size=(20, 3)), rng.normal(size=(20, 3))
     n /= np.linalg.norm(n, axis=1)[:, None]

@@ -55,7 +55,7 @@ def at_once(function, n=8):
 
 
 @pytest.mark.skipif(not sysconfig.get_config_var("Py_GIL_DISABLED"), reason="this Python has a GIL")
-def test_where_there_is_no_gil_no_kernel_brings_it_back():
+def test_kernels_do_not_enable_the_gil():
     modules = [".".join(p.relative_to(KERNELS.parent).with_suffix("").parts) for p in KERNELS.rglob("*.pyx")]
     code = f"""
 import importlib, sys
@@ -76,7 +76,7 @@ def often():
     sys.setswitchinterval(before)
 
 
-def test_what_is_derived_is_one_object_for_all_threads(often):
+def test_derived_arrays_are_one_object_for_all_threads(often):
     for seed in range(20):
         problem = random_contact_problem(seed)
         for name in ("data", "csr", "csr_data", "jacobian"):
@@ -95,7 +95,7 @@ def test_threads_read_worlds_whose_turn_came_too_late(often):
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="forks are of POSIX")
-def test_a_process_forked_while_a_thread_works_solves_the_same_problem():
+def test_process_forked_during_a_solve_solves_the_same_problem():
     script = """if True:
         import os, signal, threading
         import numpy as np
@@ -162,7 +162,7 @@ def test_an_error_of_one_thread_stops_the_others():
     assert told == [1]
 
 
-def test_threads_that_ask_for_threads_do_not_wait_for_each_other(monkeypatch):
+def test_solve_many_inside_threads_does_not_deadlock(monkeypatch):
     """All that are kept are busy with calls that want more: what nobody begins is nobody's."""
     monkeypatch.setattr(threads, "MAX_THREADS", 1)
     threads.get_thread_pool.cache_clear()

@@ -42,7 +42,7 @@ def drawn(seed, singular=False):
 
 
 @given(seed=seeds, tol=st.sampled_from([1e-3, 1e-6]), off=st.integers(-9, 0))
-def test_found_means_what_it_means_to_users_of_osqp_and_clarabel(seed, tol, off):
+def test_solve_qp_found_holds_by_the_errors_of_osqp(seed, tol, off):
     """The three errors of OSQP's paper, from the arrays as given; the objective is within the tolerance, too."""
     qp, rng = drawn(seed, singular=bool(seed % 2)), np.random.default_rng(seed)
     problem = lv.Problem.from_qp(**qp)
@@ -101,7 +101,7 @@ def nearly_singular(seed):
 
 
 @given(seed=seeds)
-def test_a_hessian_that_is_nearly_singular_hides_no_solution(seed):
+def test_solve_qp_with_a_nearly_singular_p_is_solved(seed):
     qp = nearly_singular(seed)
     answer = lv.solve_qp(lv.Problem.from_qp(**qp), tol=1e-8)
     assert answer.error <= 1e-6, str(answer)  # one in 400 is not found: x of 1e9 without rows
@@ -158,7 +158,7 @@ def with_far_rows(qp, seed, far):
 
 
 @given(seed=seeds, far=st.integers(4, 19), off=st.sampled_from([0.0, 1e-6, 1e-2]))
-def test_rows_that_do_not_act_change_no_error(seed, far, off):
+def test_solve_qp_error_does_not_depend_on_inactive_rows(seed, far, off):
     """An unsatisfied equation was hidden by a bound of 1e9: the largest target of any row was what errors were over."""
     qp = drawn(seed)
     one, two = lv.Problem.from_qp(**qp), lv.Problem.from_qp(**with_far_rows(qp, seed, 10.0**far))
@@ -201,7 +201,7 @@ def test_multiplier_of_a_far_row_counts_as_zero_in_the_error():
     assert answer.found and answer.error <= 1e-10
 
 
-def test_terms_that_cancel_excuse_no_violation():
+def test_solve_qp_violation_hidden_by_cancelling_terms_is_not_found():
     """A second difference of 1e7 - 2e7 + 1e7 is violated by 0.5, 5e-8 of its terms, and by 50 % of its side of -1."""
     difference = 1000.0 * np.array([[1.0, -2.0, 1.0]])
     problem = lv.Problem.from_qp(
@@ -370,7 +370,7 @@ def test_every_backend_solves_programs_with_a_singular_hessian(name, seed):
         assert name != "clarabel", str(answer)
 
 
-def test_a_singular_hessian_is_kept_and_auto_names_the_backend_that_ran():
+def test_solve_qp_with_a_singular_p_runs_a_backend_that_is_named():
     P = np.array([[2.0, 2.0, 0.0], [2.0, 2.0, 0.0], [0.0, 0.0, 0.0]])
     problem = lv.Problem.from_qp(P, [-1.0, -1.0, 1.0], A=[[1.0, 1.0, 1.0]], b=[1.0], lb=np.zeros(3), name="flat")
     assert problem.generalized is None and problem.has_singular_program
@@ -386,7 +386,7 @@ def test_a_singular_hessian_is_kept_and_auto_names_the_backend_that_ran():
 
 
 @pytest.mark.parametrize("name", [n for n in lv.available(law="lcp") if not lv.get(n).external])
-def test_own_solvers_refuse_a_singular_hessian_and_name_those_that_do_not(name):
+def test_solve_qp_with_a_singular_p_and_an_own_solver_raises(name):
     if name == "auto":
         return
     with pytest.raises(lv.CapabilityError, match=r"P of this program is singular: use auto, or .*osqp"):
@@ -412,7 +412,7 @@ def test_own_solvers_solve_strictly_convex_programs(name, seed):
     np.testing.assert_allclose(answer.x, lv.solve_qp(lv.Problem.from_qp(**qp)).x, atol=1e-4)
 
 
-def test_a_hessian_is_singular_from_a_pivot_of_1e_13_of_its_diagonal_on():
+def test_program_is_singular_from_a_pivot_of_1e_13():
     for pivot, is_singular in ((1e-12, False), (1e-15, True)):
         beside = np.sqrt(1.0 - pivot)
         problem = lv.Problem.from_qp([[1.0, beside], [beside, 1.0]], [1.0, 1.0], lb=[-1.0, -1.0])
@@ -474,7 +474,7 @@ def test_linear_programs_of_many_variables_reach_their_optimum(seed, n):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_forces_that_all_vanish_are_a_solution_only_where_the_rows_hold(seed):
+def test_solve_qp_without_forces_is_found_only_if_rows_hold(seed):
     """q = 0: every x of P x = 0 that fulfils the rows is a solution."""
     rng = np.random.default_rng(seed)
     n, rows, root = 90, rng.normal(size=(70, 90)), rng.normal(size=(40, 90))
@@ -507,7 +507,7 @@ def test_rows_that_contradict_each_other_among_many_are_proven(seed):
 # -- what is refused -------------------------------------------------------------------------------
 
 
-def test_found_means_to_the_error_that_was_asked_for():
+def test_solve_qp_found_holds_to_the_requested_tolerance():
     rng = np.random.default_rng(0)
     for n in (3, 10, 30):
         root, rows = rng.normal(size=(n, n)), rng.normal(size=(n, n))

@@ -60,7 +60,7 @@ def test_pivots_across_panels_take_no_longer_than_the_time_limit(m):
     assert lv.solve(problem, "admm", max_iter=3).work["factorisations"] == 1
 
 
-def test_a_factor_of_more_entries_than_can_be_counted_is_said(monkeypatch):
+def test_admm_factor_beyond_index_range_raises(monkeypatch):
     class Large(admm.LinearSystem):
         def analyse(self):
             raise OverflowError("the factor has 2^31 entries or more")
@@ -94,7 +94,7 @@ def test_without_memory_it_is_plain_admm_by_hand():
 
 
 @pytest.mark.parametrize("slide", [0.6, 6.0])
-def test_first_solves_that_rise_are_no_divergence(slide):
+def test_admm_residual_that_rises_first_is_not_divergence(slide):
     """A contact that hardly presses, and slides: residuals are large beside that of doing nothing."""
     problem = lv.Problem.contact(np.diag([2.4, 4.4, 0.9]), [3.7e-7, 0.2 * slide, -slide], [1.0])
     solution = lv.solve(problem, "admm", tol=1e-8)

@@ -13,7 +13,7 @@ from lavender.solvers.newton import Newton
 
 @pytest.mark.parametrize("form", FORMS)
 @given(seed=seeds)
-def test_islands_are_those_of_the_matrix_and_each_can_stand_alone(form, seed):
+def test_restrict_to_islands_gives_blocks_of_the_matrix(form, seed):
     rolls = bool(seed % 2)
     problem = FORMS[form](random_contact_problem(seed, spin=not rolls, rolling=rolls, bodies=9, joints=2, contacts=6))
     count, label = find_islands(problem)
@@ -37,7 +37,7 @@ def test_islands_are_those_of_the_matrix_and_each_can_stand_alone(form, seed):
         assert not a[np.ix_(rows, others)].any()
 
 
-def test_an_island_may_ask_for_dust():
+def test_restrict_to_an_island_of_b_1e_300_gives_zero():
     """1e-300 m/s beside 1 m/s: no problem alone may ask for so little, beside which nothing is."""
     problem = lv.Problem(np.array([1.0, 1e-300]), lv.Cones.free(2), np.eye(2))
     _, label = find_islands(problem)

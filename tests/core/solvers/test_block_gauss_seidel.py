@@ -31,7 +31,7 @@ def blocks_of(kind, rng, n, m):
 
 @pytest.mark.parametrize("matrix", ["full", "asymmetric", "diag(1, 100)", "condition 1e6"])
 @pytest.mark.parametrize("rows", [1, 2, 3, 4, 6, 8])
-def test_joints_that_meet_nothing_are_solved_to_rounding_by_one_sweep(rows, matrix):
+def test_block_gauss_seidel_solves_separate_joints_in_one_sweep(rows, matrix):
     rng, n = np.random.default_rng(7 + rows), 500
     w = blocks_of(matrix, rng, n, rows) + 0.1 * np.eye(rows) * (matrix == "full")
     reach, zero = rng.uniform(0.0, 0.5, (2, n * rows)), np.zeros(n)
@@ -90,7 +90,7 @@ MATRICES = ("full", "asymmetric", "diag(1, 100)", "rank one", "condition 1e6")
     ("kind", "law"),
     [(kind, law) for kind in ALONE for law in ("coulomb", "cone") if (kind, law) != ("round", "coulomb")],
 )
-def test_contacts_alone_are_solved_to_rounding_by_one_sweep(kind, law, matrix):
+def test_block_gauss_seidel_solves_separate_contacts_in_one_sweep(kind, law, matrix):
     """As many as no other meets, by the judge's error of each; what no exact answer is found for is counted."""
     rng, n = np.random.default_rng(1), 4000
     mu = np.where(np.arange(n) % 10 == 0, 0.0, 10.0 ** rng.uniform(-2, 1, n))

@@ -170,7 +170,7 @@ BROKEN = [MemoryError("8 GB"), TooLarge("A would have 1e10 entries"), FloatingPo
 
 @pytest.mark.parametrize("error", [*BROKEN, KeyboardInterrupt()], ids=lambda error: type(error).__name__)
 @pytest.mark.parametrize("name", [name for name in OURS if name != "auto"])
-def test_what_breaks_down_or_is_stopped_after_the_start_is_a_result(name, error, monkeypatch):
+def test_solver_that_raises_after_the_start_gives_a_result(name, error, monkeypatch):
     """With the best impulse so far, and never one that is worse than the start."""
     spec = registry.get(name)
     *_, problem = make_well_posed_problems(spec)
@@ -202,7 +202,7 @@ def test_what_breaks_down_or_is_stopped_after_the_start_is_a_result(name, error,
 
 @pytest.mark.parametrize("error", BROKEN, ids=lambda error: type(error).__name__)
 @pytest.mark.parametrize("limit", [None, 10.0])
-def test_auto_goes_on_with_the_others_where_one_breaks_down(limit, error, monkeypatch):
+def test_auto_continues_with_other_solvers_after_an_exception(limit, error, monkeypatch):
     def breaks(self, n):
         raise error
 
@@ -224,7 +224,7 @@ def test_auto_goes_on_with_the_others_where_one_breaks_down(limit, error, monkey
 
 
 @pytest.mark.parametrize("name", OURS)
-def test_an_a_that_is_too_large_is_told_before_the_start_or_not_needed(name, monkeypatch):
+def test_solver_on_an_a_beyond_memory_raises_before_the_start_or_does_not_form_it(name, monkeypatch):
     monkeypatch.setattr(operators, "MAX_INDEXABLE_ENTRIES", 4000)  # J and M have 2,700
     spec = registry.get(name)
     rng = np.random.default_rng(4)

@@ -293,14 +293,14 @@ def failure(spec, name):
 
 
 @pytest.mark.parametrize("check", [c.name for c in contract.list_checks(make_spec(Sweeps))])
-def test_a_correct_solver_passes(register, check):
+def test_contract_of_a_correct_solver_is_met(register, check):
     spec = make_spec(Sweeps)
     register(spec)
     assert failure(spec, check) == ""
 
 
 @pytest.mark.parametrize("factory, check, words", FAULTS, ids=[f"{f.__name__}-{c}" for f, c, _ in FAULTS])
-def test_a_fault_is_named(register, factory, check, words):
+def test_contract_of_a_faulty_solver_names_the_unmet_check(register, factory, check, words):
     spec = make_spec(factory)
     register(spec)
     sentence = failure(spec, check)
@@ -317,7 +317,7 @@ def test_a_fault_is_named(register, factory, check, words):
         ("budgets_are_kept", {"refusal": lambda p: "never"}, "the spec lists the laws ['lcp', 'linear'], but refuses"),
     ],
 )  # fmt: skip
-def test_a_wrong_spec_is_named(register, check, more, words):
+def test_contract_of_a_wrong_spec_names_the_unmet_check(register, check, more, words):
     spec = make_spec(Sweeps, **more)
     register(spec)
     assert words in failure(spec, check)

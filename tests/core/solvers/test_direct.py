@@ -68,7 +68,7 @@ def test_every_factorisation_reaches_rounding(case):
 
 
 @pytest.mark.parametrize("a", [tridiagonal(400), sp.csr_array(tridiagonal(400) @ tridiagonal(400))])
-def test_bounded_rows_of_a_strip_are_a_band_whatever_they_are_called(a):
+def test_direct_on_a_shuffled_strip_uses_a_band_factor(a):
     problem = lv.Problem.lcp(shuffled(np.random.default_rng(2), a), np.ones(400))
     assert lv.solve(problem, "direct").solver.form == "band"
 
@@ -104,7 +104,7 @@ def test_a_stack_takes_one_factorisation():
 
 
 @pytest.mark.parametrize("m", [5, 30, 120, 900])
-def test_singular_linear_systems_say_their_rank(m):
+def test_direct_on_a_singular_system_reports_its_rank(m):
     rng = np.random.default_rng(m)
     if m == 900:
         grid = laplacian(30)
@@ -152,7 +152,7 @@ def test_an_lcp_without_a_solution_gets_a_certificate(solver, seed, m):
 
 @pytest.mark.parametrize(("m", "density"), [(2, 1.0), (40, 1.0), (64, 0.1), (65, 1.0), (200, 1.0), (200, 0.02)])
 @pytest.mark.parametrize("bounds", [(0.0, np.inf), (-0.3, 0.3), (-np.inf, np.inf)])
-def test_asymmetric_bounded_rows(m, density, bounds):
+def test_direct_solves_asymmetric_bounded_rows(m, density, bounds):
     """Positive definite and not symmetric, as recorded problems are and more: compiled and LAPACK's LU, SuperLU."""
     rng = np.random.default_rng(m)
     a = sp.random_array((m, m), density=density, rng=rng, data_sampler=rng.standard_normal).toarray()
@@ -168,7 +168,7 @@ def test_asymmetric_bounded_rows(m, density, bounds):
     np.testing.assert_allclose(long.impulse, solution.impulse, rtol=1e-9, atol=1e-12 / mass.min())
 
 
-def test_asymmetric_rows_whose_exchanges_go_round_in_circles_are_stalled():
+def test_direct_with_cycling_exchanges_is_stalled():
     # No solution at all: w = -lambda_other - 1 < 0 whatever the impulse.
     for more in (0, 80):
         a = np.eye(2 + more)
@@ -196,7 +196,7 @@ def skew(seed, m=120, density=2.0):
     return sp.csr_array(k - k.T), rng.standard_normal(m)
 
 
-def test_superlu_is_not_asked_where_no_entries_would_do():
+def test_direct_does_not_call_superlu_without_entries():
     """It writes outside its arrays there: a process that had 442 of these ended in a segmentation fault."""
     a = sp.csr_array(([1.0, 1.0, 1.0], ([0, 1, 2], [0, 0, 0])), (3, 3))
     with pytest.raises(RuntimeError, match="singular"):
@@ -212,7 +212,7 @@ def test_superlu_is_not_asked_where_no_entries_would_do():
             assert lv.solve(lv.Problem.linear(full, b), solver).claim_check == "confirmed"
 
 
-def test_a_panel_that_lost_a_pivot_is_counted_and_named():
+def test_direct_with_a_lost_pivot_counts_and_names_it():
     m = 100
     a = 2.0 * np.eye(m)
     a[:2, :2] = [[1.0, 1.0], [2.0, 2.0]]
@@ -225,7 +225,7 @@ def test_a_panel_that_lost_a_pivot_is_counted_and_named():
 
 @pytest.mark.parametrize("bound", [np.inf, 0.05])
 @pytest.mark.parametrize(("m", "half"), [(40, 39), (60, 1), (100, 5), (900, 20)])
-def test_a_sound_factor_leaves_nothing_to_refine(m, half, bound):
+def test_direct_with_a_good_factor_is_not_refined(m, half, bound):
     """Refinement would hide a wrong half of a factor's solve, at the price of its work."""
     rng = np.random.default_rng(m)
     diagonals = [rng.normal(size=m - abs(k)) for k in range(-half, half + 1)]

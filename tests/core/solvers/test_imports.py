@@ -48,7 +48,7 @@ HEAVY = {
 }  # fmt: skip
 
 
-def test_the_package_loads_what_auto_needs_a_name_its_own_file_and_a_listing_no_backend():
+def test_import_of_the_package_loads_only_needed_modules():
     """Beyond NumPy and what it loads: lavender's own modules, 140 with all that a first solve needs.
 
     SciPy's sparse arrays would add 150, its optimisers 300: 0.2 to 0.45 s in the first call of a control loop.
@@ -116,7 +116,7 @@ for solver, kind in (words.split(": ") for words in sys.argv[1:]):
 
 @pytest.mark.nightly
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs processes that fork")
-def test_the_clock_of_a_limit_holds_no_import_of_scipy():
+def test_solve_with_a_limit_imports_scipy_before_its_clock():
     """Counted and never done, it made every call of a process within 0.3 s late: a set-up of 1 ms never began."""
     solved = {  # `auto` counts what it has to load as a set-up, and does without where that is too long
         "direct": ("linear", "few entries", "asymmetric", "singular"),

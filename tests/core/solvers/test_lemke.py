@@ -58,7 +58,7 @@ def test_murtys_exponential_example_takes_all_its_pivots():
     np.testing.assert_array_equal(solution.impulse, np.append(np.zeros(n - 1), b[-1]))
 
 
-def test_a_path_that_a_budget_cuts_stands_where_it_stopped_and_too_many_rows_are_refused():
+def test_lemke_stopped_by_its_budget_keeps_its_point():
     problem = random_lcp(3, m=60, rank=40)
     cut = [lv.solve(problem, "lemke", max_iter=n).residual.relative for n in range(1, 40, 2)]
     assert min(cut) < 0.5, "where the path stands, not the start"

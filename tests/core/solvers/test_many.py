@@ -42,7 +42,7 @@ def assert_same(many, i, single):
 
 
 @pytest.mark.parametrize("again", [copy.copy, copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
-def test_what_came_of_many_is_copied_and_pickled(again):
+def test_results_of_many_are_copied_and_pickled(again):
     """Solutions, verdicts and derivatives, of a batch and of a list in which each goes another way."""
     batch = lv.Batch(*worlds(3), cones=DISKS)
     mixed = [batch[0], lv.Problem.contact(np.eye(3), np.ones(3), mu=[(0.5, 0.2)]), batch[1]]
@@ -233,7 +233,7 @@ def test_a_world_has_the_bits_of_its_single_solve(name):
             assert found[i].verdict == one.verdict
 
 
-def test_verdicts_of_many_tell_rounding_early_stops_and_wrong_answers():
+def test_residual_many_separates_rounding_early_stops_and_wrong_answers():
     batch = lv.Batch(*worlds(8), cones=DISKS, friction="cone")
     lam = lv.solve_many(batch, tol=1e-10).impulse.astype(np.float32)
     lam[1] *= 0.99
@@ -255,7 +255,7 @@ def test_a_batch_reads_the_arrays_that_it_was_given():
     assert after.impulse[1].tobytes() == before[1].tobytes()
 
 
-def test_a_batch_starts_where_it_is_told():
+def test_solve_many_begins_at_the_given_impulses():
     jac, mass, free = worlds(6)
     batch = lv.Batch(jac, mass, free, cones=DISKS, friction="cone")
     cold = lv.solve_many(batch, tol=1e-9)
@@ -287,7 +287,7 @@ def spoiled(jac, mass, free, mu):
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-def test_a_bad_world_is_named_and_harms_no_other(threads):
+def test_invalid_world_of_a_batch_is_named_and_others_are_solved(threads):
     jac, mass, free = worlds(10)
     mu = np.full((10, 4), 0.5)
     clean = lv.solve_many(lv.Batch(jac.copy(), mass.copy(), free.copy(), cones=DISKS, mu=mu.copy()))
@@ -318,7 +318,7 @@ def test_a_bad_world_is_named_and_harms_no_other(threads):
 
 
 @pytest.mark.parametrize("listed", [False, True])
-def test_a_start_that_is_not_finite_is_a_fault_of_its_world(listed):
+def test_start_that_is_not_finite_is_a_fault_of_its_world_only(listed):
     batch = lv.Batch(*worlds(6), cones=DISKS)
     clean = lv.solve_many(batch, tol=1e-8)
     start = clean.impulse.copy()
@@ -389,7 +389,7 @@ def test_a_world_written_over_before_it_is_read_contradicts_its_status():
     assert many[3].success and not many[3].status_conflict
 
 
-def test_lists_start_from_their_impulses_and_refuse_what_is_none():
+def test_solve_many_of_a_list_begins_at_its_impulses():
     given = [*lv.Batch(*worlds(2), cones=DISKS), lv.Problem.lcp(np.eye(2), [1.0, -1.0])]
     many = lv.solve_many(given)
     assert many.ptr.tolist() == [0, 12, 24, 26] and len(many.velocity) == 2 * 18
@@ -404,7 +404,7 @@ def test_lists_start_from_their_impulses_and_refuse_what_is_none():
         lv.solve_many(3)
 
 
-def test_what_goes_wrong_on_another_thread_is_raised():
+def test_error_on_another_thread_is_raised_by_solve_many():
     both, seen = threading.Barrier(2, timeout=10.0), set()
 
     def callback(*_):

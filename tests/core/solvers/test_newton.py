@@ -72,7 +72,7 @@ def test_newton_system_is_the_derivative_and_is_solved(form, law, seed):
 
 
 @pytest.mark.slow
-def test_a_path_runs_through_its_folds():
+def test_newton_path_follows_folds():
     """Steps of a pile on which load passes from stick to slip, up to twelve times on one path."""
     paths = 0
     for step, problem in Pile(14).problems(130):
@@ -94,7 +94,7 @@ def test_a_compliance_costs_interior_points_no_more_steps(compliance):
 
 
 @pytest.mark.parametrize("n", [3, 30, 150])
-def test_a_circle_of_exchanges_ends_by_count(n):
+def test_newton_exchanges_in_a_cycle_end_by_count(n):
     """Newton's method on min(z, H z - g) goes round among single rows here (Ben Gharbia, Gilbert 2012)."""
     a = np.eye(n) + 2.0 * np.roll(np.eye(n), 1, axis=0)
     problem = lv.Problem.lcp(a, np.ones(n))
@@ -187,7 +187,7 @@ def test_free_rows_of_few_entries_are_solved_with_all_the_others(even, seed):
 
 @pytest.mark.parametrize("form", FORMS)
 @given(seed=seeds)
-def test_where_nothing_rubs_the_law_has_no_slip_and_no_rounds(form, seed):
+def test_newton_without_friction_equals_the_cone_law_without_coulomb_rounds(form, seed):
     """mu = 0, rows that depend on each other: under either law the same convex problem."""
     p = random_contact_problem(seed, bodies=3, joints=5, contacts=25, tangents=2, spin=False)
     p = replace(p, compliance=np.zeros(p.m), cones=replace(p.cones, mu=np.zeros(p.n_blocks)))

@@ -19,7 +19,7 @@ def stack(n, ratio=1.0):
 
 @pytest.mark.parametrize("name", ["nncg", "anderson"])
 @pytest.mark.parametrize("sweep", ["pgs", "blocks"])
-def test_stack_has_its_closed_form(name, sweep):
+def test_nncg_on_a_stack_gives_its_closed_form(name, sweep):
     problem, exact = stack(20)
     solution = lv.solve(problem, name, sweep=sweep, tol=1e-10, max_iter=20_000)
     assert solution.success
@@ -33,7 +33,7 @@ def sliding_pile():
 
 
 @pytest.mark.parametrize(("restart", "kept"), [("growth", 0), ("against", 2)])
-def test_first_iterations_by_hand(restart, kept):
+def test_nncg_first_iterations_equal_a_dense_twin(restart, kept):
     """Iterations of nncg against the formulas written in NumPy over single sweeps of pgs."""
     problem = random_lcp(5, m=9) if restart == "growth" else sliding_pile()
     d, count = problem.d, 0
@@ -57,7 +57,7 @@ def test_first_iterations_by_hand(restart, kept):
 
 
 @pytest.mark.parametrize("name", ["nncg", "anderson"])
-def test_starting_from_the_convex_answer(name):
+def test_nncg_starts_from_the_answer_of_the_cone_law(name):
     # b is that of impulses well inside their cones: nothing slides, and the cone law's answer is Coulomb's.
     rng = np.random.default_rng(3)
     base = random_contact_problem(78, tangents=2, spin=False, contacts=20, bodies=8, joints=0)

@@ -34,7 +34,7 @@ def test_specs_are_copied_and_pickled(again):
     assert again(named("another", options={"x": "a number"})).options == {"x": "a number"}
 
 
-def test_a_factory_that_is_not_there_or_makes_no_solver_is_named(register, tmp_path, monkeypatch):
+def test_solver_with_a_missing_factory_raises_an_error_that_names_it(register, tmp_path, monkeypatch):
     for factory in ("no_such_module_1:Solver", "math:Solver"):
         register(lv.SolverSpec("absent", factory, {"lcp"}, summary="of a test"), replace=True)
         with pytest.raises(lv.errors.SolverUnavailable, match=f"'absent' cannot be imported from '{factory}'"):
@@ -51,7 +51,7 @@ def test_a_factory_that_is_not_there_or_makes_no_solver_is_named(register, tmp_p
         lv.solve(TINY, "half")
 
 
-def test_a_refusal_that_raises_refuses_for_its_own_solver_alone(register):
+def test_solver_whose_refusal_raises_is_refused_alone(register):
     register(named("unsure", refusal=lambda problem: 1 / 0))
     register(named("sure", refusal=lambda problem: False))
     reason = "cannot say whether it takes the problem: ZeroDivisionError: division by zero"
@@ -77,7 +77,7 @@ def test_a_cost_that_is_not_a_number_is_refused_by_the_solver_s_name(counted, re
         lv.solve(TINY, "wrong", time_limit=10.0)
 
 
-def test_more_iterations_than_were_asked_for_are_no_result(plug_in):
+def test_claim_of_more_iterations_than_the_limit_is_a_numerical_error(plug_in):
     name = plug_in(lambda problem, impulse: lv.Claim(lv.Status.MAX_ITERATIONS, 7, {}))
     solution = lv.solve(TINY, name, max_iter=5)
     assert solution.status is lv.Status.NUMERICAL_ERROR
@@ -85,7 +85,7 @@ def test_more_iterations_than_were_asked_for_are_no_result(plug_in):
     assert lv.solve(TINY, name, max_iter=7).iterations == 7
 
 
-def test_the_row_whose_impulse_is_not_finite_is_named(plug_in):
+def test_message_names_the_row_whose_impulse_is_not_finite(plug_in):
     # A lambda has it in every row that is coupled, so that the worst row tells nothing.
     def breaks(problem, impulse):
         impulse[2] = np.nan
@@ -128,7 +128,7 @@ def test_a_plug_in_without_update_is_prepared_anew(register):
 # -- names ------------------------------------------------------------------------------------------
 
 
-def test_capabilities_select():
+def test_available_selects_by_capabilities():
     ordered = lv.available(law="lcp", order=True)
     assert "pgs" in ordered
     assert "direct" not in ordered
@@ -178,7 +178,7 @@ def raises():
     ],
     ids=["import", "factory", "name of ours", "no spec"],
 )
-def test_a_broken_plug_in_warns_by_name_and_breaks_nothing(load, sign, monkeypatch):
+def test_broken_plug_in_warns_and_leaves_other_solvers(load, sign, monkeypatch):
     entries = [Entry("broken", load), Entry("good_one", lambda: named("good_one"))]
     monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: entries)
     monkeypatch.setattr(registry, "registered", {})

@@ -73,7 +73,7 @@ KINDS = (
 
 @pytest.mark.parametrize("kind", KINDS)
 @given(seed=seeds, tol=st.sampled_from([1e-3, 1e-6, 1e-9, 1e-13, 0.9]))
-def test_the_short_way_and_the_long_way_are_one(kind, seed, tol):
+def test_compiled_call_equals_the_general_solve(kind, seed, tol):
     problem = draw(kind, seed)
     for solver in SHORT:
         if registry.get(solver).refuses(problem) is not None:
@@ -101,7 +101,7 @@ def test_first_solve_of_rows_that_nothing_moves_has_the_result_of_later_ones(kin
 
 
 @pytest.mark.parametrize("limit", [None, 10.0])
-def test_what_rounding_hides_is_no_matter_of_time(limit):
+def test_impulses_that_cancel_in_rounding_are_diverged_with_any_limit(limit):
     """Two fixed impulses that cancel in a free row, whose b is 1000 times their rounding 2^-53 A lambda."""
     low, high = [1.5, -1.5, -np.inf], [1.5, -1.5, np.inf]
     held = lv.Problem.lcp(np.full((3, 3), 1e13), [0.0, 0.0, 1.0], low, high)
@@ -156,7 +156,7 @@ def test_islands_of_bodies_with_joints(law, seed):
     assert found.success and "islands" in found.message
 
 
-def test_islands_where_doing_nothing_is_right_from_a_warm_start():
+def test_compiled_call_on_an_island_at_rest_returns_zero():
     """Of nine islands one leaves the ground: nothing is to be done for it, and the solution says what was done."""
     rng = np.random.default_rng(3)
     g = rng.normal(size=(12, 6))

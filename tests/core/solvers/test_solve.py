@@ -39,7 +39,7 @@ def test_another_problem_replaces_the_prepared_one_unless_an_error_is_raised(nam
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals of POSIX")
 @pytest.mark.parametrize("solver", ["pgs", "auto"])
-def test_ctrl_c_while_many_are_handed_out_to_threads_begins_no_more(solver, monkeypatch):
+def test_ctrl_c_during_solve_many_starts_no_more_problems(solver, monkeypatch):
     """The signal comes with the first problem that a thread takes, one by one or in the compiled loop."""
     n, begun, solve, hand = 2000, [], many.solve, loop.Worker
 
@@ -76,7 +76,7 @@ def test_ctrl_c_while_many_are_handed_out_to_threads_begins_no_more(solver, monk
 
 
 @pytest.mark.parametrize("name", ["auto", "newton", "direct", "pgs", "anderson", "lemke"])
-def test_a_solve_leaves_no_result_with_its_problem(name):
+def test_solve_stores_no_result_in_its_problem(name):
     """A residual was stored with the problem for the next call of the judge."""
     problem = random_lcp(3, m=90)
     lv.solve(problem, name)

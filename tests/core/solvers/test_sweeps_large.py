@@ -21,7 +21,7 @@ def pile():
 
 
 @pytest.mark.parametrize("order", ORDERS)
-def test_writing_out_changes_no_bit(order, pile, monkeypatch):
+def test_records_of_bodies_written_out_change_no_bit(order, pile, monkeypatch):
     """Cold start: v = 0 in any numbering, and every block then reads the same values in the same order."""
     monkeypatch.setattr("lavender.problem.ordering.MAX_MEAN_BODY_DISTANCE", 0)
     plain = sweeps(pile, NAME, 7, order=order)
@@ -90,7 +90,7 @@ def test_local_takes_a_matrix_too(pile):
 
 
 @pytest.mark.parametrize("order", ("given", *ORDERS, "symmetric", "random"))
-def test_update_keeps_what_comes_from_the_structure(order, pile, monkeypatch):
+def test_update_of_numbers_keeps_the_structure(order, pile, monkeypatch):
     monkeypatch.setattr("lavender.problem.ordering.MAX_MEAN_BODY_DISTANCE", 0)
     monkeypatch.setattr(layout, "MIN_CONTACTS_FOR_COPY", 1)
     other = replace(pile, b=pile.b * 1.25)

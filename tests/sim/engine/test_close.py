@@ -5,7 +5,7 @@ import pytest
 import lavender as lv
 
 
-def test_a_closed_simulation_refuses_calls_and_still_tells_its_settings():
+def test_closed_simulation_raises_and_keeps_its_settings():
     with lv.Simulation(lv.Scene("stack", n=2, solver_iterations=7)) as sim:
         state = sim.snapshot()
         sim.step()

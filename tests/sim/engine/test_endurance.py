@@ -58,7 +58,7 @@ def test_a_scene_of_the_gallery_keeps_its_energy_and_its_place(name, rate):
 
 
 @pytest.mark.parametrize("name", ["bridge", "four_bar", "stack", "heavy_on_light"])
-def test_newton_keeps_them_too(name):
+def test_gallery_scene_solved_by_newton_keeps_energy(name):
     # A second of the bridge, of which every step is a hundred joints and contacts, costs what the others take.
     result = simulate(name, 60, 1.0 if name == "bridge" else 2.5, "newton")
     # one step of the bridge, joints and friction together, ends at 1.6e-6 for 1e-6 when its iterations are used up

@@ -104,7 +104,7 @@ WAYS = {  # steps that were done before
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_every_way_to_go_on_has_the_bits_of_the_run(name, tmp_path):
+def test_simulation_continued_in_any_way_has_the_bits_of_the_run(name, tmp_path):
     scene = lv.Scene(name, seed=3, order="random", **SCENES[name])
     for way, (before, make) in WAYS.items():
         sim = after(before, scene)
@@ -138,7 +138,7 @@ def test_reset_starts_again_and_a_seed_builds_the_scene_anew():
     np.testing.assert_array_equal(sim.reset(seed=1)[0]["positions"], first)
 
 
-def test_what_lacks_room_says_so_before_any_state_has_changed():
+def test_simulation_beyond_its_buffers_raises_before_the_state_changes():
     sim = lv.Simulation("stack")
     state = with_room(sim.state, sim.state.size[8], 5)
     before = {k: state.a[k].copy() for k in ("x", "q", "v", "cache_key", "cache_impulse", "joint_impulse")}

@@ -116,7 +116,7 @@ def test_crossed_edges_meet_in_one_point():
 
 
 @pytest.mark.parametrize("flip", [False, True])
-def test_sphere_against_everything(flip):
+def test_collide_of_a_sphere_with_any_shape_gives_the_exact_contact(flip):
     ball = ("sphere", 0.5, {"position": (0.2, 0.1, 0.48)})
     for other, point in (
         (("plane", (0, 0, 1), {}), (0.2, 0.1, -0.01)),
@@ -246,7 +246,7 @@ def test_shuffled_and_false_keys_do_no_harm():
     assert all(v < 1e-3 for v in worst.values())
 
 
-def test_an_entry_far_from_the_contact_is_stale():
+def test_warm_start_entry_far_from_the_contact_is_dropped():
     sim = after(60, "stack", n=2, substeps=1)
     a, n = sim.state.a, int(sim.state.head[HEAD["cached"]])
     a["cache_local"][:n] += 10.0

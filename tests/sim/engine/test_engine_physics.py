@@ -96,7 +96,7 @@ def test_a_closed_system_keeps_its_momentum(kind):
 
 
 @pytest.mark.parametrize("name", ["chain", "bridge", "four_bar", "newtons_cradle"])
-def test_joints_hold(name):
+def test_joints_of_a_scene_stay_closed(name):
     sim = lv.Simulation(lv.Scene(name, solver_iterations=64))
     worst = 0.0
     for _ in range(600):

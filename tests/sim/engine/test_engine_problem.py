@@ -31,7 +31,7 @@ def reported(observation, problem):
         *((name, {"order": order, "seed": 5}) for name in ("stack", "bridge") for order in SCENE_ORDERS),
     ],
 )
-def test_the_step_reports_the_bits_of_the_front_door(name, more):
+def test_step_has_the_bits_and_residuals_of_solve(name, more):
     sim, rows = lv.Simulation(lv.Scene(name, substeps=1, **SCENES[name], **more)), 0
     order = sim.scene.parameters.order
     asked = {} if order == "alternating" else {"order": order}  # whose contacts stand as they are swept
@@ -148,7 +148,7 @@ def test_any_registered_solver_steps_the_scene(name, rolling):
 
 
 @pytest.mark.parametrize("policy", ["use", "keep", "damp", "raise"])
-def test_a_failed_solve_is_counted_and_dealt_with(policy):
+def test_step_after_a_failed_solve_follows_on_failure(policy):
     # One sweep of pgs cannot reach 1e-6 on six boxes.
     sim = lv.Simulation(lv.Scene("stack", solver="pgs", solver_iterations=1, on_failure=policy))
     sim.state.head[HEAD["warm_start"]] = 1
@@ -241,7 +241,7 @@ def test_recorded_problems_are_the_problems_of_the_steps(tmp_path):
         ({"solver": "newton"}, None),
     ],
 )
-def test_every_step_tells_the_order_of_its_sweeps(parameters, order):
+def test_step_reports_the_order_of_its_sweeps(parameters, order):
     sim = lv.Simulation(lv.Scene("stack", n=2, **parameters))
     assert sim.reset()[1]["order"] == sim.step()[-1]["order"] == order
     if sim.last_solution is not None:

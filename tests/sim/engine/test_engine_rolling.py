@@ -37,7 +37,7 @@ def test_a_ball_rolls_to_rest_where_the_moment_stops_it(patch):
     assert abs(seen["positions"][1, 0] / truth - 1.0) < 0.01
 
 
-def test_the_cache_gives_the_moments_back():
+def test_warm_start_restores_rolling_moments():
     """A resting pile warm-started solves better than a cold one at the same sweeps."""
     warm, cold = pile(warm_start=True), pile(warm_start=False)
     for sim in (warm, cold):
@@ -50,7 +50,7 @@ def test_the_cache_gives_the_moments_back():
     assert lv.residual(warm.constraint_problem(), guess).energy < 0.2 * min(a.energy, b.energy)
 
 
-def test_without_friction_there_is_nothing_to_roll_on():
+def test_ball_without_friction_does_not_roll():
     assert not ball(friction=0.0).constraint_problem().cones.has_rolling
 
 

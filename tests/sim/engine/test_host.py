@@ -10,7 +10,7 @@ from lavender.sim.engine.layout import SETTING
 
 @pytest.mark.parametrize("name", ["stack", "chain", "bridge", "pile"])
 @pytest.mark.parametrize("order", ["given", "random", "top_down"])
-def test_watched_sweeps_are_the_sweeps(name, order):
+def test_sweeps_with_a_residual_after_each_have_the_same_bits(name, order):
     simulation = after(30, name, order=order, solver_iterations=12)
     watched, plain = simulation.state.copy(), simulation.state.copy()
     for state in (watched, plain):

@@ -11,7 +11,7 @@ from lavender.sim.scene import Box, Plane, Sphere
 from lavender.sim.scene.parts import convert_to_rotation_matrix
 
 
-def test_the_readme_of_a_scene_by_hand():
+def test_scene_of_one_box_gives_the_documented_observation():
     scene = lv.Scene(dt=0.01)
     assert (scene.add_plane(), scene.add_box((1, 1, 1), mass=2.0, position=(0, 0, 0.5))) == (0, 1)
     observation, reward, terminated, truncated, info = lv.Simulation(scene).step()
@@ -46,7 +46,7 @@ def test_sizes_are_those_of_the_docstrings(name, more, bodies, contacts, rows):
     assert (scene.n_bodies, problem.rows.n_contacts, problem.m) == (bodies, contacts, rows)
 
 
-def test_what_a_scene_does_not_declare_is_not_allocated():
+def test_scene_without_friction_or_spin_allocates_no_rows():
     def size(**more):
         scene = lv.Scene(**more)
         scene.add_plane()
@@ -210,7 +210,7 @@ def test_anchors_lie_where_they_were_given():
     np.testing.assert_allclose(sim.state.a["joint_error"], 0.0, atol=1e-15)
 
 
-def test_what_is_added_to_a_scene_is_in_its_copies_and_not_in_the_simulations_before():
+def test_scene_changed_later_does_not_change_earlier_simulations():
     scene = lv.Scene("stack", n=2)
     sim = lv.Simulation(scene)
     scene.add_sphere(0.3, position=(5.0, 0.0, 3.0))

@@ -32,7 +32,7 @@ def test_a_run_has_the_bits_of_a_scene_that_begins_with_this_velocity(parameters
 
 
 @pytest.mark.parametrize("solver", ["sequential_impulses", "newton"])
-def test_what_the_last_step_published_does_not_change(solver):
+def test_set_velocity_keeps_published_arrays(solver):
     sim = lv.Simulation(boxes(solver=solver), report_residual=True)
     trajectory(sim, 5)
     published = sim.residual(), str(sim.last_solution and sim.last_solution.residual), sim.time
@@ -44,7 +44,7 @@ def test_what_the_last_step_published_does_not_change(solver):
     assert (before.index == after.index).all() and (before.keys == after.keys).all()
 
 
-def test_what_cannot_be_set_is_refused_and_changes_nothing():
+def test_set_velocity_of_a_wrong_value_raises_and_changes_nothing():
     scene = boxes()
     scene.add_sphere(position=(5.0, 0.0, 0.5), name="box 0")  # the name of two bodies
     sim = lv.Simulation(scene)

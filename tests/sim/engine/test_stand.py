@@ -58,7 +58,7 @@ def test_stacks_stand_on_few_sweeps_in_every_order_and_friction(name, seconds, p
     assert drift(name, seconds, **parameters) < MOST
 
 
-def test_what_moves_without_the_defaults_moves_here_too():
+def test_stack_in_whole_steps_and_given_order_leaves_its_place():
     # Whole steps swept in one direction: the measure above does see a stack that leaves its place.
     assert drift("stack", n=10, solver_iterations=8, substeps=1, order="given") > 10 * MOST
 
@@ -79,7 +79,7 @@ def test_substeps_are_no_longer_than_the_longest(dt, substeps):
     assert lv.Scene("stack", solver="newton", dt=0.01, max_substep=0.004).parameters.substeps == 3
 
 
-def test_what_was_left_to_its_default_follows_the_rest():
+def test_scene_defaults_follow_other_parameters():
     scene = lv.Scene("stack", friction=0.3).with_parameters(solver="newton", dt=1 / 30)
     p = scene.parameters
     assert (p.substeps, p.order, p.friction) == (1, "given", 0.3)

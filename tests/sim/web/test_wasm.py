@@ -142,7 +142,7 @@ def module_file(module, newton_module, tmp_path_factory):
     return path
 
 
-def test_node_finds_every_bit_the_same(module_file, recording):
+def test_wasm_module_has_the_bits_of_the_native_engine(module_file, recording):
     done = node(CHECK, module_file, recording)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "all the same: 16 scenes, 4800 steps, 640 solves by newton" in done.stdout

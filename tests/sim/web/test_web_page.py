@@ -218,7 +218,7 @@ def compare_told(name, told):
 
 
 @pytest.mark.parametrize("start", TOURS)
-def test_a_tour_shows_the_native_numbers_and_says_what_it_said(visit, start):
+def test_web_tour_shows_native_numbers(visit, start):
     tour, told = TOURS[start], []
     v = visit("#stack" if start == "#stack&gallery" else "#stack" if start == "#" else start)
     for expected in tour(v):
@@ -311,7 +311,7 @@ def test_a_run_of_its_own_shows_one_step_when_it_pauses(visit):
     assert v.js("lavender.charts.residual.data[0].length") == steps
 
 
-def test_keyboard_does_everything(visit):
+def test_web_page_is_controlled_by_keyboard(visit):
     v = visit()
     press = v.page.keyboard.press
     press("2")
@@ -358,7 +358,7 @@ def colors_in(v, i):
     )
 
 
-def test_phone_without_network(visit):
+def test_web_page_runs_on_a_phone_without_network(visit):
     size = {"viewport": {"width": 360, "height": 640}, "device_scale_factor": 2}
     v = visit("#chain", **size, has_touch=True, is_mobile=True)
     v.context.set_offline(True)
