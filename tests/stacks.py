@@ -56,3 +56,7 @@ def bricks(layers, noise, seed=0):
     target = np.zeros((k, 3))
     target[:, 0] = noise * rng.normal(size=k)
     return lv.Problem.from_rows(rows, target=target.ravel(), mu=0.5)
+
+
+def idle_problem():
+    return lv.Problem.lcp(np.eye(3), [-1.0, -2.0, -1.0], name="flying apart")

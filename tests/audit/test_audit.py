@@ -447,3 +447,13 @@ def test_audit_counts_each_verdict_once(boxes):
     assert found.worst_rows["steps"].sum() == unconverged + wrong
     assert (found.totals["unconverged"], found.totals["wrong"]) == (unconverged + wrong, wrong)
     assert len(found.headline) <= 3
+
+
+@pytest.mark.parametrize(("engine", "package"), [("mjx", "mujoco.mjx"), ("mujoco_warp", "mujoco_warp")])
+def test_audit_with_an_engine_not_installed_names_the_package(boxes, engine, package, monkeypatch):
+    import sys
+
+    for name in (package, "jax", "warp"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(lv.InputError, match="pip install mujoco-"):
+        audit(boxes(), worlds=1, steps=2, engine=engine)

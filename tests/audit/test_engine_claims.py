@@ -90,3 +90,15 @@ def test_step_scene_of_newton_starts_from_stored_states(tmp_path):
     noisy = next(step_scene(scene, "kamino", worlds=3, steps=1, spread=0.1)).state
     assert np.ptp(noisy["body_qd"], axis=0).max() > 0.01
     assert not noisy["body_qd"][0].any()
+
+
+def test_step_scene_of_a_wrong_scene_raises(tmp_path):
+    with pytest.raises(lv.UnknownName, match="kamin"):
+        step_scene("x", "kamin")
+    with pytest.raises(lv.InputError, match="does not exist"):
+        step_scene(tmp_path / "scene.py", "genesis")
+    (tmp_path / "scene.py").write_text("x = 1\n")
+    with pytest.raises(lv.InputError, match="no function build"):
+        step_scene(tmp_path / "scene.py", "kamino")
+    with pytest.raises(lv.InputError, match="a Python file"):
+        step_scene("boxes", "genesis")

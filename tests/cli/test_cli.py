@@ -346,3 +346,14 @@ def test_check_json_is_the_only_output(lavender, path):
     assert code == 0 and len(entries) == 2
     assert [row["solver"] for row in entries[0]["solvers"]] == ["newton", "pgs"]
     assert entries[0]["solvers"][0]["verdict"] == "agrees"
+
+
+@pytest.mark.parametrize("columns", ["0", "19"])
+@pytest.mark.parametrize("words", [("solvers",), ("report", "--list"), ("check", "stack(n=4)", "--solvers", "pgs")])
+def test_command_in_a_narrow_terminal_prints_whole_names(lavender, monkeypatch, words, columns):
+    wide = lavender(*words)[1]
+    monkeypatch.setenv("COLUMNS", columns)
+    code, narrow, _ = lavender(*words)
+    assert code == 0
+    names = re.findall(r"^\w+", wide, re.MULTILINE)
+    assert names and set(names) <= set(re.findall(r"^\w+", narrow, re.MULTILINE))

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from stacks import stack
+from stacks import idle_problem, stack
 from worked import python
 
 import lavender as lv
@@ -237,3 +237,16 @@ def test_report_of_a_model_records_again_if_an_included_file_changed(lavender, t
     assert lavender(*words, "--no-reuse")[0] == cli.EXIT_INTERRUPTED
     monkeypatch.setattr(recording, "record_file", recorded)
     assert (lavender(*words)[0], len(calls)) == (0, 5)
+
+
+def test_solve_command_of_a_problem_at_rest_prints_nothing_to_do(lavender, tmp_path):
+    lv.io.save(idle_problem(), tmp_path / "idle.npz")
+    code, out, _ = lavender("solve", tmp_path / "idle.npz", "--solver", "pgs")
+    assert code == 0 and "nothing to do" in out
+
+
+def test_report_that_measured_nothing_prints_the_reason(lavender, tmp_path):
+    lv.Problem.contact(np.eye(3), [1.0, 2.0, 0.0], mu=[0.5]).save(tmp_path / "friction.npz")
+    code, out, _ = lavender("report", tmp_path / "friction.npz", "--solvers", "direct")
+    assert code == 1
+    assert "nothing was measured: takes laws linear, lcp, not 'coulomb'" in out

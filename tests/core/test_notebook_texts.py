@@ -32,3 +32,25 @@ def test_plot_of_a_solution_shows_worst_rows_and_history(solution):
 def test_completion_of_a_namespace_shows_public_names_only(name):
     module = importlib.import_module(getattr(lv, name).__name__)
     assert dir(module) == sorted(module.__all__)
+
+
+def test_repr_of_results_has_one_line_with_their_numbers(problem, solution, tmp_path):
+    with lv.io.Recorder(tmp_path, every=1) as recorder:
+        recorder.add(problem, solution.impulse)
+        texts = {
+            f"relative {solution.residual.relative:.2e}": repr(solution.residual),
+            f"{len(solution.history.iterations)} records": repr(solution.history),
+            "8 contacts and 2 other blocks, 10 rows": repr(problem.cones + lv.Cones.free(2)),
+            "pgs for <Problem 'toy_stack'": repr(lv.prepare(problem, "pgs")),
+            "1 steps, 1 files": repr(recorder),
+            "2 agree": repr(lv.cross_check(problem, ["direct", "pgs"])),
+        }
+    for part, text in texts.items():
+        assert part in text and "\n" not in text and len(text) < 200
+
+
+def test_repr_html_has_the_numbers_of_a_result(problem, solution):
+    floor = f"{solution.residual.roundoff_floor:.1e}"
+    assert floor in solution._repr_html_() and floor in solution.residual._repr_html_()
+    html = lv.cross_check(problem, ["direct", "pgs"])._repr_html_()
+    assert html.count("<tr>") == 3 and "agrees" in html

@@ -217,3 +217,12 @@ def test_from_kamino_of_the_installed_engine_gives_the_matrix_of_j_m_and_complia
     assert (lv.residual_many(step.batch, step.impulse).velocity_error < 1e-4).all()
     velocity = np.concatenate([step.batch[i].velocity(step.impulse[step.batch.rows_of(i)]) for i in range(2)])
     assert np.abs(velocity - after.ravel()).max() <= VELOCITY_TOLERANCE
+
+
+def test_from_kamino_of_missing_attributes_or_other_objects_raises():
+    solver, _ = load("mixed")
+    del solver._solver_kamino.problem_fd.data.bound_lower
+    with pytest.raises(lv.CapabilityError, match="bound_lower"):
+        lv.io.from_kamino(solver)
+    with pytest.raises(lv.InputError, match="a dict; a newton"):
+        lv.io.from_kamino({})

@@ -103,3 +103,16 @@ def test_contacts_without_memory_are_counted():
     solver.mjw_data.nacon = Array([stored + 5])
     dropped = lv.io.from_newton_mujoco(solver, velocity).claims.residuals["dropped_contacts"]
     assert dropped.tolist() == [5.0, 5.0, 5.0]
+
+
+def test_from_newton_mujoco_of_other_solvers_or_versions_raises():
+    with pytest.raises(lv.InputError, match="SolverMuJoCo"):
+        lv.io.from_newton_mujoco(object(), np.zeros((1, 1)))
+    solver, velocity = stand_in()
+    del solver.mjw_data.qfrc_smooth
+    with pytest.raises(lv.CapabilityError, match="qfrc_smooth"):
+        lv.io.from_newton_mujoco(solver, velocity)
+    solver, velocity = stand_in()
+    solver.mjw_data.efc.J = Array(np.zeros((3, 1, 500), np.float32))
+    with pytest.raises(lv.CapabilityError, match="sparse"):
+        lv.io.from_newton_mujoco(solver, velocity)

@@ -51,3 +51,9 @@ def test_a_prepared_auto_records_only_if_requested():
     assert second.history is None
     assert first.history.iterations.tolist() == third.history.iterations.tolist()
     assert first.impulse.tobytes() == third.impulse.tobytes()
+
+
+def test_plot_of_auto_history_names_the_solver_of_each_stage():
+    history = lv.solve(lv.suite.case("box_stackF(n=10)").problem, history=True).history
+    labels = [text.get_text() for text in history.plot().axes[0].get_legend().get_texts()]
+    assert labels == ["start", "anderson", "newton"]

@@ -6,7 +6,18 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from calls import says
-from random_problems import CONTACTS, GIVEN, arrays_of, nearly_singular, random_contact_problem, random_lcp
+from hypothesis import given
+from hypothesis import strategies as st
+from random_problems import (
+    CONTACTS,
+    GIVEN,
+    arrays_of,
+    nearly_singular,
+    random_contact_problem,
+    random_lcp,
+    seeds,
+    without_solution,
+)
 
 import lavender as lv
 from lavender import registry
@@ -285,3 +296,21 @@ def test_unsolvable_problem_with_growing_impulses_is_not_accepted(name, problem)
         if name == "auto":
             assert solution.status is lv.Status.INFEASIBLE
             assert solution.iterations <= budget.get("max_iter", np.inf)
+
+
+@given(seed=seeds, m=st.integers(1, 6), definite=st.booleans())
+@pytest.mark.parametrize("name", lv.available())
+def test_impulse_of_an_infeasible_problem_is_within_its_bounds(name, seed, m, definite):
+    """An engine that applies it must not pull at a contact; -4.9 N s came back where lower = 0."""
+    rng = np.random.default_rng(seed)
+    a = -np.diag(rng.uniform(0.1, 1.0, m)) if definite else without_solution(seed, m + 1).dense()
+    problem = lv.Problem.lcp(a, rng.uniform(0.1, 1.0, m) if definite else without_solution(seed, m + 1).b)
+    if registry.get(name).refuses(problem):
+        return
+    solution = lv.solve(problem, name)
+    assert not solution.success
+    if solution.status is lv.Status.INFEASIBLE:
+        assert (solution.impulse >= 0.0).all()
+        # Sums over the rows in another order round differently.
+        assert solution.residual.energy <= solution.residual.energy_at_zero * (1.0 + 1e-14)
+        assert solution.claim_check == "confirmed" and solution.certificate is not None

@@ -521,3 +521,14 @@ def test_solve_qp_found_holds_to_the_requested_tolerance():
             assert rough.found == (rough.error <= 1e-6)
             strict = lv.solve_qp(problem, tol=0.0)
             assert strict.found == (strict.error == 0.0) == str(strict).startswith("solved")
+
+
+def test_solve_qp_with_a_contradicted_claim_is_not_found(plug_in):
+    def run(problem, impulse):
+        impulse[:] = 0.5 * lv.solve(problem, "newton", tol=1e-12).impulse
+        return lv.Claim(lv.Status.CONVERGED, 1)
+
+    problem = lv.Problem.from_qp(2.0 * np.eye(2), [-4.0, -2.0], A=[[1.0, 1.0]], b=[1.0], ub=[1e9, 1e9])
+    answer = lv.solve_qp(problem, plug_in(run))
+    assert answer.solution.claim_check == "contradicted" and "CONTRADICTED" in str(answer)
+    assert not answer.found and not str(answer).startswith("solved")

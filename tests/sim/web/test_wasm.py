@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 
 import lavender as lv
-from lavender.base.errors import LavenderError
+from lavender.base.errors import InputError, LavenderError
 from lavender.sim.scene import SCENES
 from lavender.sim.web import compile as wasm
 from lavender.sim.web import pages
-from lavender.sim.web.scenes import PRESETS_PATH, collect_page_data, describe_snapshot
+from lavender.sim.web.scenes import PRESETS_PATH, collect_page_data, describe_snapshot, write_scene
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[2]
@@ -187,3 +187,14 @@ def test_presets_of_the_page_have_the_results_of_the_documentation(tmp_path):
     )
     cold_warm = results["experiment=5"]["numbers"][0]
     assert alternating["steps 21–90"] == f"{cold_warm['b'] / cold_warm['a']:.0f}"
+
+
+def test_wasm_build_without_a_compiler_names_it(tmp_path, monkeypatch):
+    monkeypatch.setenv("LAVENDER_WASM_CC", "no-such-compiler --target=wasm32-wasi")
+    with pytest.raises(LavenderError, match="names 'no-such-compiler', which does not exist"):
+        pages.build_module(tmp_path / "a.wasm")
+
+
+def test_write_scene_with_another_solver_is_refused_with_the_remedy(tmp_path):
+    with pytest.raises(InputError, match="select newton in the page"):
+        write_scene(lv.Scene("stack", solver="newton"), tmp_path / "scene.json")
