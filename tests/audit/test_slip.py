@@ -120,16 +120,6 @@ def test_slip_of_a_gripped_box_depends_on_the_grip_force(grip, cause):
     assert dominant(explanation) == cause
 
 
-@pytest.mark.parametrize("option", ['cone="elliptic"', 'cone="pyramidal"', 'cone="elliptic" impratio="10"'])
-def test_slip_variants_are_solved_to_their_tolerance(option):
-    """Each solution has a relative residual of at most 1e-9, and an engine that converged has the same velocity."""
-    for angle in (0.2, 0.6):
-        explanation = explain_slip_of_states(block(angle, option=option), steps=100).explanations[0]
-        for variant in explanation.variants[1:]:
-            assert not variant.note.startswith("not solved")
-            assert variant.relative <= 1e-9, variant.name
-
-
 def test_advice_lists_only_settings_whose_simulated_slip_is_smaller():
     soft = explain_slip_of_states(block(0.3, option='cone="elliptic"'), steps=600).explanations[0]
     as_it_is, *others = soft.remedies

@@ -17,7 +17,7 @@ from stacks import stack
 from worked import python
 
 import lavender as lv
-from lavender import cli, io, report
+from lavender import cli, report
 from lavender.cli import entry
 from lavender.report.store import select_skips
 
@@ -116,24 +116,6 @@ def test_help_is_quick_and_names_every_command():
         & {"matplotlib", "h5py", "qpsolvers", "pandas", "rich.table", "jinja2", "lavender.report", "lavender.audit"}
         == set()
     )
-
-
-def test_solve_command_exit_code_follows_the_status(lavender, path, tmp_path):
-    assert lavender("solve", path)[0] == 0  # auto
-    assert "auto: CONVERGED" in lavender("solve", path)[1]
-    assert "8 rows" in lavender("solve", "stack(n=8)", "--solver", "direct")[1]
-    assert lavender("solve", path, "--solver", "pgs", "--max-iter", 1)[0] == cli.EXIT_UNMET
-    assert lavender("solve", path, "--solver", "pgs", "--tol", 0, "--max-iter", 1)[0] == 0  # a budget, as asked
-    impossible = lv.Problem.lcp(np.array([[1.0, -1.0], [-1.0, 1.0]]), np.ones(2))
-    io.save(impossible, tmp_path / "impossible.npz")
-    code, out, _ = lavender("solve", tmp_path / "impossible.npz", "--solver", "direct")
-    assert ("INFEASIBLE" in out, code) == (True, cli.EXIT_INFEASIBLE)
-    # An impulse that ran away is accepted nowhere, nor is one that moves where nothing was to do.
-    away = lv.Problem.linear([[1.0, 1.0], [1.0, 1.0]], [1.0, 2.0], guess=[1e17, -1e17])
-    idle = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [-1.0, -1.0], guess=[1e6, 0.0])
-    for wrong, more in ((away, ()), (idle, ("--max-iter", 0))):
-        io.save(wrong, tmp_path / "wrong.npz")
-        assert lavender("solve", tmp_path / "wrong.npz", "--solver", "pgs", *more)[0] == cli.EXIT_UNMET
 
 
 def test_solve_command_with_output_equal_to_the_problem_ends_with_2(lavender, path):

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -43,9 +42,6 @@ def test_progress_lines_have_the_remaining_time(capsys, monkeypatch):
     assert measuring.format_remaining_time(Event(20, 0, "", ""), 10.0) == ""  # the total is not known
 
 
-QUICK = ("--tolerances", "1e-3", "1e-6", "--budgets", "2", "4", "--repeats", "1", "--no-figures")
-
-
 def test_lists_take_commas_or_blanks_and_files_may_follow(lavender, path, tmp_path):
     code, *_ = lavender(
         "report", "--tolerances=1e-2", "--solvers", "pgs,jacobi", "--budgets", "3", "5", path, "--orders", "reverse",
@@ -55,23 +51,6 @@ def test_lists_take_commas_or_blanks_and_files_may_follow(lavender, path, tmp_pa
     runs = report.select_runs(report.read(tmp_path / "out"))
     assert set(runs["solver"]) == {"pgs", "jacobi"} and set(runs["order"]) == {"given", "reverse"}
     assert set(runs.loc[runs["mode"] == "budget", "max_iter"]) == {3, 5}
-
-
-def test_command_on_a_folder_with_an_unreadable_file_names_it_and_reads_the_rest(lavender, path):
-    (path.parent / "[bold]x.npz").write_bytes(b"PK")
-    more = {"check": ("--solvers", "direct"), "report": ("--solvers", "pgs", *QUICK, "--tables")}
-    for command in ("check", "doctor", "explain", "report"):
-        named = (path, path.parent / "[bold]x.npz") if command == "report" else (path.parent / "[bold]x.npz",)
-        assert lavender(command, *named, *more.get(command, ()))[0] == cli.EXIT_BAD_INPUT
-        assert not Path("lavender-report/index.html").exists()
-        code, out, err = lavender(command, path.parent, *more.get(command, ()))
-        assert (command, code) == (command, cli.EXIT_UNMET)
-        assert "[bold]x: " in out + err and "stack8" in out + f"stack8 {command}" * (command == "doctor")
-    campaign = ("report", "--workers", 1, path.parent / "[bold]x.npz", *more["report"], "--out", "c")
-    assert lavender(*campaign)[0] == cli.EXIT_BAD_INPUT
-    code, out, _ = lavender("check", path.parent / "[bold]x.npz", path, "--solvers", "direct")
-    assert code == cli.EXIT_BAD_INPUT and "agrees" in out  # what can be read is checked all the same
-    assert lavender("explain", path.parent, "--tol", -1)[0] == cli.EXIT_BAD_INPUT
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
@@ -152,24 +131,6 @@ def test_ctrl_c_while_workers_start_is_handled_by_the_command_only(tmp_path):
 
 ARM = """<mujoco><option timestep="0.01"/><worldbody><geom type="plane" size="1 1 1"/>
 <body pos="0 0 {height}"><freejoint/><geom type="{kind}" size=".1 .1 .1"/></body></worldbody></mujoco>"""
-
-
-def test_report_of_two_models_of_one_file_name_keeps_both(lavender, tmp_path):
-    pytest.importorskip("mujoco")
-    for name, kind in (("h1", "box"), ("g1", "sphere")):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "scene.xml").write_text(ARM.format(height=0.1, kind=kind))
-    quick = ("--solvers", "auto", "--repeats", 1, "--no-figures")
-    words = ("--steps", 20, "--record-every", 5, *quick, "--out", tmp_path / "o")
-    models = [tmp_path / name / "scene.xml" for name in ("h1", "g1")]
-    assert lavender("report", *models, *words)[0] == 0
-    cases = select_cases(report.read(tmp_path / "o"))
-    rows = dict(zip(cases["sequence"], cases["rows"], strict=True))
-    assert set(rows) == {"h1-scene", "g1-scene"}
-    assert rows["h1-scene"] > rows["g1-scene"]  # a box has more contacts than a sphere
-    folders = {p.name for p in (tmp_path / "o" / "recorded").iterdir()}
-    assert lavender("report", *models, *words)[0] == 0
-    assert {p.name for p in (tmp_path / "o" / "recorded").iterdir()} == folders
 
 
 def test_report_counts_steps_that_were_not_recorded(lavender, tmp_path, monkeypatch):

@@ -498,13 +498,10 @@ def test_records_of_any_content_are_shown_or_rejected(tmp_path, entries, kind):
     tried = {name: np.random.default_rng(i).permutation(len(HOSTILE))[:4] for i, name in enumerate(names)}
     accepted = {n: [v for v in (HOSTILE[i] for i in tried[n]) if read({n: v}) is not None] for n in names}
     assert any(len(accepted[name]) < len(tried[name]) for name in names)
-    for i in range(2):
-        lines = read({n: x[-1 - i % len(x)] for n, x in accepted.items() if x})
-        if lines is not None:
-            try:
-                show_all(lines)
-            except lv.InputError:
-                continue
+    lines = read({name: values[-1] for name, values in accepted.items() if values})
+    if lines is not None:
+        with contextlib.suppress(lv.InputError):
+            show_all(lines)
 
 
 @pytest.mark.parametrize(

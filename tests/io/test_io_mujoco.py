@@ -34,20 +34,6 @@ def test_the_solution_of_newton_is_a_solution_here(cone, condim, jacobian):
     assert found.velocity_at_zero > 1e-3  # m/s: there was something to do
 
 
-def test_friction_slides_and_sticks_in_the_scene():
-    # Otherwise the test above would not see a wrong bound of the disk.
-    model, data = state()
-    problem, own = lv.io.from_mujoco(model, data), adapter.impulse(*state())
-    c = problem.cones
-    ratio = [
-        np.hypot(*own[j + 1 : j + 3]) / (mu * own[j])
-        for j, mu, kind in zip(c.ptr, c.mu, c.kind, strict=False)
-        if kind == lv.CONTACT and own[j] > 0.0
-    ]
-    assert max(ratio) == pytest.approx(1.0, abs=1e-9)  # on the cone, to rounding
-    assert min(ratio) < 0.99
-
-
 def test_solve_of_a_mujoco_step_gives_its_acceleration():
     model, data = state()
     problem = lv.io.from_mujoco(model, data)
@@ -451,20 +437,3 @@ def test_data_without_a_forward_pass_are_rejected_by_name():
     )
     with pytest.raises(lv.InputError, match="mj_forward"):
         adapter.from_mujoco(model, mj.MjData(model))
-
-
-def test_a_changed_qvel_leaves_the_problem_of_the_forward_pass():
-    """`mj_step` changes qvel after the pass, so a change of it cannot be told from a step."""
-    model = mj.MjModel.from_xml_string(
-        "<mujoco><worldbody><geom type='plane' size='1 1 .1'/>"
-        "<body pos='0 0 .09'><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
-    )
-    data = mj.MjData(model)
-    data.qvel[2] = -1.0
-    mj.mj_forward(model, data)
-    before = adapter.from_mujoco(model, data)
-    data.qvel[2] = 5.0
-    after = adapter.from_mujoco(model, data)
-    assert np.array_equal(before.b, after.b) and np.array_equal(
-        before.velocity(before.b * 0), after.velocity(after.b * 0)
-    )

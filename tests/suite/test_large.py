@@ -103,18 +103,3 @@ def test_judge_of_unconverged_large_case_equals_second_residual(name):
     assert solution.residual.relative > TOL
     # Sums of 20,000 rounded squares
     assert compute_residual(problem, solution.impulse) == pytest.approx(solution.residual.relative, rel=1e-10)
-
-
-def test_second_residual_of_two_walls_is_the_largest_of_its_islands():
-    # Two walls that share no body: one solved, the other not.
-    one = suite.case("wall(n=4)").problem.rows
-    count, bodies = len(one.normal), len(one.inv_mass)
-    names = ("inv_mass", "inv_inertia", "v_free", "normal", "tangent", "arm_a", "arm_b")
-    arrays = {name: np.concatenate([getattr(one, name)] * 2) for name in names}
-    shift = np.where(one.contact_body >= 0, bodies, 0)
-    body = np.concatenate([one.contact_body, one.contact_body + shift])
-    problem = lv.Problem.from_rows(lv.Rows(**arrays, contact_body=body), mu=0.6, tangents=2)
-    solved = lv.solve(problem, tol=1e-9).impulse.copy()
-    solved[3 * count :] = 0.0
-    assert compute_residual(problem, solved) == pytest.approx(1.0, rel=1e-12)
-    assert lv.residual(problem, solved).relative == pytest.approx(1.0, rel=1e-12)

@@ -1,7 +1,5 @@
 """`newton`, `admm` and `auto` on built-in problems, whose structure these properties need."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 from random_problems import as_matrix, good
@@ -53,15 +51,6 @@ def test_auto_stages_sum_to_the_work_and_end_at_the_residual(problem):
     begun = lv.residual(problem, problem.start()).relative
     assert solution.stages[0].before == pytest.approx(begun, rel=1e-12)
     assert lv.solve(problem, "newton").stages == ()
-
-
-def test_a_looser_tolerance_costs_no_more():
-    problem = suite.granular(n=6, friction="coulomb", seed=8).problem
-    found = [lv.solve(problem, tol=tol) for tol in (1e-3, 1e-4)]
-    assert all(solution.success for solution in found), found
-    # A check ends sweeps where too many are predicted to be left at that tolerance: others then begin later.
-    for loose, tight in pairwise(solution.work["sweeps"] for solution in found):
-        assert loose <= 2.0 * tight, found
 
 
 BOXES = {

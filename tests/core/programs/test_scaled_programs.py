@@ -12,9 +12,11 @@ BY_NAME = {base.name: base for base in BASES}
 
 
 @pytest.mark.parametrize("name", installed("osqp", "clarabel", "piqp", "proxqp", "daqp", "quadprog", "highs", "scs"))
-def test_backend_solves_scaled_copies_and_makes_no_false_claim(name):
-    counts, failures = run_backend(name, BASES)
-    assert counts["solves"] == 13 * 14
+@pytest.mark.parametrize("half", [0, pytest.param(1, marks=pytest.mark.nightly)])
+def test_backend_solves_scaled_copies_and_makes_no_false_claim(name, half):
+    bases = BASES[half::2]
+    counts, failures = run_backend(name, bases)
+    assert counts["solves"] == 13 * sum(base.x is not None for base in bases) >= 13 * 6
     assert counts["right and found"] >= 0.99 * counts["solves"], failures
     for column in ("wrong and found", "false INFEASIBLE or UNBOUNDED", "found differs from CONVERGED", "contradicted"):
         assert counts[column] == 0, failures

@@ -86,7 +86,10 @@ ARGUMENTS = {
     "solve": ("problem.npz", "--solver", "projected_gradients"),
     "check": ("problem.npz", "--solvers", "projected_gradients", "pgs", "--reference", "newton"),
     "explain": ("problem.npz",),
-    "report": ("problem.npz", "--solvers", "projected_gradients", "pgs", "--tolerances", "1e-3", "--budgets", "4"),
+    "report": (
+        *("problem.npz", "--solvers", "projected_gradients", "pgs", "--tolerances", "1e-3", "--budgets", "4"),
+        *("--repeats", "1", "--no-figures"),
+    ),
     "solvers": (),
     "contract": ("projected_gradients",),
     "doctor": (),
