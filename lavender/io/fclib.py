@@ -12,10 +12,10 @@ FCLIB's vector `w` is an offset of the velocity, not our slack. Format: Acary, B
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -43,69 +43,31 @@ SPARSE_ENTRY_BYTES = 16  # [bytes] One entry of a sparse matrix: value and index
 BOUNDS_ROW_BYTES = 64  # [bytes] Memory that `Cones` and b need per row.
 
 
-@dataclass(frozen=True, eq=False)
-class Contents:
-    """The unchanged contents of an FCLIB file: nothing is condensed, rescaled or symmetrised.
-
-    The local form has W and q (and V, R, s), the global form M, H, f and w (and G, b). Matrices are CSR arrays of
-    SciPy, (rows, columns).
+class Contents(NamedTuple):
+    """Contents of an FCLIB file: nothing is condensed, rescaled or symmetrised.
 
     Parameters
     ----------
+    group : str
+        Name of the problem's group in the file.
     spacedim : int
         Rows of each contact, normal first: 2, 3, or 5 with rolling friction.
-    mu : (c,), -
-    mu_r : (c,) m, optional
-        With rolling friction.
-    W : (m, m), optional
-    q : (m,), optional
-    V : (m, p), optional
-    R : (p, p), optional
-    s : (p,), optional
-    M : (n, n), optional
-    H : (n, m), optional
-    f : (n,), optional
-    w : (m,), optional
-    G : (n, p), optional
-    b : (p,), optional
-    solution : mapping
-        The stored solution: "r" and "u" (m,), "v" (n,), "l" (p,).
-    guesses : tuple of mapping
-        Guesses with the entries of `solution`.
-    info : mapping of str to str
-        "title", "description", "math_info".
+    parts : dict
+        Matrices (CSR) and vectors by the names of `PARTS` of the form; absent ones are not in it.
+    solution, guesses : dict, sequence of dict
+        The stored solution and guesses: "r" and "u" (m,), "v" (n,), "l" (p,).
+    info : dict of str to str
     compare : str
         Not part of FCLIB: "r,u", "u" or "error" if the file has a group `reference`.
     """
 
+    group: str
     spacedim: int
-    mu: FloatArray
-    mu_r: FloatArray | None = None
-    W: sp.csr_array | None = None
-    q: FloatArray | None = None
-    V: sp.csr_array | None = None
-    R: sp.csr_array | None = None
-    s: FloatArray | None = None
-    M: sp.csr_array | None = None
-    H: sp.csr_array | None = None
-    f: FloatArray | None = None
-    w: FloatArray | None = None
-    G: sp.csr_array | None = None
-    b: FloatArray | None = None
-    solution: Mapping[str, FloatArray] = field(default_factory=dict)
-    guesses: tuple[Mapping[str, FloatArray], ...] = ()
-    info: Mapping[str, str] = field(default_factory=dict)
+    parts: Mapping[str, Any]
+    solution: Mapping[str, FloatArray] = MappingProxyType({})
+    guesses: Sequence[Mapping[str, FloatArray]] = ()
+    info: Mapping[str, str] = MappingProxyType({})
     compare: str = ""
-
-    @property
-    def form(self) -> str:
-        """Form of the problem: "local" or "global"."""
-        return "local" if self.W is not None else "global"
-
-    @property
-    def group_name(self) -> str:
-        """Name of the problem's group in the file."""
-        return (LOCAL if self.form == "local" else GLOBAL) + ("" if self.mu_r is None else ROLLING)
 
     def build_problem(self, name: str = "", *, max_bytes: int = MAX_BYTES) -> Problem:
         """Return the problem.
@@ -117,66 +79,53 @@ class Contents:
         InputError
             M is singular, array sizes do not agree, or A may need more than `max_bytes`.
         """
-        general = self._build_generalised_form(max_bytes) if self.form == "global" else None
-        if general is not None:
-            a, b = None, general.bias(-self._offset())
-        elif self.form == "local":
-            a, b = self._build_local_form()
+        x, a, general = self.parts, None, None
+        if self.group.startswith(LOCAL):
+            a, b = x["W"], -x["q"]
+            if "s" in x:
+                a, b = sp.csr_array(sp.block_array([[a, x["V"]], [x["V"].T, x["R"]]])), np.append(b, -x["s"])
         else:
-            a, b = self._build_condensed_form(Budget(max_bytes))
-        c, d = len(self.mu), self.spacedim
-        tangents = d - 1 if self.mu_r is None else 2
-        cones = Cones.contacts(self.mu, tangents, rolling=self.mu_r) + Cones.free(len(b) - c * d)
-        guess = self._impulse(self.guesses[0]) if self.guesses else None
-        name = self.info.get("title", "") or name
-        return Problem(b, cones, a, guess=guess, name=name, generalized=general)
+            # The rows of J = [H G]^T are the contact rows and the equations.
+            jt = sp.csr_array(sp.hstack([x["H"], x["G"]])) if "G" in x else x["H"]
+            offset = np.append(x["w"], x["b"]) if "b" in x else x["w"]
+            general = _build_generalised_form(x["M"], jt, x["f"], max_bytes)
+            if general is not None:
+                b = general.bias(-offset)
+            elif x["M"].shape[0] == 0:
+                a, b = sp.csr_array((len(offset), len(offset))), -offset
+            else:
+                a, free_velocity = form_dense_a(x["M"], jt, x["f"], Budget(max_bytes))
+                b = -(offset + free_velocity)
+        mu, mu_r, d = x["mu"], x.get("mu_r"), self.spacedim
+        cones = Cones.contacts(mu, d - 1 if mu_r is None else 2, rolling=mu_r) + Cones.free(
+            len(b) - len(mu) * d
+        )
+        guess = _join_impulse(self.guesses[0]) if self.guesses else None
+        return Problem(b, cones, a, guess=guess, name=self.info.get("title", "") or name, generalized=general)
 
-    def _build_local_form(self) -> tuple[sp.csr_array, FloatArray]:
-        """Return A (m + p, m + p) and b (m + p,) of the local form."""
-        assert self.q is not None
-        if self.V is None or self.s is None:
-            return self.W, -self.q
-        a = sp.block_array([[self.W, self.V], [self.V.T, self.R]])
-        return sp.csr_array(a), -np.concatenate([self.q, self.s])
 
-    def _columns(self) -> sp.csr_array:
-        assert self.H is not None
-        return self.H if self.G is None else sp.csr_array(sp.hstack([self.H, self.G]))
+def _join_impulse(point: Mapping[str, FloatArray]) -> FloatArray:
+    return np.concatenate([point["r"], point["l"]]) if "l" in point else point["r"]
 
-    def _offset(self) -> FloatArray:
-        assert self.w is not None
-        return self.w if self.b is None else np.concatenate([self.w, self.b])
 
-    def _build_generalised_form(self, max_bytes: int) -> Generalized | None:
-        """Return the generalised form, or None if M is not a mass matrix of bodies.
+def _build_generalised_form(
+    mass: sp.csr_array, jt: sp.csr_array, f: FloatArray, max_bytes: int
+) -> Generalized | None:
+    """Return the generalised form, or None if M (n, n) is not a mass matrix of bodies.
 
-        M does not count as a mass matrix if it is asymmetric or not positive definite, or if a connected component of
-        it is too large to factor.
-        """
-        assert self.M is not None
-        n = self.M.shape[0]
-        if n == 0:
-            return None
-        size = np.bincount(sp.csgraph.connected_components(self.M, directed=False)[1]).astype(float)
-        if 4 * SPARSE_ENTRY_BYTES * float(size @ size) > max_bytes:
-            return None
-        try:
-            general = Generalized(self._columns().T.tocsr(), self.M, np.zeros(n))
-            return general.with_jacobian(v_free=general.solve(self.f))
-        except InputError:
-            return None
-
-    def _build_condensed_form(self, budget: Budget) -> tuple[sp.csr_array, FloatArray]:
-        """Return A and b of the global form with J = [H G]^T, which contains the contact rows and the equations."""
-        assert self.M is not None
-        jt, offset = self._columns(), self._offset()
-        if self.M.shape[0] == 0:
-            return sp.csr_array((len(offset), len(offset))), -offset
-        a, free_velocity = form_dense_a(self.M, jt, np.asarray(self.f), budget)
-        return a, -(offset + free_velocity)
-
-    def _impulse(self, point: Mapping[str, FloatArray]) -> FloatArray:
-        return np.concatenate([point["r"], point["l"]]) if "l" in point else point["r"]
+    M does not count as a mass matrix if it is asymmetric or not positive definite, or if a connected component of it is
+    too large to factor.
+    """
+    if mass.shape[0] == 0:
+        return None
+    size = np.bincount(sp.csgraph.connected_components(mass, directed=False)[1]).astype(float)
+    if 4 * SPARSE_ENTRY_BYTES * float(size @ size) > max_bytes:
+        return None
+    try:
+        general = Generalized(jt.T.tocsr(), mass, np.zeros(mass.shape[0]))
+        return general.with_jacobian(v_free=general.solve(f))
+    except InputError:
+        return None
 
 
 def form_dense_a(
@@ -237,37 +186,31 @@ def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
         The file is not an FCLIB file, is truncated or inconsistent, or holds a problem with and one without rolling
         friction; or h5py is not installed.
     """
-    file = read_contents(path, max_bytes=max_bytes)
+    h5py = import_h5py()
+    try:
+        with h5py.File(path, "r") as stream:
+            file = _read_file(HDF5Reader(h5py, stream, max_bytes))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    except (OSError, KeyError, RuntimeError, ValueError, TypeError, OverflowError, MemoryError) as error:
+        raise InputError(
+            f"{path} cannot be read as HDF5 ({error}); the file is damaged or not an HDF5 file: write it again"
+        ) from None
     try:
         problem = file.build_problem(Path(path).stem, max_bytes=max_bytes)
-        guesses = tuple(problem.impulse_array(file._impulse(g), "guess") for g in file.guesses)
+        guesses = tuple(problem.impulse_array(_join_impulse(g), "guess") for g in file.guesses)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     point = file.solution
     return Stored(
         problem,
-        file.group_name,
-        impulse=file._impulse(point) if "r" in point else None,
+        file.group,
+        impulse=_join_impulse(point) if "r" in point else None,
         slack=np.append(point["u"], np.zeros(len(point.get("l", ())))) if "u" in point else None,
         compare=file.compare,
         guesses=guesses,
         info=file.info,
     )
-
-
-def read_contents(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Contents:
-    """Read the matrices and vectors of an FCLIB file without changing them; raises the errors of `read`."""
-    h5py = import_h5py()
-    try:
-        with h5py.File(path, "r") as file:
-            return _read_file(HDF5Reader(h5py, file, max_bytes))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    except (OSError, KeyError, RuntimeError, ValueError, TypeError, OverflowError, MemoryError) as error:
-        raise InputError(
-            f"{path} cannot be read as HDF5 ({error}); the file is damaged or not an HDF5 file: write it "
-            "again"
-        ) from None
 
 
 def _read_file(r: HDF5Reader) -> Contents:
@@ -322,12 +265,13 @@ def _read_file(r: HDF5Reader) -> Contents:
     values: dict[str, Any] = {name: r.read_matrix(f"{group}/{name}", shapes[name]) for name in matrices}
     values |= {name: r.read_vector(f"{vectors}/{name}", shapes[name][0]) for name in names}
     return Contents(
+        group,
         spacedim,
+        values,
         solution=_read_point(r, "solution", n, m, p) if r.has_path("solution") else {},
         guesses=tuple(_read_point(r, guess, n, m, p) for guess in guesses),
         info={name: r.read_text(f"{group}/info/{name}") for name in ("title", "description", "math_info")},
         compare=r.read_text("reference/compare"),
-        **values,
     )
 
 

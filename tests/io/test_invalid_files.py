@@ -225,9 +225,8 @@ def test_max_bytes_limits_the_size_of_the_arrays(tmp_path):
 
 def contents(mass, h):
     m = h.shape[1]
-    return fclib.Contents(
-        3, np.full(m // 3, 0.5), M=sp.csr_array(mass), H=sp.csr_array(h), f=np.ones(len(h)), w=np.zeros(m)
-    )
+    parts = {"M": sp.csr_array(mass), "H": sp.csr_array(h), "f": np.ones(len(h)), "w": np.zeros(m)}
+    return fclib.Contents("fclib_global", 3, parts | {"mu": np.full(m // 3, 0.5)})
 
 
 def test_factors_of_a_mass_matrix_beyond_the_memory_limit_are_rejected():
