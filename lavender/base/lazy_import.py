@@ -63,10 +63,9 @@ class _LazyModule:
 
 if TYPE_CHECKING:
     from scipy import sparse as sparse
-    from scipy import spatial as spatial
     from scipy.linalg import lapack as lapack
 else:
-    sparse, spatial, lapack = map(_LazyModule, ("scipy.sparse", "scipy.spatial", "scipy.linalg.lapack"))
+    sparse, lapack = map(_LazyModule, ("scipy.sparse", "scipy.linalg.lapack"))
 
 
 def import_module_lazily(name: str) -> Any:
