@@ -1,6 +1,7 @@
 """Properties of every public array, registered solver, backend and form, which no single example checks."""
 
 import json
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -269,6 +270,14 @@ def test_cross_check_objective_is_that_of_numpy():
         assert row.objective == pytest.approx(expected, abs=1e-10 + 1e-3 * abs(expected))
 
 
+def test_cross_check_reference_with_a_large_floor_is_not_an_optimum():
+    near = 1.0 - 2.0**-40
+    problem = lv.Problem.linear([[1.0, near, 0.3], [near, 1.0, 0.3], [0.3, 0.3, 1.0]], [0.3, -0.7, 0.1])
+    check = lv.cross_check(problem, ["direct"], reference="direct")
+    assert 10.0 * check.rows[0].roundoff_floor > check.rows[0].relative > 1e-5
+    assert check.reference != "direct" and "direct: relative" in check.reference_note
+
+
 def test_residual_of_ellipses_has_row_errors_in_the_metric_of_the_disk():
     a, b = spd(6, seed=1)
     problem = lv.Problem.contact(a, b, mu=[(0.9, 0.3), (0.2, 0.8)])
@@ -416,6 +425,37 @@ def test_pinned_body_that_turns_is_moving_in_every_order(order):
     for name in ("sequential_impulses", "pgs"):
         found = lv.solve(problem, name, order=order, tol=1e-11, max_iter=10_000).impulse
         np.testing.assert_allclose(found, expected, atol=1e-8)
+
+
+def test_row_builder_bulk_contacts_have_the_names_and_rows_of_single_calls():
+    names, points = ["z", "a", "m"], np.array([[0.0, 0.1, 0.0], [0.2, 0.0, 0.0], [-0.2, 0.3, 0.0]])
+    problems = []
+    for bulk in (True, False):
+        builder = lv.RowBuilder(np.ones(3), [np.eye(3)] * 3, np.zeros((3, 6)), 0.01, position=np.zeros((3, 3)))
+        if bulk:
+            builder.contacts(
+                [[-1, 2], [-1, 0], [-1, 1]], points, [[0.0, 0.0, 1.0]] * 3, mu=[0.1, 0.2, 0.3], names=names
+            )
+        else:
+            for body, point, mu, name in zip([2, 0, 1], points, [0.1, 0.2, 0.3], names, strict=True):
+                builder.contact(-1, body, point, [0.0, 0.0, 1.0], mu=mu, name=name)
+        problems.append(builder.problem())
+    one, other = problems
+    assert [one.block_name(i) for i in range(3)] == names == [other.block_name(i) for i in range(3)]
+    np.testing.assert_array_equal(one.dense(), other.dense())
+    np.testing.assert_array_equal(one.cones.mu, other.cones.mu)
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".hdf5"])
+def test_write_that_fails_leaves_no_file_behind(suffix, tmp_path, monkeypatch):
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    problem = lv.Problem.contact(*spd(3), mu=0.5)
+    monkeypatch.setattr(os, "replace", fail)
+    with pytest.raises(lv.InputError, match="No space left"):
+        lv.io.save(problem, tmp_path / f"a{suffix}")
+    assert list(tmp_path.iterdir()) == []
 
 
 # -- two options together ----------------------------------------------------------------------------------------------
