@@ -16,6 +16,7 @@ from lavender.external.forms import get_program
 from lavender.external.running import classify_status
 from lavender.judge.certificates import check_certificate
 from lavender.problem.cones import project_impulse
+from lavender.solvers import direct
 from lavender.solvers.islands import find_islands, get_rows_of_blocks, restrict_to_blocks
 from lavender.solvers.polyhedral import convert_to_bounded_rows
 from lavender.solving import log, loop
@@ -254,6 +255,16 @@ def test_direct_of_an_ill_conditioned_asymmetric_matrix_ends_at_its_floor(seed):
     a = u @ np.diag(np.logspace(0, -9, 30)) @ v
     solution = lv.solve(lv.Problem.linear(a, rng.normal(size=30)), "direct", tol=1e-15)
     assert solution.residual.at_floor, str(solution)
+
+
+def test_direct_with_a_factor_that_fails_at_last_returns_its_best_iterate(monkeypatch):
+    """The steps of the first solves are a little too short and are refined, the third is wrong by far."""
+    a = np.diag([1.0, -2.0, 3.0]) + 0.1
+    steps = iter([0.99, 0.99, -1e3, 1.0])
+    monkeypatch.setattr(direct.RankRevealingFactor, "solve", lambda self, w: next(steps) * np.linalg.solve(a, w))
+    solution = lv.solve(lv.Problem.linear(a, np.ones(3)), "direct", tol=1e-9)
+    assert solution.residual.relative == pytest.approx(1e-4, rel=1e-3) and next(steps) == 1.0
+    assert not solution.success and solution.status is lv.Status.STALLED
 
 
 # -- numbers that are only shown ---------------------------------------------------------------------------------------
