@@ -284,3 +284,14 @@ def test_impulses_turn_with_the_contact_frame():
     np.testing.assert_allclose(world, [0, 0, 9.81 / 120.0], atol=1e-12)
     guess = problem.guess.reshape(-1, 3)
     np.testing.assert_allclose(guess, contacts["impulses"], atol=1e-12)
+
+
+@pytest.mark.parametrize(("speed", "expected"), [(5.0, 4), (15.0, 4), (100.0, 0)])
+def test_contact_that_moves_by_at_most_five_margins_in_a_step_keeps_its_warm_start(speed, expected):
+    """Bars that lie crosswise: where their edges cross, contacts move on both by a fraction of `speed` / 240 m."""
+    scene = lv.Scene(substeps=1)
+    scene.add_box((2.0, 0.4, 0.2), position=(0.0, 0.0, 0.1), static=True)
+    scene.add_box((0.4, 2.0, 0.2), position=(0.0, 0.0, 0.3), angular_velocity=(0.0, 0.0, speed))
+    simulation, at = lv.Simulation(scene), lv.SOLVER_FIELDS.index("cache_matches")
+    matches = [simulation.step()[0]["solver"][at] for _ in range(3)]
+    assert matches == [0, expected, expected]
