@@ -50,7 +50,7 @@ def count_work(name: str, factor: float) -> dict[str, float]:
     from lavender.judge.residuals import get_zero_impulse_reference
     from lavender.problem import Problem
     from lavender.solving.auto import DecisionTree
-    from lavender.solving.compiled_call import get_call_time_fraction
+    from lavender.solving.compiled_call import choose_call_deadline
 
     def pile(n: int) -> Problem:
         return lv.suite.granular(n=n, friction="coulomb").problem
@@ -89,7 +89,9 @@ def count_work(name: str, factor: float) -> dict[str, float]:
         for limit in (1e-3, 1e-2, 1e-1):  # [s]
             limited.deadline = Deadline(limit)
             fits = limited.deadline.get_remaining_seconds() is not None and not limited.is_late
-            counted[f"{label}, {limit:g} s"] = 1.0 + fits + 2.0 * get_call_time_fraction(problem, limit)
+            call = choose_call_deadline(problem, Deadline(limit))
+            share = ((call and call.get_remaining_seconds()) or 0.0) / limit
+            counted[f"{label}, {limit:g} s"] = 1.0 + fits + round(2.0 * share, 1)
         counted[f"{label}, stages"] = math.fsum(
             min(stage.iterations, 1e9) * (1 + i) for i, stage in enumerate(lv.explain(problem).stages)
         )

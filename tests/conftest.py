@@ -120,38 +120,53 @@ def plug_in(register):
 
 
 @pytest.fixture
-def clock(monkeypatch):
+def clock():
     """The clock of time limits, which goes by what a test counts."""
-    import sys
-
     from calls import Clock
 
-    from lavender.base import deadline
+    from lavender_ext.core.deadline import play_clock
 
     made = Clock()
-    monkeypatch.setattr(deadline, "perf_counter", made)
-    for name, module in list(sys.modules.items()):
-        if name.startswith(("lavender.solving.", "lavender.solvers.")) and hasattr(module, "perf_counter"):
-            monkeypatch.setattr(module, "perf_counter", made)
-    return made
+    play_clock(made)
+    yield made
+    play_clock(None)
 
 
 @pytest.fixture
 def interrupted_newton(monkeypatch) -> list[float]:
     """Ctrl-C after newton's fifth turn of one factorisation; the list fills with the best residual after each."""
     from lavender.solvers import newton
-    from lavender.solvers.newton_systems.systems import MatrixSystem, VelocitySystem
+    from lavender.solvers.newton_systems import general
 
     looks: list[float] = []
 
-    def interrupt(self, seconds):
-        looks.append(self.solve.relative)
-        if len(looks) == 5:
-            raise KeyboardInterrupt
+    class Interrupted:
+        """A compiled method whose sixth step is preceded by Ctrl-C."""
+
+        def __init__(self, method):
+            self.method = method
+
+        def __getattr__(self, name):
+            return getattr(self.method, name)
+
+        def step(self, work, impulse):
+            if len(looks) == 5 and not self.is_stopped:
+                self.is_stopped = True
+                raise KeyboardInterrupt
+            end = self.method.step(work, impulse)
+            if not self.is_stopped:
+                looks.append(self.method.relative)
+            return end
+
+        is_stopped = False
+
+    run = general.run_newton_method
+
+    def interrupt(problem, method, *more):
+        return run(problem, Interrupted(method), *more)
 
     monkeypatch.setattr(newton, "INTERRUPT_CHECK_INTERVAL", 0.0)
-    for system in (MatrixSystem, VelocitySystem):
-        monkeypatch.setattr(system, "record_factor_time", interrupt)
+    monkeypatch.setattr(general, "run_newton_method", interrupt)
     return looks
 
 

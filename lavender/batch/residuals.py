@@ -104,7 +104,6 @@ class WorldResults:
     @property
     def worst_row(self) -> np.ndarray:
         """Row of the largest velocity error (n,), as an index in its world; -1 for a world without rows."""
-        self._judge_late_worlds()
         return self._export(self._worlds.worst[:-1])
 
     def _export(self, array: np.ndarray) -> Any:
@@ -112,11 +111,7 @@ class WorldResults:
         return mark_read_only(array) if self._convert is None else self._convert(array)
 
     def _get_column(self, which: str) -> FloatArray:
-        self._judge_late_worlds()
         return mark_read_only(self._worlds.numbers[NUMBER[which], :-1])
-
-    def _judge_late_worlds(self) -> None:
-        """Judge worlds that were not judged during the call; a derived class overrides this if it has such worlds."""
 
     def _get_rows(self, i: int) -> slice:
         return slice(int(self._first[i]), int(self._first[i] + self._sizes[i]))

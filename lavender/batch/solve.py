@@ -21,13 +21,11 @@ from lavender.judge.residuals import judge_impulse, residual
 from lavender.judge.solution import CONTRADICTED, Solution, Status, raise_if_interrupted
 from lavender.problem import Problem
 from lavender.problem.derived import cached_property
-from lavender.solvers.costs import RATES, estimate_judge_setup_cost, estimate_pass_cost
 from lavender.solvers.registry import SolverSpec, get
-from lavender.solving.compiled_call import COST_PER_SECOND, NO_STAGE_MESSAGE, compute_postponed_fields
-from lavender.solving.finish import create_unjudged, keep_unjudged_start
+from lavender.solving.compiled_call import compute_postponed_fields
 from lavender.solving.limits import check_time_limit
 from lavender.solving.loop import MIN_TIME_LIMIT
-from lavender.solving.prepared import Prepared, check_accepted, check_arguments
+from lavender.solving.prepared import Prepared, check_arguments
 from lavender.solving.solve import solve
 from lavender.solving.velocity import MAX_VELOCITY_TOLERANCE, accept_velocity, check_velocity_tolerance
 from lavender_ext.batch.many import CODE, NUMBER, Worker
@@ -46,7 +44,6 @@ if TYPE_CHECKING:
         callback: Callback | None
 
 
-# Worlds that are not started before the deadline are called late. Their start is their answer.
 STATUS_OF_INDEX = np.array(list(Status), object)
 INDEX_OF_STATUS = {status: i for i, status in enumerate(Status)}
 
@@ -93,7 +90,6 @@ class Solutions(WorldResults, Sequence[Solution]):
         self.tol, self._spec, self._starts, self._cold = tol, spec, starts, cold
         self._options, self._errors = options, errors
         self._solutions: dict[int, Solution] = {}
-        self._late_worlds: list[int] = []  # Late worlds with a start that is not judged yet.
         self._time_per_world = 0.0  # [s] Mean time of the worlds so far.
         # Keep a copy of the starts of a batch, because the loop overwrites them.
         self._given_starts = None if cold or type(problems) is not Batch else starts.copy()
@@ -118,7 +114,6 @@ class Solutions(WorldResults, Sequence[Solution]):
     @cached_property
     def _velocities(self) -> FloatArray:
         if type(self.problems) is Batch:
-            self._judge_late_worlds()
             return mark_read_only(self._velocity.reshape(self.problems.velocity_shape))  # type: ignore[union-attr]
         velocities = [np.zeros(0)]
         for i, p in enumerate(self.problems):
@@ -172,31 +167,6 @@ class Solutions(WorldResults, Sequence[Solution]):
             return None if self._given_starts is None else self._given_starts[self._get_rows(i)]
         return self._starts[i]
 
-    def store_late_world(self, i: int, unjudged: Solution | None = None) -> None:
-        """Store a late world with its start, or an unjudged solution. It is judged when its numbers are read."""
-        if unjudged is None:
-            self._worlds.code[i] = CODE["late"]
-            start = self.get_start(i)
-            if start is None:
-                start = self.problems.start(i) if type(self.problems) is Batch else self.problems[i].start()
-        else:
-            self._solutions[i], start = unjudged, unjudged.impulse
-        self._impulse[self._get_rows(i)] = start
-        self._late_worlds.append(i)
-
-    def _judge_late_worlds(self) -> None:
-        """Judge the starts of late worlds."""
-        # Another thread may judge the same worlds at the same time; it stores equal numbers.
-        for i in self._late_worlds:
-            try:
-                self.store_solution(i, self._get_result(i))
-            except LavenderError as error:
-                if self._errors == "raise":
-                    raise
-                self.faults[i], self._worlds.numbers[:, i] = error, np.nan
-                self.clear_invalid()
-        self._late_worlds = []
-
     def store_solution(self, i: int, solution: Solution) -> None:
         """Store the solution of a world that a single call solved."""
         if self.velocity_tol is not None:
@@ -210,21 +180,6 @@ class Solutions(WorldResults, Sequence[Solution]):
             v = problem.velocity(solution.impulse).ravel()
             first = self.problems.at[i]["velocity"]  # type: ignore[attr-defined]
             self._velocity[first : first + len(v)] = v
-
-    def _estimate_late_judging_cost(self) -> float:
-        """Estimate the cost [ns] of the results if no world is started before the deadline."""
-        if type(self.problems) is Batch:
-            rows, columns = (self.problems.at[name].astype(float) for name in ("rows", "velocities"))
-            # Number of entries in a row of J, or of A for a matrix.
-            entries = np.where(columns > 0.0, columns, rows)
-            products = float(np.sum(rows * (2.0 * entries + 4.0)))
-            return float(RATES["judged late world"] * len(rows) + RATES["judge entry"] * products)
-        return sum(
-            RATES["judged late world"] + estimate_judge_setup_cost(p) + estimate_pass_cost(p)
-            if data and p.generalized
-            else RATES["late world"]
-            for p, data in zip(self.problems, self._data, strict=True)
-        )
 
     def clear_invalid(self) -> None:
         """Set the numbers of worlds with the status INVALID_PROBLEM to NaN and their counts to 0."""
@@ -244,21 +199,10 @@ class Solutions(WorldResults, Sequence[Solution]):
 
     def _get_result(self, i: int) -> Solution:
         if i not in self._solutions:
-            make = self._make_late_solution if i in self._late_worlds else self._make_solution
-            self._solutions[i] = make(i)
+            self._solutions[i] = self._make_solution(i)
         if self.velocity_tol is not None and self._solutions[i].velocity_tol is None:
             self._solutions[i] = accept_velocity(self._solutions[i], self.velocity_tol)
         return self._solutions[i]
-
-    def _make_late_solution(self, i: int) -> Solution:
-        """Build the solution of a late world."""
-        try:
-            problem = self.problems[i]
-        except LavenderError as error:
-            raise self._make_fault(i, error) from None
-        start = self._impulse[self._get_rows(i)]
-        message = f"{NO_STAGE_MESSAGE}, unjudged"
-        return create_unjudged(problem, self._spec, self._options, start, self.tol, message, keeps_start=True)
 
     def _make_solution(self, i: int) -> Solution:
         """Build the solution of a world that the compiled loop processed."""
@@ -330,8 +274,7 @@ def solve_many(
         guarantees it in the world with the largest velocity error of the zero impulse.
     time_limit : float, optional, s
         Limit of the wall-clock time of the whole call. Worlds are solved in order, each with all of the remaining
-        time. Worlds that are not started in time keep their start and have the status TIME_LIMIT. In a batch, their
-        data may not be checked before their numbers are read.
+        time. Worlds that are not started in time keep their start, which is judged, and have the status TIME_LIMIT.
     errors : {"raise", "status"}
         For worlds with invalid data or an invalid start (NaN, an M that is not definite, a negative mu): raise the
         error of the first one, or give them the status INVALID_PROBLEM and store the errors in `Solutions.faults`.
@@ -367,8 +310,6 @@ def solve_many(
     named = cast("dict[str, Any]", options)
     solutions = Solutions(worlds, starts, starts is None, tol, spec, named, errors, like)
     solutions._invalid_starts, solutions.velocity_tol = invalid_starts, velocity_tol
-    if deadline.is_set:
-        deadline.reserve_seconds(1e-9 * solutions._estimate_late_judging_cost())
     more: dict[str, Any] = {"tol": tol, "max_iter": max_iter, **named}
     # The compiled loop is used under the conditions under which `solve` makes a single compiled call.
     uses_loop = (
@@ -378,38 +319,19 @@ def solve_many(
     limits = (small.limits, small.rules) if small is not None else (None, None)
 
     def process_until_deferred(hand: Worker) -> int:
-        if not deadline.is_set:
-            return int(hand.solve_worlds(tol, *limits))
-        if deadline.has_passed(0.0):
-            return int(hand.judge_worlds(tol, False, True))
-        seconds = deadline.get_remaining_seconds(MIN_TIME_LIMIT) or MIN_TIME_LIMIT
-        return int(hand.solve_worlds(tol, *limits, COST_PER_SECOND * seconds))
+        return int(hand.solve_worlds(tol, *limits, deadline))
 
     def solve_single(i: int) -> None:
-        is_batch, code = type(worlds) is Batch, solutions._worlds.code[i]
-        if deadline.is_set and not is_batch:
-            deadline.reserve_seconds(-1e-9 * RATES["late world"])
-        if deadline.has_passed():
-            # Of a batch, build the problem of the first late world only, so that a solver that does not accept the
-            # batch's problems raises an error.
-            if not (is_batch and solutions._late_worlds and code != CODE["bad"]):
-                check_accepted(worlds[i], spec, deadline)
-            solutions.store_late_world(i)
-            return
         problem, start = worlds[i], solutions.get_start(i)
-        has_failed = code == CODE["tried"]
-        if has_failed:
+        if solutions._worlds.code[i] == CODE["tried"]:
             own = Deadline(deadline.get_remaining_seconds(MIN_TIME_LIMIT)) if deadline.is_set else None
             counts = solutions._get_counts(problem, i)
             arguments = check_arguments(spec, start, tol, max_iter, own, failed_call=counts)
-            solution = Prepared(problem, spec, named, False, own)._solve(arguments, problem)
+            solution = Prepared(problem, spec, named, False)._solve(arguments, problem)
         else:
             left = deadline.get_remaining_seconds(MIN_TIME_LIMIT)
-            # Even the choice between start and zero impulse would take time from later worlds.
-            solution = keep_unjudged_start(solve(problem, solver, impulse=start, time_limit=left, **more))
-        is_judged = solution.status is not Status.TIME_LIMIT or "residual" in vars(solution)
-        store = solutions.store_solution if is_judged else solutions.store_late_world
-        store(i, solution if "callback" in options else raise_if_interrupted(solution))
+            solution = solve(problem, solver, impulse=start, time_limit=left, **more)
+        solutions.store_solution(i, solution if "callback" in options else raise_if_interrupted(solution))
 
     begin = perf_counter()
     solutions._process_worlds(process_until_deferred, solve_single, threads, errors)

@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, check_float, mark_read_only
+from lavender.base.arrays import FloatArray, mark_read_only
 from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError
 from lavender.judge.residuals import get_zero_impulse_reference, residual
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
-from lavender.solvers.registry import Cost, Solver
+from lavender.solvers.registry import Solver
 from lavender_ext.judge.measure import all_finite
 
 
@@ -51,18 +51,6 @@ class ForeignSolver(Solver):
 
     def _call_optional(self, method: str, *arguments: Any) -> Any:
         return self._call_method(method, *arguments) if self._has_method(method) else None
-
-    def cost(self, problem: Problem) -> Cost:
-        """Return the wrapped solver's own estimate of its costs [ns]; without one, the cost of `prepare` is 0."""
-        estimate = self._call_optional("cost", problem)
-        if estimate is None:
-            return Cost()
-        if not isinstance(estimate, Cost):
-            raise InputError(
-                f"cost of solver {self.name!r} returned a {type(estimate).__name__}; a "
-                "lavender.registry.Cost is needed"
-            )
-        return Cost(check_float(f"cost of the set-up of solver {self.name!r}", estimate.setup, low=0.0))
 
     def start_workers(self, state: State, time_limit: float) -> None:
         """Start worker processes before the clock of a time limit starts."""

@@ -23,8 +23,7 @@ from lavender.judge.residuals import compute_stopping_residual
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.problem.program import QuadraticProgram
-from lavender.solvers.costs import RATES
-from lavender.solvers.registry import Cost, Solver
+from lavender.solvers.registry import Solver
 
 MAX_DENSE_SIZE = 2**30  # [bytes] A backend for dense matrices rejects a problem with a larger matrix.
 # [-] A claim "solved" is false if the error exceeds this multiple of tol, and at least MIN_FALSE_CLAIM: the tests of
@@ -152,10 +151,6 @@ class QPSolver(Solver):
             )
         check_bool("isolate", self.isolate)
 
-    def cost(self, problem: Problem) -> Cost:
-        """Estimate the cost to form the program."""
-        return Cost(lambda: RATES["program"] + RATES["program entry"] * problem.max_entries)
-
     @np.errstate(all="ignore")  # The judge finds overflows.
     def prepare(self, problem: Problem) -> Form:
         """Write the problem as a program for the backend; raise CapabilityError if the backend cannot solve it."""
@@ -190,7 +185,7 @@ class QPSolver(Solver):
         if deadline.is_set:
             begin = perf_counter()
             self.start_workers(None, 0.0)
-            deadline.reserve_seconds(begin - perf_counter())
+            deadline.extend(perf_counter() - begin)
         judge = ProgramJudge(program, tol)
         return judge, self._call(program, judge, max_iter, tol, deadline, start)
 

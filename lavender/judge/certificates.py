@@ -40,8 +40,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.base.deadline import NEVER, Deadline, TooLate
-from lavender.base.rates import RATES
+from lavender.base.deadline import NEVER, Deadline
 from lavender.judge.residuals import divide_by_reference, get_zero_impulse_reference
 from lavender.problem import Problem
 from lavender_ext.factor.linear import LinearSystem
@@ -90,15 +89,12 @@ class Proof:
         Reason why y does not prove that no impulse meets the tolerance; empty if it proves this.
     conflict : str
         If y is a proof: names of the conflicting blocks.
-    skipped_time : float, s
-        Estimated time of polishing y, if the deadline did not allow it; else 0.
     """
 
     y: FloatArray
     impulse_bound: float
     reason: str = ""
     conflict: str = ""
-    skipped_time: float = 0.0
 
     @property
     def message(self) -> str:
@@ -131,9 +127,8 @@ def prove_infeasibility(
     """Check whether y (m,) proves that no impulse meets `tol`, and bound the impulse of every solution.
 
     If y fails only by a solver's rounding, y is polished: replaced by the nearest direction on the same rows with
-    A^T y = 0, if that can be computed before the deadline. The last result is stored with the problem, because a
-    solver and the check of its claim make the same call. A result without polishing is not reused if there
-    is time for it now.
+    A^T y = 0, unless the deadline has passed. The last result is stored with the problem, because a solver and the
+    check of its claim make the same call; after the deadline, only a proof is stored.
 
     Parameters
     ----------
@@ -143,7 +138,7 @@ def prove_infeasibility(
     tol : float, -
         Relative residual that no impulse may meet.
     deadline : Deadline, optional
-        Limit of the time for polishing.
+        Time after which y is not polished.
 
     Returns
     -------
@@ -154,11 +149,11 @@ def prove_infeasibility(
     key = tol, y.shape, y.tobytes()
     stored: tuple[Any, Proof] | None = problem.derived.cache.get(__name__)
     if stored is not None and stored[0] == key:
-        skipped_time = stored[1].skipped_time
-        if not skipped_time or deadline is None or deadline.has_passed(skipped_time):
-            return stored[1]
-    proof = _prove_with_polished_directions(problem, y, tol, deadline or NEVER)
-    problem.derived.cache[__name__] = key, proof
+        return stored[1]
+    deadline = deadline or NEVER
+    proof = _prove_with_polished_directions(problem, y, tol, deadline)
+    if not (proof.reason and deadline.has_passed()):
+        problem.derived.cache[__name__] = key, proof
     return proof
 
 
@@ -171,14 +166,11 @@ def _prove_with_polished_directions(problem: Problem, y: FloatArray, tol: float,
             return Proof(y, 0.0, reason)
         proof = _check_infeasibility_direction(inner, problem.on_disk(y), tol)
         if 0.0 < proof.impulse_bound < math.inf and (proof.reason or np.count_nonzero(y) <= MAX_EXACT_ROWS):
-            try:
-                for polished in _polish_direction(inner, proof.y, deadline):
-                    candidate = _check_infeasibility_direction(inner, polished, tol)
-                    if not candidate.reason and (proof.reason or candidate.impulse_bound == math.inf):
-                        proof = candidate
-                        break
-            except TooLate as late:
-                proof = replace(proof, skipped_time=late.args[0])
+            for polished in _polish_direction(inner, proof.y, deadline):
+                candidate = _check_infeasibility_direction(inner, polished, tol)
+                if not candidate.reason and (proof.reason or candidate.impulse_bound == math.inf):
+                    proof = candidate
+                    break
         if inner is not problem:
             proof = replace(proof, y=problem.cones.stretch * proof.y)
         return proof if proof.reason else replace(proof, conflict=_describe_conflict(problem, proof.y))
@@ -381,8 +373,8 @@ def _compute_energy_norm(data: Any, w: FloatArray) -> Any:
 def _polish_direction(problem: Problem, y: FloatArray, deadline: Deadline) -> Iterator[FloatArray]:
     """Yield the direction nearest to y in the metric of D, on the rows of y, for which small entries of A^T y are 0.
 
-    The direction is yielded twice: rounded to 26 bits, and unrounded. With 26 bits, sums of halves and thirds of
-    simple numbers can be exactly 0.
+    Nothing is yielded after the deadline. The direction is yielded twice: rounded to 26 bits, and unrounded. With 26
+    bits, sums of halves and thirds of simple numbers can be exactly 0.
     """
     length = np.sqrt(problem.d)
     is_used = np.abs(y) * length > MAX_ROUNDING_SLACK * float(length @ np.abs(y))
@@ -404,10 +396,8 @@ def _polish_direction(problem: Problem, y: FloatArray, deadline: Deadline) -> It
         columns = np.flatnonzero((z != 0.0) & (np.abs(z) <= max_z))
         if np.any(np.abs(z[required]) > max_z) or len(columns) * len(rows) > MAX_POLISHED_ROWS**2:
             return
-        work = len(columns) * len(rows) * min(len(columns), len(rows))
-        seconds = 1e-9 * RATES["least squares"] * work
-        if deadline.has_passed(seconds):
-            raise TooLate(seconds)
+        if deadline.has_passed():
+            return
         system = (a[:, columns].toarray() / length[rows][:, None] * weight[columns]).T
         y[rows] -= solve_least_squares(system, z[columns]) / length[rows]
     spacing = 2.0**-25 * _round_down_to_power_of_two(y)

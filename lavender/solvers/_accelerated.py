@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 from lavender.base.errors import InputError, check_name
@@ -80,15 +79,9 @@ class Accelerated(Sweeping):
         state: AcceleratedState = super().prepare(problem)
         return state
 
-    def _sweeps_over_matrix(self, problem: Problem) -> bool:
-        if _max_entries(problem) is not None:
-            return True
-        return problem.rows is None and not is_sweep_over_jacobian_cheaper(problem)
-
     def cost(self, problem: Problem) -> Cost:
-        """Estimate the costs. One iteration is one sweep over the data of `choose_sweep_operator`."""
-        setup = partial(self._estimate_setup_cost, problem)
-        return Cost(setup, lambda: estimate_sweep_cost(problem, estimate_sweep_work(problem)))
+        """Estimate the cost of an iteration: one sweep over the data of `choose_sweep_operator`."""
+        return Cost(iteration=lambda: estimate_sweep_cost(problem, estimate_sweep_work(problem)))
 
     def _build_state(
         self, problem: Problem, order: Order, before: AcceleratedState | None

@@ -16,13 +16,12 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.base.deadline import Deadline, Stopwatch, TooLate
+from lavender.base.deadline import NEVER, Deadline
 from lavender.base.errors import BREAKDOWN, InputError
 from lavender.base.lazy_import import import_numerical_modules
 from lavender.base.lazy_import import sparse as sp
@@ -30,16 +29,6 @@ from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.solvers._accelerated import MAX_MEMORY
-from lavender.solvers.costs import (
-    RATES,
-    SCIPY_MODULES,
-    Cost,
-    count_dense_work,
-    estimate_analysis_cost,
-    estimate_formation_cost,
-    estimate_import_cost,
-    estimate_symmetry_cost,
-)
 from lavender.solvers.factors import (
     MAX_DENSE_RANK_ROWS,
     PIVOT_TOLERANCE,
@@ -61,13 +50,15 @@ _ADMM_PATIENCE = 5000
 # of spheres then take 0.7 times as long at 1,300 (7,143 rows), 0.5 at 3,400 and 0.3 at 8,000. Towers and walls have 7
 # to 140, and take 2 to 7 times as long.
 MAX_FACTOR_WORK_PER_ENTRY = 2000.0
-_LATE_MESSAGE = "the next factorisation, or the analysis before it, would end after the time limit"
-# Estimated number of entries of J and J^T together per row between two bodies, and of J^T J per velocity.
-_JACOBIAN_ROW_ENTRIES, _NORMAL_ENTRIES_PER_VELOCITY = 24, 18
+_LATE_MESSAGE = "the time limit ended the factorisation, or came before it"
 
 
 class _Breakdown(Exception):
     """A factorisation broke down; the message contains the reason."""
+
+
+class _OutOfTime(Exception):
+    """The deadline has passed."""
 
 
 class AdmmState:
@@ -76,21 +67,18 @@ class AdmmState:
     def __init__(self, problem: Problem, memory: int, relaxation: float) -> None:
         get_zero_impulse_reference(problem)
         self.problem, self.memory, self.relaxation = problem, memory, relaxation
-        self.deadline = Deadline()  # A step does not start if it is expected to end after this deadline.
+        self.deadline = NEVER
         # Number of all factorisations, and number of those that earlier claims have reported.
         self.factorisations = self.reported = 0
         self.watch: Any = None
         self.factor: Any = None
-        self.next_cost = 0.0  # Cost [ns] of the next step.
         self.next_steps = [self._scale_problem, self._analyse_matrix, self.update_factor]
 
     def scale_and_factor(self) -> None:
-        """Scale, analyse and factor; raise TooLate before a step that is expected to end after the deadline."""
-        if self.watch is None and self.deadline.is_set:
-            self.next_cost = _estimate_scaling_cost(self.problem)
+        """Scale, analyse and factor, unless that was done; raise `_OutOfTime` after the deadline."""
         while self.next_steps:
-            if not self.deadline.fits(self.next_cost):
-                raise TooLate
+            if self.deadline.has_passed():
+                raise _OutOfTime
             self.next_steps[0]()
             del self.next_steps[0]
 
@@ -109,7 +97,6 @@ class AdmmState:
             self.is_over_bodies, self.theta, self.jacobian = True, form.theta, form.jacobian
             self.body_work, self.body_solve = _count_body_work(problem), None
             self.has_factor = self.body_work <= MAX_FACTOR_WORK_PER_ENTRY * form.jacobian.nnz
-            self.next_cost = 0.0  # There is no matrix to analyse before the first factor.
             return
         a = problem.csr
         scale = 1.0 / np.sqrt(problem.d)
@@ -120,22 +107,11 @@ class AdmmState:
         if problem.m:
             self.matrix = make_pattern_symmetric(self.matrix)
             self.system = LinearSystem(get_sorted_csr_arrays(self.matrix)[:2], USE_WIDE_LANES)
-        self.next_cost = estimate_analysis_cost(problem) if problem.m else 0.0
 
     def _analyse_matrix(self) -> None:
-        """Analyse the matrix, if there is one, and estimate the cost of the first factor; later costs are measured."""
-        problem, rates = self.problem, RATES
-        self.next_cost = 0.0
-        if self.is_over_bodies:
-            assert problem.rows is not None
-            n = 6 * problem.rows.n_bodies
-            setup = rates["scipy calls"] + rates["layout entry"] * _JACOBIAN_ROW_ENTRIES * problem.m
-            setup += rates["analysis entry"] * _NORMAL_ENTRIES_PER_VELOCITY * n
-            work = rates["panels work"] * self.body_work if self.has_factor else 0.0
-            self.next_cost = float(setup + rates["form row"] * n + work)
-        elif problem.m:
-            work = (1.0 + self.lu) * _analyse_panels(self.system).cost
-            self.next_cost = float(rates["form row"] * problem.m + rates["panels work"] * work)
+        """Analyse the matrix, if there is one."""
+        if not self.is_over_bodies and self.problem.m:
+            _analyse_panels(self.system)
 
     @property
     def inner_iterations(self) -> int:
@@ -160,18 +136,16 @@ class AdmmState:
         return np.nan if self.watch is None else float(self.watch.sweeps_per_decade)
 
     def update_factor(self) -> None:
-        """Set the factor, or conjugate gradients, for the present rho, and measure the time to compute it."""
-        if not self.deadline.fits(self.next_cost):
-            raise TooLate
-        watch = Stopwatch()
+        """Set the factor, or conjugate gradients, for the present rho; raise `_OutOfTime` after the deadline."""
+        if self.deadline.has_passed():
+            raise _OutOfTime
         self.factor = self._factor_with_fallbacks()
         self.factorisations += self.has_factor
-        self.next_cost = 1e9 * watch.elapsed_seconds
 
     def _factor_with_fallbacks(self) -> tuple[Any, ...]:
         """Factor the matrix. If that breaks down, try L U, then L U of the full matrix, if these are allowed.
 
-        Raise `_Breakdown` if no factorisation succeeds, and TooLate if the last one would end after the deadline.
+        Raise `_Breakdown` if no factorisation succeeds.
         """
         m, rho = self.problem.m, self.splitting.rho
         if m == 0:
@@ -195,8 +169,6 @@ class AdmmState:
             done = _factor_shifted_matrix(system, matrix, shift, True)
         if not done and self.lu and not self.full and m <= MAX_DENSE_RANK_ROWS:
             # L U by supernodes failed, since it cannot exchange rows across supernodes: try L U of a full matrix.
-            if not self.deadline.fits(RATES["full LU work"] * count_dense_work(m)):
-                raise TooLate
             self.full = True
             self.matrix = matrix = matrix.toarray()
             self.system = system = LinearSystem(m, USE_WIDE_LANES)
@@ -216,20 +188,6 @@ def _count_body_work(problem: Problem) -> float:
     rows = problem.rows
     assert rows is not None
     return float(Layout(rows.moving_block_bodies, rows.n_bodies, 6).work)
-
-
-def _estimate_scaling_cost(problem: Problem) -> float:
-    """Estimate the cost of scaling [ns]."""
-    rates = RATES
-    if _is_over_bodies(problem):  # Computes J, the square root of M^-1, and their product.
-        return float(3.0 * rates["scipy calls"] + rates["layout entry"] * _JACOBIAN_ROW_ENTRIES * problem.m)
-    entries, form = problem.max_entries, estimate_formation_cost(problem)
-    # A is a product of dense matrices.
-    if problem.generalized is not None and entries == float(problem.m) ** 2:
-        product = rates["full layout entry"] * entries
-        product += rates["dense factor"] * float(problem.metric.products_of_matrix)
-        form = min(form, rates["set-up"] + product)
-    return float(rates["set-up"] + form + estimate_symmetry_cost(problem) + rates["scaling entry"] * entries)
 
 
 def _analyse_panels(system: LinearSystem) -> LinearSystem:
@@ -273,11 +231,7 @@ class ADMM(Solver):
         if not 0.0 < self.relaxation < 2.0:
             raise InputError(f"relaxation is {self.relaxation!r}; a number between 0 and 2 is needed")
 
-    needs_scipy = True
-
-    def cost(self, problem: Problem) -> Cost:
-        """Estimate the cost of `prepare`; all other set-up runs in `set_deadline` if it fits, else in `run`."""
-        return Cost(partial(estimate_import_cost, *SCIPY_MODULES))
+    lazy_modules = ("scipy.sparse.linalg",)
 
     def prepare(self, problem: Problem) -> AdmmState:
         """Build the state. The problem is scaled, analysed and factored later, with the clock at hand."""
@@ -288,9 +242,9 @@ class ADMM(Solver):
 
     @np.errstate(all="ignore")  # Results that overflow are judged.
     def set_deadline(self, state: AdmmState, deadline: Deadline) -> None:
-        """Start no step that is expected to end after `deadline`. Do the set-up now if it ends before."""
+        """Set the deadline, and do the set-up now, so that the time of an iteration is measured without it."""
         state.deadline = deadline
-        with suppress(TooLate, _Breakdown, *BREAKDOWN):  # `run` repeats the set-up and reports the error.
+        with suppress(_OutOfTime, _Breakdown, *BREAKDOWN):  # `run` repeats the set-up and reports the error.
             state.scale_and_factor()
 
     @np.errstate(all="ignore")  # Results that overflow are judged.
@@ -307,7 +261,7 @@ class ADMM(Solver):
             state.scale_and_factor()
         except _Breakdown as failure:
             return Claim(Status.NUMERICAL_ERROR, 0, {}, str(failure))
-        except TooLate:
+        except _OutOfTime:
             return Claim(Status.TIME_LIMIT, 0, {}, _LATE_MESSAGE)
         splitting, inner = state.splitting, state.inner_iterations
         if state.watch.total == 0:
@@ -325,7 +279,7 @@ class ADMM(Solver):
             result = make_claim(*state.watch.run_python(iterate, impulse, max_iter, tol))
         except _Breakdown as failure:
             result, message = Claim(Status.NUMERICAL_ERROR, state.watch.total), str(failure)
-        except TooLate:
+        except _OutOfTime:
             result, message = Claim(Status.TIME_LIMIT, state.watch.total - total), _LATE_MESSAGE
         work = {
             "solves": result.iterations,

@@ -1,6 +1,6 @@
 """Estimate costs [ns]: operations, counted from the data, times the rates of `lavender.base.rates`. No clock is read.
 
-`Solver.cost(problem)` returns a `Cost`; `auto`, deadlines and `explain` read it. There are two kinds of costs.
+`Solver.cost(problem)` returns a `Cost`, which `auto` and `explain` read. There are two kinds of costs.
 
 Costs of iterations, which `auto` compares. Their rates are fitted means:
 
@@ -14,15 +14,13 @@ the number of factorisations: 1 for linear problems, `DECISIONS.pivot_factorisat
 of bodies, otherwise `DECISIONS.factorisations`. Newton's method over generalised velocities has its own estimate,
 without a start and with two rates of rows (`lavender_ext/small/limits.pxd`).
 
-Costs of set-ups and of the judge, which cannot be interrupted. They are estimated only under a time limit; their rates
-are 1.5 times the fitted means. `python -m benchmarks rates` measures the rates and writes the file. The rates from
-"band work" on in the file were measured once: they only select a factorisation, or are used only under a time limit. A
-problem has the same cost on all machines with the same file.
+Costs of set-ups, which are not interrupted. `auto` estimates them under a time limit; their rates are 1.5 times the
+fitted means. `python -m benchmarks rates` measures the rates and writes the file. The rates from "band work" on in the
+file were measured once: they select a factorisation. A problem has the same cost on all machines with the same file.
 """
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf, nan
@@ -32,15 +30,12 @@ from lavender.problem import Problem
 from lavender.solvers.decisions import DECISIONS
 from lavender_ext.factor.sparse import bandwidth
 
-SCIPY_MODULES = ("scipy.sparse", "scipy.linalg.lapack")  # Modules that factorisations need.
 # The analysis of A costs 1 + bandwidth / ANALYSIS_BANDWIDTH times its rate per entry.
 ANALYSIS_BANDWIDTH = 1500.0
-PRODUCTS_PER_BODY_ROW = 32  # Number of multiply-adds of one pass of the judge per row between two bodies.
 # A factor by panels costs 1 + rows / PANELS_GROWTH_ROWS times its rate per entry.
 PANELS_GROWTH_ROWS = 8000.0
 # [ns, ns per entry of a full A] If a time limit exceeds LOOSE_LIMIT + LOOSE_LIMIT_PER_ENTRY m^2, it is about a hundred
-# times the cost of set-up and judge. No costs are then estimated before the solve, because an estimate takes longer
-# than a small problem.
+# times the cost of the set-ups, and `auto` does not estimate these.
 LOOSE_LIMIT, LOOSE_LIMIT_PER_ENTRY = 1e7, 1e3
 
 
@@ -52,7 +47,7 @@ class Cost:
     Parameters
     ----------
     setup : float, ns
-        Cost of `prepare`. Since it cannot be interrupted, it starts only if this cost fits into a time limit.
+        Cost of `prepare`, of a solver that `auto` starts under a time limit only if this cost fits.
     iteration : float, ns
         One iteration; NaN if it is not known.
     total : float, ns
@@ -151,7 +146,7 @@ def estimate_sparse_work(entries: float, m: int) -> float:
 
 
 def get_loose_limit(problem: Problem) -> float:
-    """Return the time limit [ns] above which no costs are estimated: about a hundred times set-up and judge."""
+    """Return the time limit [ns] above which `auto` estimates no set-ups: about a hundred times their cost."""
     return LOOSE_LIMIT + LOOSE_LIMIT_PER_ENTRY * float(len(problem.b)) ** 2
 
 
@@ -174,33 +169,6 @@ def estimate_formation_cost(problem: Problem, known: bool | None = None) -> floa
     return float(RATES["set-up"] + RATES["form row"] * problem.m + entries)
 
 
-def estimate_disk_cost(problem: Problem) -> float:
-    """Estimate the cost to build `problem.disk` [ns]; 0 if it is known, or if the problem has no ellipses.
-
-    The estimate counts the couplings of bodies; the caller has checked that there is time for this.
-    """
-    if not problem.cones.has_ellipse or "_disk" in problem.__dict__:
-        return 0.0
-    if problem.generalized is not None:
-        entries = float(len(problem.generalized.operator.jac[1]))
-        return float(RATES["disk"] + RATES["disk row"] * problem.m + RATES["disk entry"] * entries)
-    entries = float(problem.max_entries if problem.matrix is None else problem.matrix.size)
-    setup = RATES["matrix disk"] + RATES["matrix disk row"] * problem.m + RATES["matrix disk entry"] * entries
-    return float(setup + estimate_formation_cost(problem) + estimate_import_cost("scipy.sparse"))
-
-
-def estimate_refusal_cost(problem: Problem) -> float:
-    """Estimate the cost of `SolverSpec.refusal` [ns]; adapters of other packages read the complete A in it."""
-    if problem.matrix is None or "_matrix_asymmetry" in problem.__dict__:
-        return 0.0
-    return float(estimate_judge_setup_cost(problem) + RATES["judge entry"] * float(problem.matrix.size))
-
-
-def estimate_import_cost(*modules: str) -> float:
-    """Estimate the cost to import the modules of SciPy that are not imported yet [ns]."""
-    return float(RATES["import"] * sum(module not in sys.modules for module in modules))
-
-
 def estimate_symmetry_cost(problem: Problem) -> float:
     """Estimate the cost to check whether A is symmetric [ns]; 0 if it is known."""
     is_known = problem.matrix is None or "_matrix_asymmetry" in problem.__dict__
@@ -210,13 +178,12 @@ def estimate_symmetry_cost(problem: Problem) -> float:
 def estimate_matrix_setup_cost(problem: Problem) -> float:
     """Estimate the cost to form A, check its symmetry, and copy it into a solver's layout [ns]."""
     entries = problem.max_entries
-    imports = estimate_import_cost(*SCIPY_MODULES) if problem.m > DECISIONS.small_rows else 0.0
     if entries == float(problem.m) ** 2:
         layout = RATES["full layout entry"] * entries
     else:
         layout = RATES["scipy calls"] + RATES["layout entry"] * entries
     form = estimate_formation_cost(problem)
-    return float(RATES["set-up"] + form + estimate_symmetry_cost(problem) + layout + imports)
+    return float(RATES["set-up"] + form + estimate_symmetry_cost(problem) + layout)
 
 
 def estimate_analysis_cost(problem: Problem) -> float:
@@ -229,12 +196,6 @@ def estimate_analysis_cost(problem: Problem) -> float:
     return float(
         RATES["analysis entry"] * entries * (problem.n_blocks / m) * (1.0 + band / ANALYSIS_BANDWIDTH)
     )
-
-
-def estimate_row_sums_cost(problem: Problem) -> float:
-    """Estimate the cost to form A and to sum its rows with SciPy [ns]."""
-    sums = RATES["set-up"] + RATES["row sum entry"] * problem.max_entries
-    return float(estimate_formation_cost(problem) + sums + estimate_import_cost("scipy.sparse"))
 
 
 def estimate_first_factor_cost(m: int, entries: float = inf) -> float:
@@ -267,53 +228,3 @@ def estimate_panel_factor_cost(nnz: int, m: int) -> float:
 def estimate_elimination_cost(problem: Problem, kind: str) -> float:
     """Estimate the cost to prepare an elimination of bodies or of generalised velocities [ns], by its rate."""
     return float(RATES["set-up"] + RATES[kind] * problem.metric.work)
-
-
-def estimate_first_sweep_cost(problem: Problem) -> float:
-    """Estimate the cost to prepare sweeps over the given form, with the first sweep [ns]."""
-    return estimate_elimination_cost(problem, "sweep set-up")
-
-
-def estimate_order_cost(problem: Problem, order: object) -> float:
-    """Estimate the cost to compute an order of blocks [ns]; 0 for the given order."""
-    is_given = isinstance(order, str) and order == "given"
-    return 0.0 if is_given else estimate_elimination_cost(problem, "order")
-
-
-# -- the judge -----------------------------------------------------------------------------------
-
-
-def estimate_judge_setup_cost(problem: Problem) -> float:
-    """Estimate the cost to compute the arrays that the judge reads [ns]: A by rows, J L^-1, or the arrays of bodies."""
-    return 0.0 if _is_set_up(problem) else _estimate_pass(problem)[1]
-
-
-def estimate_pass_cost(problem: Problem) -> float:
-    """Estimate the cost of one pass of the judge [ns], from the size of its data."""
-    work = float(problem.metric.work) if _is_set_up(problem) else _estimate_pass(problem)[0]
-    return float(RATES["judge product"] * work)
-
-
-def estimate_result_cost(problem: Problem) -> float:
-    """Estimate the cost of one pass of the judge and of building its result [ns]."""
-    return float(RATES["result"] + estimate_pass_cost(problem))
-
-
-def _is_set_up(problem: Problem) -> bool:
-    """Return whether the data that the judge reads are set up."""
-    view = problem.derived.view
-    return "metric" in problem.__dict__ or (view is not None and view.ready)
-
-
-def _estimate_pass(problem: Problem) -> tuple[float, float]:
-    """Return an upper bound of the multiply-adds of a pass of the judge, and the cost to compute its arrays [ns]."""
-    general = problem.generalized
-    if general is not None:
-        # A row of J L^-1 has at most as many entries as the row of J, times the mean length of the rows of L.
-        reached = (len(general.operator.mass[1]) + general.operator.fill) / max(general.nv, 1)
-        entries = min(len(general.operator.jac[1]) * reached, float(general.m) * general.nv)
-        return 2.0 * entries, (RATES["judge entry"] + RATES["judge whitening"] * reached) * entries
-    if problem.rows is not None:
-        work = PRODUCTS_PER_BODY_ROW * float(problem.m)
-        return work, RATES["judge product"] * work
-    return float(problem.matrix.size), RATES["judge entry"] * float(problem.matrix.size)

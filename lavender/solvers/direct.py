@@ -87,7 +87,7 @@ class Direct(Solver):
 
         return Lemke()
 
-    needs_scipy = True
+    lazy_modules = ("scipy.sparse.linalg",)
 
     def cost(self, problem: Problem) -> Cost:
         """Estimate the cost of `prepare` and of exchanges."""
@@ -185,7 +185,6 @@ class _Run:
         self.state, self.problem, self.impulse = state, state.problem, impulse
         self.max_iter, self.tol, self.deadline = max_iter, tol, deadline
         self.best_pass: measure.Judged | None = None
-        self.late = False  # Whether a round was not started because it would have ended after the deadline.
         self.iterations = 0
         self.work: dict[str, int] = {}
         self.reported: dict[str, int] = {}  # Work that earlier runs of this state have reported.
@@ -238,7 +237,7 @@ class _Run:
     @property
     def out_of_time(self) -> bool:
         pivot = self.state.pivot
-        return self.late or (pivot is not None and pivot.rows.late) or self.deadline.has_passed()
+        return (pivot is not None and pivot.rows.late) or self.deadline.has_passed()
 
     @property
     def pivot_work(self) -> dict[str, int]:
@@ -317,16 +316,13 @@ class _Run:
         """Run rounds of the kernel, continuing where the last run of this state stopped."""
         rows, before = pivot.rows, pivot.rows.n_rounds
         pivot.set_deadline(self.deadline)
-        late = False
         if self.state.is_running:
             self.reported = rows.work
         else:
-            late = pivot.is_too_late_to_sweep(self.deadline)
-            rows.set_start(self.impulse, self.sufficient_residual, 0 if late else pivot.sweeps)
+            rows.set_start(self.impulse, self.sufficient_residual, pivot.sweeps)
             self.state.is_running = True
         while True:
-            max_rounds = 0 if late else min(ROUNDS_PER_CHECK, self.max_iter - self.iterations)
-            code, self.late = pivot.run_rounds(self.deadline, max_rounds)
+            code = rows.advance(min(ROUNDS_PER_CHECK, self.max_iter - self.iterations))
             self.iterations = rows.n_rounds - before
             if code == SMALL_PIVOT and rows.passes == 0:
                 self.add_singularity_note(pivot, self.patient or pivot.symmetric)

@@ -18,6 +18,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray
+from lavender.base.deadline import NEVER, Deadline
 from lavender.base.lazy_import import import_numerical_modules, lapack
 from lavender.base.lazy_import import sparse as sp
 from lavender.base.lu import factor_sparse_lu
@@ -103,10 +104,12 @@ def compute_half_bandwidth_in_order(problem: Problem, order: IntArray) -> int:
 class Factor(Protocol):
     """Interface of a factorisation of A_FF + shift D_FF for changing free sets F."""
 
-    def factor(self, place: IntArray, n_free: int, shift: float) -> int:
-        """Factor A + shift D of the rows with place >= 0, in their order.
+    deadline: Deadline  # Time after which `factor` returns -1.
 
-        There must be at least one such row. Return the number of pivots that do not exceed PIVOT_TOLERANCE d.
+    def factor(self, place: IntArray, n_free: int, shift: float) -> int:
+        """Factor A + shift D of the rows with place >= 0, in their order; n_free may be 0.
+
+        Return the number of pivots that do not exceed PIVOT_TOLERANCE d, or -1 after the deadline.
         """
         ...
 
@@ -118,15 +121,19 @@ class Factor(Protocol):
 class DenseFactor:
     """Dense Cholesky factor, A = L L^T."""
 
+    deadline = NEVER
+
     def __init__(self, problem: Problem) -> None:
         self.a = problem.dense()
         self.d = problem.csr_data.d
 
     def factor(self, place: IntArray, n_free: int, shift: float) -> int:
+        if n_free == 0:
+            return 0
         free = np.flatnonzero(place >= 0)
         a = self.a.copy() if n_free == len(place) else self.a[np.ix_(free, free)]
         self.system = LinearSystem(n_free, USE_WIDE_LANES)
-        return self.system.factor(a, self.d[free], shift, PIVOT_TOLERANCE)
+        return self.system.factor(a, self.d[free], shift, PIVOT_TOLERANCE, deadline=self.deadline)
 
     def solve(self, rhs: FloatArray) -> FloatArray:
         return self.system.solve(rhs)
@@ -135,6 +142,8 @@ class DenseFactor:
 class SparseFactor:
     """Cholesky factor by supernodes, in an order of minimum degree."""
 
+    deadline = NEVER
+
     def __init__(self, problem: Problem) -> None:
         self.d = problem.csr_data.d
         self.m = problem.m
@@ -142,12 +151,14 @@ class SparseFactor:
         self.all_rows = LinearSystem(self.pattern[:2], USE_WIDE_LANES)
 
     def factor(self, place: IntArray, n_free: int, shift: float) -> int:
+        if n_free == 0:
+            return 0
         indptr, indices, data = self.pattern
         self.system, d = self.all_rows, self.d
         if n_free < self.m:
             indptr, indices, data = extract_free_part(indptr, indices, data, place, n_free)
             self.system, d = LinearSystem((indptr, indices), USE_WIDE_LANES), d[place >= 0]
-        return self.system.factor(data, d, shift, PIVOT_TOLERANCE)
+        return self.system.factor(data, d, shift, PIVOT_TOLERANCE, deadline=self.deadline)
 
     def solve(self, rhs: FloatArray) -> FloatArray:
         return self.system.solve(rhs)
@@ -186,7 +197,9 @@ def _factor_with_superlu(a: sp.csc_array) -> tuple[Any, FloatArray]:
 
 
 class LUFactor:
-    """LU factor of D^-1/2 A_FF D^-1/2 for an asymmetric A."""
+    """LU factor of D^-1/2 A_FF D^-1/2 for an asymmetric A; LAPACK and SuperLU read no clock."""
+
+    deadline = NEVER
 
     def __init__(self, problem: Problem) -> None:
         m = problem.m
@@ -197,6 +210,8 @@ class LUFactor:
             import_numerical_modules("scipy.sparse.linalg")
 
     def factor(self, place: IntArray, n_free: int, shift: float) -> int:
+        if n_free == 0 or self.deadline.has_passed():
+            return 0 if n_free == 0 else -1
         self.free = np.flatnonzero(place >= 0)
         if self.sparse:
             return self._factor_sparse(shift)

@@ -10,12 +10,10 @@ multiply the error by k - 1 in each iteration and do not converge for k >= 2.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 
 from lavender.base.arrays import check_float
 from lavender.problem import Problem
 from lavender.problem.ordering import compute_block_order
-from lavender.solvers.costs import Cost, estimate_row_sums_cost
 from lavender.solvers.sweeping import SWEEPS, SweepSolver, SweepState
 from lavender_ext.sweep import serial
 
@@ -35,10 +33,6 @@ class Jacobi(SweepSolver):
     def __post_init__(self) -> None:
         if self.omega is not None:
             check_float("omega", self.omega, above=0.0)
-
-    def cost(self, problem: Problem) -> Cost:
-        """Estimate the cost of `prepare`."""
-        return Cost(partial(estimate_row_sums_cost, problem))
 
     def prepare(self, problem: Problem) -> SweepState:
         data, order = problem.csr_data, compute_block_order(problem)

@@ -36,15 +36,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import partial
 from math import inf
-from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from lavender.base.arrays import FloatArray, check_choice
-from lavender.base.deadline import Deadline, TooLate
+from lavender.base.deadline import Deadline
 from lavender.base.errors import CapabilityError, InputError
-from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import compute_stopping_residual, judge_impulse
 from lavender.judge.solution import Claim, Status, format_work_count, sum_work_counts
 from lavender.problem import OPERATORS, Problem
@@ -75,14 +73,8 @@ VELOCITY_MAX_COST_RATIO = 10.0
 MAX_FORMED_ROWS = 3000
 SPARSE_WORK_RATIO = 4.0  # Time of a multiply-add of a sparse factor as a multiple of one of a dense factor.
 INTERRUPT_CHECK_INTERVAL = 0.05  # Longest estimated time [s] between two checks for Ctrl-C.
-STAGE_TIME_FRACTION = 0.5  # A single stage may use at most this fraction of the remaining time.
 # Texts of each count of the kernel: "1 exchange" and " exchanges".
 COUNT_TEXTS = tuple((format_work_count(1, kind), format_work_count(2, kind)[1:]) for kind in COUNTED)
-_ENDS = {
-    OUTCOMES["reached"]: Status.CONVERGED,
-    OUTCOMES["floor"]: Status.ROUNDOFF_LIMIT,
-    OUTCOMES["stuck"]: Status.STALLED,
-}
 # The row form starts from the result of the velocity form if its relative residual does not exceed this,
 # otherwise from the default start.
 WARM_START_MAX_RESIDUAL = 1e-3
@@ -141,7 +133,7 @@ class Newton(Solver):
 
     form: str = "auto"
 
-    needs_scipy = True
+    lazy_modules = ("scipy.sparse.linalg",)
 
     def cost(self, problem: Problem) -> Cost:
         """Estimate the costs; the total is a lower bound that needs no analysis of the matrix (`NewtonState.cost`)."""
@@ -245,11 +237,11 @@ class Newton(Solver):
         if not len(problem.b):
             return Claim(Status.CONVERGED, 0)
         if system is not None and system.dense:
-            return self._run_system(problem, system, impulse, max_iter, tol, time_limit)
+            return self._run_system(problem, system, impulse, max_iter, tol, Deadline(time_limit))
         with np.errstate(all="ignore"):  # Results that overflow are judged.
             if state.general is not None:
-                return self._run_over_velocities(state, impulse, max_iter, tol, time_limit)
-            return self._run_system(problem, system, impulse, max_iter, tol, time_limit)
+                return self._run_over_velocities(state, impulse, max_iter, tol, Deadline(time_limit))
+            return self._run_system(problem, system, impulse, max_iter, tol, Deadline(time_limit))
 
     @np.errstate(all="ignore")  # Results that overflow are judged.
     def advance(
@@ -273,12 +265,12 @@ class Newton(Solver):
                 impulse,
                 n,
                 tol,
-                time_limit,
+                Deadline(time_limit),
                 is_continued,
-                remaining or SPEC.max_iter,
+                min(remaining or SPEC.max_iter, SPEC.max_iter),
             )
         claim = general.run_newton_steps(
-            state.problem, state.general, impulse, n, tol, time_limit, is_continued
+            state.problem, state.general, impulse, n, tol, Deadline(time_limit), is_continued
         )
         if claim.status is Status.MAX_ITERATIONS and state.general.how != OUTCOMES["more"]:
             return Claim(Status.STALLED, claim.iterations, claim.work)
@@ -299,15 +291,15 @@ class Newton(Solver):
         return NewtonState(problem, system if system.solve.m else None)
 
     def _run_over_velocities(
-        self, state: NewtonState, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None
+        self, state: NewtonState, impulse: FloatArray, max_iter: int, tol: float, deadline: Deadline
     ) -> Claim:
         """Solve over generalised velocities; if that fails, continue over bodies or over the rows of A.
 
         The row form runs only if iterations remain and A has at most `MAX_FORMED_ROWS` rows. `impulse` (m,) [N s]
         holds the better of the two results on return.
         """
-        problem, deadline = state.problem, Deadline(time_limit)
-        claim = general.run_newton_steps(problem, state.general, impulse, max_iter, tol, time_limit)
+        problem = state.problem
+        claim = general.run_newton_steps(problem, state.general, impulse, max_iter, tol, deadline)
         remaining = max_iter - claim.iterations
         if claim.status not in (Status.STALLED, Status.NUMERICAL_ERROR, Status.DIVERGED) or remaining <= 0:
             return claim
@@ -327,7 +319,7 @@ class Newton(Solver):
             impulse,
             remaining,
             tol,
-            deadline.get_remaining_seconds(1e-3),
+            deadline,
         )
         if not compute_stopping_residual(problem, impulse, w, e)[0] <= best:
             impulse[:] = before
@@ -343,30 +335,36 @@ class Newton(Solver):
         impulse: FloatArray,
         max_iter: int,
         tol: float,
-        time_limit: float | None,
+        deadline: Deadline,
         is_continued: bool = False,
         max_total: int | None = None,
     ) -> Claim:
-        """Run the stages over bodies or rows (see `_run_stages`). Over bodies, a warm start is tried first."""
+        """Run the method over bodies or rows (`run_newton_method`). Over bodies, a warm start is tried first."""
         if system is None:
             system = make_system(problem, "impulse")
             impulse[:] = system.solve.fixed
             return Claim(Status.STALLED, 0, {"factorisations": 0}, "no row can move")
         sweeps = warm_factorisations = 0
-        before = system.solve.done if is_continued else 0
         if self.form == "auto" and problem.rows is not None and not is_continued:
-            code, sweeps, warm_factorisations = warm_start(problem, impulse, tol, max_iter, time_limit)
+            code, sweeps, warm_factorisations = warm_start(problem, impulse, tol, max_iter, deadline)
             claim = make_warm_start_claim(code, sweeps, warm_factorisations)
             if claim is not None:
                 judged = judge_impulse(problem, impulse.copy())
                 if judged.relative <= tol:
                     return replace(claim, judged=judged)
-        max_iter -= warm_factorisations
-        status, certificate = _run_stages(
-            problem, system, impulse, max_iter, tol, time_limit, is_continued, max_total
+        solve, steps = system.solve, max(1, int(INTERRUPT_CHECK_INTERVAL / max(system.factor_seconds, 1e-6)))
+        run = general.run_newton_method(
+            problem,
+            solve,
+            impulse,
+            max_iter - warm_factorisations,
+            tol,
+            deadline,
+            steps,
+            max_total,
+            is_continued,
         )
-        solve = system.solve
-        factorisations = warm_factorisations + solve.done - before
+        factorisations = warm_factorisations + run.counts[0]
         message = ", ".join(
             [
                 one if n == 1 else f"{n}{many}"
@@ -375,7 +373,7 @@ class Newton(Solver):
             ]
         )
         work = {"factorisations": factorisations} | ({"sweeps": sweeps} if sweeps else {})
-        return Claim(status, factorisations, work, message, form=system.form, certificate=certificate)
+        return Claim(run.status, factorisations, work, message, form=system.form, certificate=run.certificate)
 
 
 def _estimate_full_matrix_cost(problem: Problem) -> float:
@@ -405,87 +403,6 @@ def _is_sparse_matrix_faster(problem: Problem, work: float) -> bool:
         return False
     ratio = 1.0 if problem.law == "coulomb" else VELOCITY_MAX_COST_RATIO
     return ratio * SPARSE_WORK_RATIO * entries**2 / (3.0 * m) <= work
-
-
-def _run_stages(
-    problem: Problem,
-    system: System,
-    impulse: FloatArray,
-    max_iter: int,
-    tol: float,
-    time_limit: float | None,
-    is_continued: bool = False,
-    max_total: int | None = None,
-) -> tuple[Status, FloatArray | None]:
-    """Run up to `max_iter` factorisations on `impulse` (m,) in place; check clock and Ctrl-C between factorisations.
-
-    Parameters
-    ----------
-    is_continued : bool
-        Whether to continue where an earlier call stopped.
-    max_total : int, optional
-        If given, later calls may continue where this one stops, with at most this many factorisations in all calls.
-
-    Returns
-    -------
-    Status
-    (m,) array or None
-        A certificate, or a direction that gives a lower bound of every solution's impulse.
-    """
-    deadline = system.deadline = None if time_limit is None else Deadline(time_limit)
-    solve, certificate, proven = system.solve, None, False
-    late = interrupted = False
-    last = max_iter + (solve.done if is_continued else 0)
-    if not is_continued:
-        solve.start(impulse, tol, SPEC.max_iter if max_total else max_iter)
-    if max_total:
-        solve.limit_work(max_total)
-    try:
-        while True:
-            before = solve.done
-            steps = INTERRUPT_CHECK_INTERVAL / max(system.expected_factor_seconds, 1e-6)
-            begin = perf_counter()
-            if deadline is not None:
-                time_left = deadline.get_remaining_seconds() or 0.0
-                # Run a single factorisation first, because its time is only estimated.
-                steps = (
-                    min(steps, STAGE_TIME_FRACTION * time_left / max(system.expected_factor_seconds, 1e-9))
-                    if solve.done
-                    else 1.0
-                )
-                if time_left <= system.expected_factor_seconds:
-                    late = True
-                    solve.request_stop()
-            try:
-                end = solve.step(max(1, int(min(steps, last - before) if max_total else steps)), impulse)
-            except TooLate:  # The next factorisation would end too late: return the best iterate.
-                late, end = True, OUTCOMES["spent"]
-                solve.request_stop()
-            if solve.done > before:
-                system.record_factor_time((perf_counter() - begin) / (solve.done - before))
-            if end == OUTCOMES["certificate"]:
-                certificate = solve.direction
-                with np.errstate(all="ignore"):
-                    proven = check_certificate(problem, certificate, tol, deadline) is None
-                if proven:
-                    solve.confirm_certificate()
-            elif end != OUTCOMES["more"] or (max_total and solve.done >= last):
-                break
-    except KeyboardInterrupt:
-        interrupted = True  # Return the best iterate also after Ctrl-C.
-        solve.request_stop()
-        solve.step(1, impulse)
-    if interrupted:
-        return Status.INTERRUPTED, None
-    if proven:
-        return Status.INFEASIBLE, certificate
-    if end == OUTCOMES["more"]:
-        return Status.MAX_ITERATIONS, None
-    if end == OUTCOMES["spent"]:
-        if max_total and not late:
-            return Status.STALLED, certificate  # All `max_total` factorisations have been used.
-        return (Status.TIME_LIMIT if late and solve.done < last else Status.MAX_ITERATIONS), None
-    return _ENDS[end], certificate
 
 
 def _get_refusal_reason(problem: Problem) -> str | None:

@@ -30,7 +30,7 @@ from lavender.judge.residuals import judge_impulse
 from lavender.judge.solution import Claim, Status, sum_work_counts
 from lavender.problem import Problem
 from lavender.problem.cones import project_impulse
-from lavender.solvers.costs import RATES, Cost
+from lavender.solvers.costs import Cost
 from lavender.solvers.registry import Solver
 
 
@@ -166,16 +166,11 @@ class BoundedRowSolver(Solver):
     """
 
     def __init__(self, solver: Solver) -> None:
-        self.solver, self.needs_scipy = solver, solver.needs_scipy
+        self.solver = solver
 
     def cost(self, problem: Problem) -> Cost:
-        """Estimate the costs of the inner solver, with the conversion of the rows."""
-        own = self.solver.cost(problem)
-        if problem.law in ("linear", "lcp"):
-            return own
-        # Rows of (1) or (2) per row of the problem.
-        ratio = bound_converted_row_count(problem) / max(problem.m, 1)
-        return Cost(lambda: ratio * own.setup + RATES["rows of contact"] * problem.m)
+        """Return the costs of the inner solver."""
+        return self.solver.cost(problem)
 
     def start_workers(self, converted: Any, time_limit: float) -> None:
         """Start the worker processes of the inner solver."""

@@ -101,12 +101,14 @@ class Solver:
         """
         raise NotImplementedError
 
-    needs_scipy = False  # Whether `prepare` uses modules of SciPy that are imported at their first use.
+    lazy_modules: tuple[
+        str, ...
+    ] = ()  # Modules that a solve may import; under a time limit before its clock starts.
 
     def cost(self, problem: Problem) -> Cost:
         """Estimate the costs [ns] from the size of the problem.
 
-        Under a time limit, `prepare` starts only if its cost fits. `auto` compares the costs of solvers.
+        `auto` compares the costs of its solvers.
         """
         return Cost()
 
@@ -114,7 +116,7 @@ class Solver:
         """Start worker processes for a solve with a limit [s], before its clock starts."""
 
     def set_deadline(self, state: Any, deadline: Deadline) -> None:
-        """Set the deadline of the next `run` of a resumable solver: no long step starts that would end later."""
+        """Set the deadline of the next `run` of a resumable solver, whose long steps read it."""
 
     def advance(
         self,
@@ -313,16 +315,8 @@ class SolverSpec:
         kinds = self.box_friction_laws == {"coulomb", "cone"} and self.round_cones and self.supports_rolling
         return kinds and self.laws == set(LAWS) and "matrix" in self.operators and self.refusal is None
 
-    def refuses(self, problem: Problem, kind_alone: bool = False) -> str | None:
-        """Return None if the solver accepts this problem, else the reason why not.
-
-        Parameters
-        ----------
-        problem : Problem
-        kind_alone : bool
-            Whether to compare only the kind of the problem with the spec, without computing anything from its data and
-            without calling `refusal`.
-        """
+    def refuses(self, problem: Problem) -> str | None:
+        """Return None if the solver accepts this problem, else the reason why not."""
         if type(problem) is not Problem:
             check_problem(problem)
         if not self.singular_programs and problem.qp is not None and problem.qp.is_singular:
@@ -368,7 +362,7 @@ class SolverSpec:
                 "takes no contacts that resist what rolls: use one of those that do, lavender.available(problem) lists "
                 "them, or leave the rows that roll out"
             )
-        if self.refusal is None or kind_alone:
+        if self.refusal is None:
             return None
         try:
             return self.refusal(problem.disk if blocks.has_ellipse else problem) or None

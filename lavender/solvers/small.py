@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
+from lavender.base.deadline import Deadline
 from lavender.judge.residuals import get_zero_impulse_reference, judge_impulse
 from lavender.judge.solution import Claim, SolverStage, Status, format_work_count, sum_work_counts
 from lavender.problem import Problem
@@ -161,7 +162,7 @@ class SmallCall:
         return 0.0 if self.limits is None else float(self.limits.cost(problem.metric, 0.0, kernel.islands)[1])
 
     def solve_and_judge(
-        self, problem: Problem, impulse: FloatArray | None, tol: float, max_cost: float = inf
+        self, problem: Problem, impulse: FloatArray | None, tol: float, deadline: Deadline | None = None
     ) -> tuple[Any, Any]:
         """Solve from an impulse (m,) [N s] or from the zero impulse.
 
@@ -170,8 +171,8 @@ class SmallCall:
         problem : Problem
         impulse : (m,) N s, optional
         tol : float, -
-        max_cost : float, ns
-            Estimated cost at which the call stops with the iterate so far.
+        deadline : Deadline, optional
+            Time at which the call ends with the iterate so far.
 
         Returns
         -------
@@ -184,14 +185,14 @@ class SmallCall:
             return None, ()
         result: tuple[Any, Any]
         if view is not None:
-            result = solve_new_generalized_problem(view, impulse, tol, self.limits, max_cost)
+            result = solve_new_generalized_problem(view, impulse, tol, self.limits, deadline)
             return result
         small = problem.derived.cache.get(COMPILED_CALL_KEY)
         if small is None and (problem.m <= SMALL_ROWS or self.hands_over):
             small = get_small_call(problem)
         if not small:
             return None, ()
-        result = small.run(impulse, tol, self.rules, max_cost)
+        result = small.run(impulse, tol, self.rules, deadline)
         return result
 
     def list_claims_of_failed_call(

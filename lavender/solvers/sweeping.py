@@ -7,7 +7,6 @@ half of the sweeps that are predicted to be needed, so it depends only on the nu
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,6 @@ from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.judge.solution import Claim, Status
 from lavender.problem import LAWS, OPERATORS, Problem
 from lavender.problem.ordering import Order, compute_block_order
-from lavender.solvers.costs import Cost, estimate_formation_cost, estimate_order_cost
 from lavender.solvers.registry import Solver, SolverSpec
 from lavender_ext.core.order import GIVEN
 from lavender_ext.judge.stopping_test import AT_FLOOR, CONVERGED, DIVERGED, RUNNING, STALLED, StoppingTest
@@ -126,18 +124,6 @@ class Sweeping(SweepSolver):
     order: Any = "given"
     ground: Any = None
     seed: int = 0
-
-    def cost(self, problem: Problem) -> Cost:
-        """Estimate the cost of `prepare`."""
-        return Cost(partial(self._estimate_setup_cost, problem))
-
-    def _estimate_setup_cost(self, problem: Problem) -> float:
-        formation = estimate_formation_cost(problem) if self._sweeps_over_matrix(problem) else 0.0
-        return estimate_order_cost(problem, self.order) + formation
-
-    def _sweeps_over_matrix(self, problem: Problem) -> bool:
-        """Return whether the sweeps need A."""
-        return True
 
     def prepare(self, problem: Problem) -> Any:
         """Build the state before the first sweep, with a new order."""

@@ -7,9 +7,10 @@ It suffices for most steps of a simulation at rest and for chains of joints. The
 from __future__ import annotations
 
 from lavender.base.arrays import FloatArray
+from lavender.base.deadline import Deadline
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
-from lavender_ext.newton.warm_start import JUDGED, MAX_WARM_SWEEPS, SOLVED, SWEPT, UNDECIDED, solve_from_guess
+from lavender_ext.newton.warm_start import JUDGED, SOLVED, SWEPT, UNDECIDED, solve_from_guess
 
 UNDECIDED_RESULT = UNDECIDED, 0, 0
 
@@ -28,7 +29,7 @@ def make_warm_start_claim(code: int, sweeps: int, factorisations: int) -> Claim 
 
 
 def warm_start(
-    problem: Problem, impulse: FloatArray, tol: float, budget: int, time_limit: float | None = None
+    problem: Problem, impulse: FloatArray, tol: float, budget: int, deadline: Deadline | None = None
 ) -> tuple[int, int, int]:
     """Solve `impulse` (m,) [N s] to tol in place if the first phase can; otherwise leave it unchanged.
 
@@ -39,7 +40,5 @@ def warm_start(
     """
     if problem.rows is None or problem.friction != "coulomb" or tol <= 0.0 or budget < 1:
         return UNDECIDED_RESULT
-    if time_limit is not None and MAX_WARM_SWEEPS * 1e-9 * problem.data.work > time_limit:
-        return UNDECIDED_RESULT
-    result: tuple[int, int, int] = solve_from_guess(problem.data, impulse, tol)
+    result: tuple[int, int, int] = solve_from_guess(problem.data, impulse, tol, deadline)
     return result

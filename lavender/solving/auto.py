@@ -50,7 +50,6 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import NEVER, Deadline, format_seconds
 from lavender.base.errors import BREAKDOWN, format_error
-from lavender.judge.residuals import combine_best_islands
 from lavender.judge.solution import Claim, Status, sum_work_counts
 from lavender.problem import OPERATORS, Problem
 from lavender.problem.derived import cached_property
@@ -64,7 +63,6 @@ from lavender.solvers.costs import (
     RATES,
     Cost,
     estimate_first_factor_cost,
-    estimate_first_sweep_cost,
     estimate_formation_cost,
     get_loose_limit,
 )
@@ -74,8 +72,8 @@ from lavender.solvers.islands import get_rows_of_blocks, restrict_to_blocks
 from lavender.solvers.newton import NewtonState
 from lavender.solvers.newton_systems.systems import find_bodies
 from lavender.solvers.registry import Solver, SolverSpec, get
-from lavender.solvers.small import AUTO, NO_TIME_MESSAGE
-from lavender.solving.compiled_call import get_call_time_fraction
+from lavender.solvers.small import AUTO
+from lavender.solving.compiled_call import choose_call_deadline
 from lavender.solving.log import Recorder, SolveLog, get_relaxation
 from lavender.solving.loop import Loop
 from lavender.solving.singular_programs import program_backends, run_program_backends
@@ -103,8 +101,6 @@ MIN_ITERATIONS_FOR_COMPILED_CALL = 200
 MAX_CALL_ITERATIONS = 2**30  # Largest number of iterations in one call.
 # Predictions of remaining sweeps replace a smaller tol by this relative residual.
 MIN_PREDICTED_RESIDUAL = 1e-16
-# [s/ns] Upper bound of the ratio of an iteration's time to its estimated cost.
-ITERATION_TIME_PER_COST = 4e-9
 # Sweeps of `is_large` problems before the first prediction of how many remain.
 FIRST_SWEEPS_OF_LARGE_PROBLEM = 8
 # Interior points on the relaxation need at least this number of factorisations.
@@ -291,7 +287,6 @@ class Iterations(Step):
         loop = Loop(
             problem=log.problem, solver=self.solver, state=self.state, impulse=self.impulse, tol=log.tol,
             deadline=deadline, records=None if log.recorder is None else [],
-            pace=ITERATION_TIME_PER_COST * estimate_cost("anderson", log.problem).iteration,
         )  # fmt: skip
         begun = 0.0 if log.recorder is None else log.recorder.time
         claim = self.run_loop(loop, n)
@@ -712,6 +707,8 @@ class AutoState:
 class Auto(Solver):
     """Select and combine other solvers; the solution's message and `stages` name them."""
 
+    lazy_modules = ("scipy.sparse.linalg", "scipy.optimize")
+
     def prepare(self, problem: Problem) -> AutoState:
         """Return the state of a new solve. Nothing is prepared."""
         return AutoState(problem)
@@ -749,22 +746,16 @@ class Auto(Solver):
             return run_program_backends(SolveLog(problem, tol, max_iter, deadline), impulse)
         counts: tuple[int, ...] | None = state.failed_call
         if counts is None and max_iter >= MIN_ITERATIONS_FOR_COMPILED_CALL:
-            fraction = get_call_time_fraction(problem, deadline.get_remaining_seconds() or inf)
-            if fraction > 0.0:
-                result, counts = AUTO.solve_and_judge(
-                    problem, impulse, tol, fraction * deadline.get_remaining_nanoseconds()
-                )
-                if result is not None and result.relative <= tol:
-                    claim = AUTO.make_claim(problem, counts, impulse, result.relative)
-                    if claim.iterations <= max_iter:
-                        impulse[:] = result.impulse
-                        return replace(claim, judged=result)
+            own = choose_call_deadline(problem, deadline)
+            result, counts = AUTO.solve_and_judge(problem, impulse, tol, own)
+            if result is not None and result.relative <= tol:
+                claim = AUTO.make_claim(problem, counts, impulse, result.relative)
+                if claim.iterations <= max_iter:
+                    impulse[:] = result.impulse
+                    return replace(claim, judged=result)
         failed = AUTO.list_claims_of_failed_call(problem, counts)
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0, {}, "nothing to solve")
-        if not deadline.fits(estimate_first_sweep_cost(problem)):
-            impulse[:] = combine_best_islands(problem, impulse, (), tol)
-            return Claim(Status.TIME_LIMIT, 0, {}, NO_TIME_MESSAGE)
         log = SolveLog(problem, tol, max_iter, deadline)
         tree = DecisionTree(problem, deadline, log, state.first_stage)
         tree.compiled_call_failed = bool(failed) and problem.generalized is not None

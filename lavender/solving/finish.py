@@ -10,17 +10,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, mark_read_only
+from lavender.base.arrays import FloatArray
+from lavender.base.deadline import NEVER, Deadline
 from lavender.base.errors import InputError
 from lavender.judge.certificates import format_lower_bound, prove_infeasibility
 from lavender.judge.residuals import (
     Residual,
-    choose_start,
     combine_best_islands,
     divide_by_reference,
     get_zero_impulse_reference,
     make_residual,
-    residual,
     reuse_or_judge_impulse,
 )
 from lavender.judge.solution import (
@@ -47,13 +46,8 @@ from lavender.problem import Problem
 from lavender.problem.cones import project_impulse
 from lavender.solvers.registry import SolverSpec, list_not_resumable
 from lavender_ext.core.checks import make_instance
-from lavender_ext.judge.measure import Judged, all_finite, are_bit_identical
+from lavender_ext.judge.measure import Judged, all_finite
 
-# End of the message of a solution that is its start, unchanged.
-UNJUDGED = ", unjudged"
-# Fields of an unjudged solution, besides its residual, that are computed when one is first read.
-LATE_FIELDS = ("iterations", "work", "solver", "message", "history", "dual", "certificate", "impulse_bound",
-         "claim_check", "status_conflict", "sweeps_per_decade", "stages")  # fmt: skip
 # A lower bound of every solution's impulse is reported only if it is at least this multiple of sum |b_i| / d_i, the
 # impulse that the rows would need one by one. Smaller bounds also hold for well-posed problems. Rows that contradict
 # each other up to a relative difference delta need about 1 / delta times that sum.
@@ -76,6 +70,7 @@ class FinishedRun(NamedTuple):
     # Empty unless the caller knows that the claim is false: it describes a solution that was found although the solver
     # claims that none exists, or the residual of the solver's own impulse if that was replaced.
     refutation: str = ""
+    deadline: Deadline = NEVER  # Certificates are not polished after it.
 
 
 class Verdict(NamedTuple):
@@ -186,7 +181,7 @@ def check_claim(run: FinishedRun, judged: Residual) -> Verdict:
     if status is INFEASIBLE and claim.certificate is None:
         unproven = "no certificate was given"
     elif status in (INFEASIBLE, STALLED) and claim.certificate is not None:
-        proof = prove_infeasibility(problem, claim.certificate, tol)
+        proof = prove_infeasibility(problem, claim.certificate, tol, run.deadline)
         bound = proof.impulse_bound or None
         if status is INFEASIBLE and not proof.reason:
             certificate, message = proof.y, _joined(message, proof.message)
@@ -220,69 +215,6 @@ def check_claim(run: FinishedRun, judged: Residual) -> Verdict:
     return Verdict(
         status, message, certificate, bound, claim_check=claim_check, status_conflict=status_conflict
     )
-
-
-def create_unjudged(
-    problem: Problem,
-    spec: SolverSpec,
-    options: dict[str, Any],
-    impulse: Any,
-    tol: float,
-    message: str,
-    setup_time: float = 0.0,
-    keeps_start: bool = False,
-) -> Solution:
-    """Return the start as a solution without judging it, because even the judge would exceed the time limit.
-
-    Its residual and the fields that depend on it are computed when they are accessed. One of them is the impulse, which
-    is zero in islands in which the start has a larger residual than zero impulses, unless `keeps_start` is true.
-    """
-    start = problem._start if problem.guess is None else problem.guess
-    start = mark_read_only(start.copy() if impulse is None else problem.impulse_array(impulse))
-    keeps_start = keeps_start or tol == 0.0 or are_bit_identical(start, problem._start)
-    claim = Claim(TIME_LIMIT, 0, {}, message)
-    late = judge_late_fields, (problem, spec, options, start, claim, tol, keeps_start)
-    solution = Solution.with_late_fields(start, TIME_LIMIT, tol, 0.0, late, setup_time)
-    if not keeps_start:
-        del solution.__dict__["impulse"]
-    return solution
-
-
-def keep_unjudged_start(solution: Solution) -> Solution:
-    """Return a solution of `create_unjudged` with its start as the impulse, and any other solution unchanged."""
-    if "impulse" in vars(solution):
-        return solution
-    problem, spec, options, start, claim, tol, _ = vars(solution)["_rest"][1]
-    return create_unjudged(
-        problem, spec, options, start, tol, claim.message, solution.setup_time, keeps_start=True
-    )
-
-
-def judge_late_fields(
-    problem: Problem,
-    spec: SolverSpec,
-    options: dict[str, Any],
-    impulse: FloatArray,
-    claim: Claim,
-    tol: float,
-    keeps_start: bool,
-) -> dict[str, Any]:
-    """Return the fields that `create_unjudged` postpones, for the start (m,) [N s], which is read-only."""
-    disk = problem.disk
-    start = problem.on_disk(impulse)
-    if not keeps_start:
-        start = choose_start(disk, start, tol)
-        if not are_bit_identical(start, problem.on_disk(impulse)):
-            impulse = mark_read_only(start.copy() if problem is disk else problem.cones.stretch * start)
-            message = (
-                claim.message.removesuffix(UNJUDGED) + ", with zero impulses in islands in which it was worse"
-            )
-            claim = replace(claim, message=message)
-    solution = finish(FinishedRun(disk, spec, options, start, claim, tol=tol))
-    if problem is not disk:
-        judged = residual(problem, impulse, "float64")
-        solution = replace(solution.convert_from_disk(problem), residual=judged, impulse=impulse)
-    return {name: getattr(solution, name) for name in ("impulse", "residual", *LATE_FIELDS)}
 
 
 def describe_end(problem: Problem, status: Status, iterations: int) -> str:

@@ -1,21 +1,20 @@
 """Call a solver's `run` in chunks, with clock, history and Ctrl-C, and select the best of its results.
 
-A chunk lasts about 10 ms. Chunks do not change the result, because every solver checks convergence at fixed numbers
-of iterations.
+A chunk lasts about 10 ms, under a time limit 1 ms. Chunks do not change the result, because every solver checks
+convergence at fixed numbers of iterations.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from math import inf
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.base.deadline import CHUNK_TIME, Deadline
+from lavender.base.deadline import CHUNK_TIME, LIMITED_CHUNK_TIME, Deadline
 from lavender.base.errors import BREAKDOWN, format_error
 from lavender.judge.residuals import (
     Residual,
@@ -41,10 +40,9 @@ from lavender_ext.judge.measure import are_bit_identical
 from lavender_ext.judge.stopping_test import StoppingTest
 
 MIN_TIME_LIMIT = 1e-6  # Smallest time limit [s] that is passed to a solver.
-# A chunk may use this fraction of the remaining time, estimated from the speed of the previous chunk.
-CHUNK_TIME_FRACTION = 0.7
 # Largest number of iterations of the first chunk: at 40 us per iteration, as of solvers in Python, it takes 10 ms.
 FIRST_CHUNK_ITERATIONS = 256
+FIRST_LIMITED_ITERATIONS = 16  # The same under a time limit.
 Callback = Callable[[int, FloatArray, Residual], Any]
 # The fields are iterations, time [s], relative residual, energy error and velocity error.
 Record = tuple[int, float, float, float, float]
@@ -73,7 +71,6 @@ class Loop:
     work: Mapping[str, int] = field(default_factory=dict)  # Work so far, as in `Claim`.
     broken: bool = False  # Whether the solver raised an arithmetic error.
     next_record: int = 0  # Number of iterations at which the next record is made.
-    pace: float = inf  # [s] Upper bound of the time of an iteration; inf if the first chunk measures it.
     judged: Any = None  # The judge's last pass over a result.
 
     def run_in_one_call(self, max_iter: int) -> Claim:
@@ -117,11 +114,10 @@ class Loop:
         """Run `max_iter` iterations in total, or fewer if the solver, the clock, the callback or Ctrl-C ends them."""
         # Assume 1 ns per unit of work for the first chunk, with a limit for solvers in Python; later chunks are
         # measured.
-        chunk = min(FIRST_CHUNK_ITERATIONS, max(1, int(CHUNK_TIME * 1e9) // max(1, self.problem.metric.work)))
+        first = FIRST_CHUNK_ITERATIONS if self.deadline is None else FIRST_LIMITED_ITERATIONS
+        chunk = min(first, max(1, int(1e9 * self._choose_chunk_time()) // max(1, self.problem.metric.work)))
         records = self.records is not None or self.callback is not None
         claim, deadline = EMPTY_CLAIM, self.deadline
-        if deadline is not None:
-            chunk = max(1, min(chunk, int(self._choose_chunk_time() / self.pace)))
         try:
             if deadline is not None:
                 begin = perf_counter()
@@ -148,25 +144,25 @@ class Loop:
                 if stopped:
                     claim = Claim(INTERRUPTED, 0, {}, "stopped by the callback")
                     break
-                # Do not start an iteration if less than half of its time remains.
-                if deadline is not None and deadline.has_passed(0.5 * elapsed / claim.iterations):
+                if deadline is not None and deadline.has_passed():
                     claim = Claim(TIME_LIMIT, 0, {}, claim.message)
                     break
                 if self.done < max_iter:
-                    chunk = self._choose_chunk_size(n, elapsed)
+                    chunk = self.choose_chunk_size(n, elapsed)
         except KeyboardInterrupt:
             claim = Claim(INTERRUPTED, 0, {}, "Ctrl-C")
         if claim.iterations == self.done and claim.work == self.work:
             return claim  # The claim of a single chunk needs no addition.
         return self._add_to_total_work(claim)
 
-    def _choose_chunk_size(self, n: int, elapsed: float) -> int:
+    def choose_chunk_size(self, n: int, elapsed: float) -> int:
+        """Return the number of iterations of the next chunk, after n iterations in `elapsed` seconds."""
         return max(1, min(8 * n, int(n * self._choose_chunk_time() / max(elapsed, 1e-7))))
 
     def _choose_chunk_time(self) -> float:
         """Return the intended time of the next chunk [s]."""
         left = None if self.deadline is None else self.deadline.get_remaining_seconds()
-        return CHUNK_TIME if left is None else min(CHUNK_TIME, CHUNK_TIME_FRACTION * left)
+        return CHUNK_TIME if left is None else min(LIMITED_CHUNK_TIME, left)
 
     def replace_by_best_impulse(self, start: FloatArray) -> None:
         """Replace a result that does not meet tol by the best of result and start in each island."""

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, cast
 import numpy as np
 
 from lavender.base.arrays import ArrayLike, FloatArray, are_equal, check_bool, check_float, check_int
-from lavender.base.deadline import NEVER, Deadline
+from lavender.base.deadline import NEVER, Deadline, read_clock
 from lavender.base.errors import BREAKDOWN, CapabilityError, InputError, InUse, UnknownName, format_error
 from lavender.judge.certificates import prove_infeasibility
 from lavender.judge.residuals import (
@@ -24,7 +24,6 @@ from lavender.judge.residuals import (
     choose_start,
     combine_best_islands,
     convert_residual_from_disk,
-    find_relative_at_zero,
     get_zero_impulse_reference,
     residual,
 )
@@ -40,20 +39,12 @@ from lavender.judge.solution import (
 )
 from lavender.problem import Problem, check_problem
 from lavender.solvers.certify import check_infeasibility_claim
-from lavender.solvers.costs import SCIPY_MODULES, estimate_import_cost
-from lavender.solvers.decisions import SMALL_ROWS
 from lavender.solvers.islands import find_islands
 from lavender.solvers.registry import Solver, SolverSpec, get
+from lavender.solvers.small import NO_TIME_MESSAGE
 from lavender.solving.compiled_call import solve_small
-from lavender.solving.finish import FinishedRun, create_unjudged, decide_empty_rows, finish, name_lost_row
-from lavender.solving.limits import (
-    check_time_limit,
-    is_setup_too_late,
-    is_tight,
-    is_too_late,
-    make_deadline,
-    reserve_time_of_judge,
-)
+from lavender.solving.finish import FinishedRun, decide_empty_rows, finish, name_lost_row
+from lavender.solving.limits import check_time_limit, make_deadline
 from lavender.solving.loop import MIN_TIME_LIMIT, Callback, Loop
 from lavender.solving.velocity import accept_velocity, relative_tolerance
 from lavender_ext.judge.measure import residuals_by_island
@@ -64,11 +55,6 @@ if TYPE_CHECKING:
 
     from lavender.solvers.registry import SolverOptions
 
-SETUP_LATE_MESSAGE = "what has to be set up first takes longer than the time limit"
-JUDGE_LATE_MESSAGE = "what the judge reads takes longer than the time limit: the start, unjudged"
-WITHOUT_SCIPY_MESSAGE = (
-    "without SciPy, which this process has not loaded: import scipy.linalg.lapack, scipy.sparse before"
-)
 SOLVE_ARGUMENTS = ("impulse", "tol", "velocity_tol", "max_iter", "time_limit", "history", "callback")
 
 
@@ -136,7 +122,6 @@ class NotSetUp(NamedTuple):
     """State of `Prepared` without a solver that is set up: the next solve sets it up."""
 
     failure: str = ""  # Arithmetic error that ended the last set-up; empty if there was none.
-    is_late: bool = False  # Whether the set-up was left out because it would have ended after the deadline.
 
 
 class Prepared:
@@ -152,17 +137,16 @@ class Prepared:
         spec: SolverSpec,
         options: dict[str, Any],
         begin: bool = True,
-        deadline: Deadline | None = None,
     ) -> None:
         # The time of checks counts as set-up: they may form A and convert ellipses to disks.
         start = perf_counter()
-        late = check_accepted(problem, spec, deadline)
+        check_accepted(problem, spec)
         if options:
             _check_option_names(spec, options)
         self.spec = spec
         self.options = options
         self._original = problem
-        self.problem = problem.disk if not late and problem.cones._blocks.has_ellipse else problem
+        self.problem = problem.disk if problem.cones._blocks.has_ellipse else problem
         self._target: tuple[Problem, FloatArray] | None = None  # [m/s] A problem and its targets b + J v*.
         self._lock = Lock()
         self._setup: SetUp | NotSetUp = NotSetUp()
@@ -226,7 +210,7 @@ class Prepared:
         """
         for name in unknown:
             raise UnknownName("argument of Prepared.solve", name, SOLVE_ARGUMENTS)
-        begun = 0.0 if time_limit is None else perf_counter()
+        begun = 0.0 if time_limit is None else read_clock()
         limit = math.inf if time_limit is None else check_time_limit(time_limit)
         original = self._original if problem is None else problem
         if b is not None or v_free is not None:
@@ -244,9 +228,10 @@ class Prepared:
             failed_call: tuple[int, ...] | None = None
             is_default = max_iter is None and callback is None and history is False
             if is_default and self.spec.delegates and not self.options and type(original) is Problem:
-                solution, failed_call = solve_small(original, self.spec, impulse, tol, limit)
+                own = None if limit == math.inf else Deadline(limit, begun)
+                solution, failed_call = solve_small(original, self.spec, impulse, tol, own)
             if solution is not None:
-                self._replace_problem(original, None)
+                self._replace_problem(original)
             else:
                 deadline = None if limit == math.inf else make_deadline(self.spec, limit, begun)
                 solution = self._solve(
@@ -280,17 +265,7 @@ class Prepared:
         """Prepare, step and finish: solve `original`, without the compiled call for small problems."""
         if type(original) is not Problem:
             check_problem(original)
-        deadline = arguments.deadline
-        if deadline is not None and is_tight(original, deadline):
-            late = is_too_late(original, self.spec, deadline)
-            if late or reserve_time_of_judge(
-                original.disk, self.spec, arguments.impulse is not None, deadline
-            ):
-                self._replace_problem(original, deadline)
-                return create_unjudged(
-                    original, self.spec, self.options, arguments.impulse, arguments.tol, JUDGE_LATE_MESSAGE
-                )
-        start = None
+        deadline, start = arguments.deadline, None
         if arguments.impulse is not None:
             disk = original.disk
             start = original.on_disk(disk.impulse_array(arguments.impulse))
@@ -320,17 +295,16 @@ class Prepared:
 
     # -- set-up ----------------------------------------------------------------------------------
 
-    def _replace_problem(self, original: Problem, deadline: Deadline | None) -> None:
+    def _replace_problem(self, original: Problem) -> None:
         """Replace the prepared problem by another one without a set-up."""
         if original is not self._original:
-            late = not has_same_operator(original, self._original) and check_accepted(
-                original, self.spec, deadline
-            )
-            self._original, self.problem = original, original if late else original.disk
+            if not has_same_operator(original, self._original):
+                check_accepted(original, self.spec)
+            self._original, self.problem = original, original.disk
             self._setup = NotSetUp()
 
     def _set_up(self, original: Problem, deadline: Deadline | None) -> SetUp | NotSetUp:
-        """Set the solver up for a problem, if its estimated time fits; reuse its state for the same structure.
+        """Set the solver up for a problem, unless the deadline has passed; reuse its state for the same structure.
 
         The problem replaces the old one unless an error is raised.
         """
@@ -346,8 +320,8 @@ class Prepared:
             get_zero_impulse_reference(problem)
         setup: SetUp | NotSetUp
         solver = last.solver if isinstance(last, SetUp) else _make_solver(spec, self.options)
-        if deadline is not None and not spec.delegates and is_setup_too_late(solver, problem, deadline):
-            setup = NotSetUp(is_late=True)
+        if deadline is not None and deadline.has_passed():
+            setup = NotSetUp()
         else:
             try:
                 if isinstance(last, SetUp) and not (is_other and not same_structure(self.problem, problem)):
@@ -369,7 +343,7 @@ class Prepared:
             begin = perf_counter()
             setup.solver.start_workers(setup.state, deadline.get_remaining_seconds() or 0.0)
             elapsed = perf_counter() - begin
-            deadline.reserve_seconds(-elapsed)
+            deadline.extend(elapsed)
             self.setup_time += elapsed
 
     # -- the run ---------------------------------------------------------------------------------
@@ -391,10 +365,7 @@ class Prepared:
         elif isinstance(setup, NotSetUp) or (
             deadline is not None and deadline.has_passed() and not spec.external
         ):
-            unjudged = self._keep_zero_impulse_unjudged(loop, setup_time)
-            if unjudged is not None:
-                return unjudged
-            claim = Claim(TIME_LIMIT, 0, {}, SETUP_LATE_MESSAGE)
+            claim = Claim(TIME_LIMIT, 0, {}, NO_TIME_MESSAGE)
             loop.replace_by_best_impulse(loop.impulse)
         else:
             has_checks = type(getattr(setup.state, "watch", None)) is StoppingTest
@@ -425,23 +396,10 @@ class Prepared:
                 problem, spec, self.options, loop.impulse, claim, tol=loop.tol, setup_time=setup_time,
                 solve_time=loop.time, history=None if loop.records is None else loop.get_history(),
                 sweeps_per_decade=float(getattr(loop.state, "sweeps_per_decade", math.nan)), refutation=refutation,
+                deadline=deadline or NEVER,
             )
         )  # fmt: skip
         return solution if self._original is problem else solution.convert_from_disk(self._original)
-
-    def _keep_zero_impulse_unjudged(self, loop: Loop, setup_time: float) -> Solution | None:
-        """Return the start unjudged if it is the zero impulse and no time remains: no better one can be selected."""
-        problem, deadline = self.problem, loop.deadline
-        at_zero = find_relative_at_zero(problem, loop.impulse)
-        if at_zero is None or at_zero <= loop.tol or loop.records is not None:
-            return None
-        if deadline is None or not deadline.has_passed():
-            return None
-        start = loop.impulse
-        if self._original is not problem:
-            start = self._original.cones.stretch * start
-        message = f"{SETUP_LATE_MESSAGE}: the start, unjudged"
-        return create_unjudged(self._original, self.spec, self.options, start, loop.tol, message, setup_time)
 
     def _select_best_impulse(
         self, loop: Loop, claim: Claim, start: FloatArray, has_checks: bool
@@ -460,9 +418,6 @@ class Prepared:
                 relative = residual(problem, claimed).relative
                 if relative > loop.tol:
                     refutation = f"its own impulse has a relative residual of {relative:.2e}"
-        needs_scipy = claim.status is TIME_LIMIT and spec.delegates and problem.m > SMALL_ROWS
-        if needs_scipy and estimate_import_cost(*SCIPY_MODULES):
-            claim = replace(claim, message=f"{claim.message}; {WITHOUT_SCIPY_MESSAGE}")
         return claim, refutation
 
     def _solve_feasible_islands(self, loop: Loop, claim: Claim, max_iter: int) -> Claim:
@@ -506,18 +461,13 @@ class Prepared:
         return replace(claim, iterations=claim.iterations + solution.iterations, work=work)
 
 
-def check_accepted(problem: Problem, spec: SolverSpec, deadline: Deadline | None = None) -> bool:
-    """Raise an error if the argument is not a problem or the solver refuses it; return the result of `is_too_late`.
-
-    If that is true, only the kind of the problem is checked, because other checks would exceed the time limit.
-    """
+def check_accepted(problem: Problem, spec: SolverSpec) -> None:
+    """Raise an error if the argument is not a problem or the solver refuses it."""
     if type(problem) is not Problem:
         check_problem(problem)
-    late = deadline is not None and is_too_late(problem, spec, deadline)
-    reason = spec.refuses(problem, late)
+    reason = spec.refuses(problem)
     if reason:
         raise CapabilityError(f"solver {spec.name!r} {reason}")
-    return late
 
 
 def _check_option_names(spec: SolverSpec, options: dict[str, Any]) -> None:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from functools import update_wrapper
-from time import perf_counter
 from typing import TYPE_CHECKING, Any, NoReturn, cast
 
 import numpy as np
 
 from lavender.base.arrays import ArrayLike
+from lavender.base.deadline import Deadline, read_clock
 from lavender.base.errors import InputError
 from lavender.judge.solution import Solution
 from lavender.problem import Problem, check_problem
@@ -59,11 +59,10 @@ def solve(
         Largest number of iterations, in the solver's own unit (sweeps, steps, pivots). Default: the limit of the
         solver's spec.
     time_limit : float, optional, s
-        Wall-clock limit of the whole call: set-up, iterations and the judge. Steps that cannot be interrupted, such as
-        a set-up or a factorisation, start only if their estimated time fits in the remaining time. The result is not
-        worse than the start. Solvers of other packages, and plug-ins, are imported before the clock starts. Solvers of
-        other packages run in a separate process, which is reused by later solves and killed at the limit (at twice the
-        limit if the package has a time limit of its own); `isolate=False` runs them in this process.
+        Wall-clock limit of set-up and iterations; one pass of the judge may follow (`docs/choose.md`). Imports do not
+        count. Solvers of other packages run in a separate process, which is reused by later solves and killed at the
+        limit (at twice the limit if the package has a time limit of its own); `isolate=False` runs them in this
+        process.
     history : bool
         Record iterations, time and residual at fixed numbers of iterations, in a `History`; with `auto`, of all stages.
     callback : callable (iterations, impulse, residual), optional
@@ -88,7 +87,6 @@ def solve(
     InputError
         `impulse`, `tol`, `velocity_tol`, `max_iter` or `time_limit` is not valid; `velocity_tol` and another `tol`.
     """
-    begun = 0.0 if time_limit is None else perf_counter()
     if type(problem) is not Problem:  # Check this first, because a frequent error is to pass A and b.
         check_problem(problem)
     if surplus:
@@ -97,16 +95,18 @@ def solve(
             "all others by name: lavender.solve(problem, solver, tol=..., impulse=...)"
         )
     spec = get(solver) if isinstance(solver, str) else _reject_solver(solver)
+    begun = 0.0 if time_limit is None else read_clock()  # After the import of a plug-in.
     limit = math.inf if time_limit is None else check_time_limit(time_limit)
     if velocity_tol is not None:
         tol = relative_tolerance(problem, velocity_tol, tol)
     solution: Solution | None = None
     failed_call: tuple[int, ...] | None = None
     if max_iter is None and callback is None and history is False and not options:
-        solution, failed_call = solve_small(problem, spec, impulse, tol, limit)
+        deadline = None if limit == math.inf else Deadline(limit, begun)
+        solution, failed_call = solve_small(problem, spec, impulse, tol, deadline)
     if solution is None:
         deadline = None if limit == math.inf else make_deadline(spec, limit, begun)
-        prepared = Prepared(problem, spec, cast("dict[str, Any]", options), False, deadline)
+        prepared = Prepared(problem, spec, cast("dict[str, Any]", options), False)
         arguments = check_arguments(spec, impulse, tol, max_iter, deadline, history, callback, failed_call)
         solution = prepared._solve(arguments, problem)
     return solution if velocity_tol is None else accept_velocity(solution, velocity_tol)

@@ -17,6 +17,7 @@ import numpy as np
 from lavender_ext.core.arrays cimport (C_CONTIGUOUS, DOUBLE, as_double_pointer, as_int_pointer, has_element_type, make_read_only,
                                        ndarray)
 from lavender_ext.core.blocks cimport Blocks
+from lavender_ext.core.deadline cimport deadline_t, get_pointer, has_passed, reading_interval
 from lavender_ext.core.method cimport workspace_t
 from lavender_ext.core.problem cimport Data, bind_body_arrays, derived_t
 from lavender_ext.core.problem import LAWS
@@ -106,7 +107,7 @@ cdef int set_task_start(task_t* j, start, double* lam, double* slack_error) exce
     """Set the start of a task, (m,) [N s] or None for the zero impulse, and its output arrays; reset its result."""
     cdef const double[::1] values
     j.lam, j.slack_error = lam, slack_error
-    j.solved, j.limit_reached, j.cold, j.cost_limit, j.by_island = False, False, start is None, INFINITY, NULL
+    j.solved, j.is_late, j.cold, j.deadline, j.by_island = False, False, start is None, NULL, NULL
     if not j.cold:
         values = start
         if values.shape[0] != j.p.n_rows:
@@ -119,7 +120,7 @@ cdef int set_task_start(task_t* j, start, double* lam, double* slack_error) exce
 cdef make_task_result(task_t* j, Data p, impulse, both):
     """Return (judged result or None, counters as of `Newton.run`)."""
     judged = None
-    if j.solved or j.limit_reached:
+    if j.solved or j.is_late:
         judged = make_judged(p, impulse, both, &j.score, j.relative, j.floor, j.float64_relative)
     return judged, (j.counts[0], j.counts[1], j.counts[2], j.counts[3])
 
@@ -164,12 +165,12 @@ cdef class Limits:
                 max_newton_cost(&p.blocks, &p.general, &self.at, islands, soft))
 
 
-def solve_new_generalized_problem(Data p, start, double tol, Limits limits, double max_cost=INFINITY):
+def solve_new_generalized_problem(Data p, start, double tol, Limits limits, deadline=None):
     """Set up, solve and judge a problem of J and M with at least one row and without derived data, in one call.
 
     Returns (judged result, counters). None is returned if it is above tol, if an empty row violates its target, or if the
-    estimated cost exceeds the limits. The counters are zero if nothing was run. At an estimated cost of `max_cost` [ns] the current
-    iterate is returned. d, Y and the residual of the zero impulse are stored in the data.
+    estimated cost exceeds the limits. The counters are zero if nothing was run. At the deadline the present iterate is
+    returned. d, Y and the residual of the zero impulse are stored in the data.
     """
     cdef task_t j
     cdef call_workspaces_t r
@@ -177,7 +178,7 @@ def solve_new_generalized_problem(Data p, start, double tol, Limits limits, doub
     cdef bint had_derived = p.ready
     impulse, results = make_read_only(new(m)), new(2 * m + 1)
     set_task_from_data(&j, p, start, <double*>(<ndarray>impulse).data, <double*>(<ndarray>results).data)
-    j.cost_limit = max_cost
+    j.deadline = get_pointer(deadline)
     memset(&r, 0, sizeof(r))
     limits.exchange_kept_workspaces(&r)
     with nogil:
@@ -216,7 +217,7 @@ cdef bint is_plain_start(impulse, Py_ssize_t m) noexcept:
             and all_finite(<const double*>x.data, m))
 
 
-def solve_compiled(problem, spec, impulse, tol, double max_cost=INFINITY):
+def solve_compiled(problem, spec, impulse, tol, deadline=None):
     """Solve and judge a problem by the compiled call of a solver, unless the call does not accept the problem.
 
     Parameters
@@ -225,8 +226,8 @@ def solve_compiled(problem, spec, impulse, tol, double max_cost=INFINITY):
     spec : SolverSpec
     impulse : (m,) N s, or None
     tol : float, -
-    max_cost : float, ns
-        Estimated cost at which the call ends with the iterate so far.
+    deadline : Deadline, optional
+        Time at which the call ends with the iterate so far.
 
     Returns
     -------
@@ -250,12 +251,12 @@ def solve_compiled(problem, spec, impulse, tol, double max_cost=INFINITY):
     elif not is_plain_start(impulse, len(problem.b)):
         first = problem.impulse_array(impulse)
     if view is not None and (<Data>view).blocks.n_rows:
-        judged, counts = solve_new_generalized_problem(view, first, tol, small.limits, max_cost)
+        judged, counts = solve_new_generalized_problem(view, first, tol, small.limits, deadline)
         if judged is None and (<Data>view).reference_energy < 0.0:      # The reference of a row needs v*.
             get_zero_impulse_reference(problem)
-            judged, counts = solve_new_generalized_problem(view, first, tol, small.limits, max_cost)
+            judged, counts = solve_new_generalized_problem(view, first, tol, small.limits, deadline)
     else:
-        judged, counts = small.solve_and_judge(problem, first, tol, max_cost)
+        judged, counts = small.solve_and_judge(problem, first, tol, deadline)
     if judged is not None and (<Judged>judged).relative <= <double>tol:
         kept = first if first is None or impulse is None else first.copy()      # The caller may change the array later.
         solution = make_instance(Solution, {
@@ -318,7 +319,6 @@ CODE = {"left": LEFT, "ready": READY, "bad": BAD, "tried": TRIED, "late": LATE, 
 
 cdef enum:                      # results of `Worker.process_worlds` other than the index of a deferred world
     DONE_ALL = -1
-    CHECK_CLOCK = -2            # the caller must check the time limit
 
 
 def list_problem_data(list problems, kind):
@@ -472,10 +472,10 @@ cdef class Worlds:
             code = convert_generalized_world(&self.w, i, scratch, &j.p, &j.g)
             j.zero_residual[0] = -1.0
             j.by_island = NULL
-            j.solved, j.limit_reached, j.cold, j.has_derived, j.lam = False, False, self.cold, False, self.lam + at[AT_ROW]
+            j.solved, j.is_late, j.cold, j.has_derived, j.lam = False, False, self.cold, False, self.lam + at[AT_ROW]
         if not j.has_derived and j.general:
             j.made = made[0]
-        j.cost_limit = INFINITY
+        j.deadline = NULL
         if not grow_workspace_to(slack_error, 0, 2 * at[ROWS] + 1):
             return LEFT
         j.slack_error = slack_error.real
@@ -507,7 +507,7 @@ cdef class Worlds:
         return READY
 
     cdef int32_t solve_world(self, int64_t i, worker_t* h, const limits_t* limits, const small_rules_t* rules, double tol,
-                             double max_cost) noexcept nogil:
+                             deadline_t* deadline) noexcept nogil:
         """Solve world i, store its result and return its status."""
         cdef task_t j
         cdef int32_t k, code = LEFT
@@ -519,7 +519,7 @@ cdef class Worlds:
             return code
         if j.p.n_rows == 0:
             return self.store_empty_world(i, &h.scratch)
-        had_derived, j.cost_limit = j.has_derived, max_cost
+        had_derived, j.deadline = j.has_derived, deadline
         if j.general:
             solve_task(&j, &h.workspace, &h.small.islands, limits, tol)
             if not had_derived:
@@ -537,11 +537,10 @@ cdef class Worlds:
                 self.tasks[i].zero_residual[k] = j.zero_residual[k]
         return code
 
-    cdef int32_t judge_world(self, int64_t i, worker_t* h, double tol, bint narrow, bint late) noexcept nogil:
+    cdef int32_t judge_world(self, int64_t i, worker_t* h, double tol, bint narrow) noexcept nogil:
         """Judge world i without solving, refined for `tol`, and return its status; worlds with empty rows are deferred.
 
-        narrow: with the round-off floor of float32. late: problems of A and of bodies are deferred as well, since they are judged
-        when their result is read.
+        narrow: with the round-off floor of float32.
         """
         cdef task_t j
         cdef small_problem_t s
@@ -554,7 +553,7 @@ cdef class Worlds:
             return self.store_empty_world(i, &h.scratch)
         code = LEFT
         if not j.general:
-            if narrow or late or not prepare_task_for_small_call(&j, &s, &h.small):
+            if narrow or not prepare_task_for_small_call(&j, &s, &h.small):
                 return LEFT
             if not grow_workspace_to(&h.small.call.work, 0, count_judge_scratch(&s.v)):
                 return LEFT
@@ -620,45 +619,49 @@ cdef class Worker:
         free(self.h.made.marks)
         free(self.h.made.numbers)
 
-    def solve_worlds(self, double tol, Limits limits, Rules rules, double max_cost=INFINITY):
+    def solve_worlds(self, double tol, Limits limits, Rules rules, deadline=None):
         """Solve worlds until one is deferred and return its index, or DONE_ALL if there are no more.
 
-        Without limits all worlds of J and M are deferred, without rules all others. max_cost: estimated cost [ns] of a
-        world at which its current iterate is the result; CHECK_CLOCK is then returned after each world.
+        Without limits all worlds of J and M are deferred, without rules all others. At the deadline the present iterate of a
+        world is its result, and the starts of the worlds after it are judged.
         """
-        return self.process_worlds(tol, limits, rules, max_cost, 0, False)
+        return self.process_worlds(tol, limits, rules, deadline, False, False)
 
-    def judge_worlds(self, double tol, bint narrow, bint late=False):
+    def judge_worlds(self, double tol, bint narrow):
         """Judge the impulses of worlds until one is deferred, and return its index, or DONE_ALL if there are no more.
 
-        narrow: use the round-off floor of float32. late: the worlds keep their starts, since there was no time to solve them.
+        narrow: use the round-off floor of float32.
         """
-        return self.process_worlds(tol, None, None, INFINITY, LATE if late else READY, narrow)
+        return self.process_worlds(tol, None, None, None, True, narrow)
 
-    cdef int64_t process_worlds(self, double tol, Limits limits, Rules rules, double max_cost, int32_t judges,
-                                bint narrow) except? -3:
-        """Process worlds until one is deferred; judges: 0 to solve them, otherwise the status that judged worlds get."""
+    cdef int64_t process_worlds(self, double tol, Limits limits, Rules rules, deadline, bint judges, bint narrow) except? -3:
+        """Solve worlds, or judge them, until one is deferred."""
         cdef Worlds w = self.worlds
         cdef const limits_t* at = &limits.at if limits is not None else NULL
         cdef const small_rules_t* small_rules = &rules.at if rules is not None else NULL
         cdef int64_t i, n = w.w.n
         cdef int32_t code, n_done = 0
+        cdef deadline_t own                             # Other threads read the clock for themselves.
+        cdef deadline_t* until = get_pointer(deadline)
+        if until != NULL:
+            own = until[0]
+            until = &own
         with nogil:
             while not self.stop[0]:
                 i = lav_add(&w.taken, 1)
                 if i >= n:
                     return DONE_ALL
-                if judges:
-                    code = w.judge_world(i, &self.h, tol, narrow, judges == LATE)
+                if has_passed(until, reading_interval()):
+                    code = w.judge_world(i, &self.h, tol, narrow)
                     if code == READY:
-                        code = judges
+                        code = LATE
+                elif judges:
+                    code = w.judge_world(i, &self.h, tol, narrow)
                 else:
-                    code = w.solve_world(i, &self.h, at, small_rules, tol, max_cost)
+                    code = w.solve_world(i, &self.h, at, small_rules, tol, until)
                 w.code_at[i] = <signed char>code
                 if code == LEFT or code == TRIED:
                     return i
-                if max_cost < INFINITY:
-                    return CHECK_CLOCK
                 n_done += 1
                 if n_done % INTERRUPT_CHECK_WORLDS == 0:
                     with gil:

@@ -11,7 +11,8 @@ from libc.string cimport memset
 from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles, take_integers
 from lavender_ext.core.assemble cimport lav_form_delassus_matrix, lav_list_blocks_of_bodies
 from lavender_ext.core.validate cimport find_invalid_number
-from lavender_ext.core.method cimport MORE, REACHED, NEEDS_WORKSPACE, options_t, workspace_t, info_t
+from lavender_ext.core.deadline cimport deadline_t, has_passed
+from lavender_ext.core.method cimport REACHED, NEEDS_WORKSPACE, options_t, workspace_t, info_t
 from lavender_ext.core.islands cimport island_workspace_integers
 from lavender_ext.core.block_types cimport CONE, blocks_t, has_independent_rows, islands_t
 from lavender_ext.core.problem cimport (DERIVED, bind_derived_row_arrays, compute_derived_numbers_of_jacobian, derived_t,
@@ -27,8 +28,8 @@ from lavender_ext.judge.score cimport make_empty_score, score_t
 from lavender_ext.judge.slack cimport compute_generalized_slack
 from lavender_ext.small.call cimport (N_COUNTS, RESULT_IS_START, RESULT_SOLVED, are_all_rows_bounded, derive_small_problem,
                                       small_problem_t, small_rules_t, solve_small, solve_workspaces_t, can_use_small_call)
-from lavender_ext.small.limits cimport (estimate_newton_cost_terms, estimate_newton_step_cost, limits_t,
-                                        max_factorisation_work, max_newton_cost, newton_cost_t)
+from lavender_ext.small.limits cimport (estimate_newton_cost_terms, limits_t, max_factorisation_work,
+                                        max_newton_cost, newton_cost_t)
 from lavender_ext.small.workspace cimport fits_workspace, grow_workspace_to, grow_workspace_to_arena
 from lavender_ext.batch.world cimport THIN_PADDING, LEFT, READY, STARTED, TRIED, compress_dense_rows
 from lavender_ext.velocity_newton.soft cimport needs_no_proximal_terms
@@ -36,12 +37,6 @@ from lavender_ext.velocity_newton.soft cimport needs_no_proximal_terms
 
 cdef enum:
     NEWTON_STEPS_PER_ISLAND = 128
-    # Costs as numbers of passes over all entries of J L^-1. They were fitted to 500 random problems and predict the time of 90 % of
-    # these within a factor of 1.4.
-    SETUP_PASSES = 10           # setup and judgement
-    FACTOR_PASSES = 3           # forming N, in addition to half of the estimated factorisation
-    LINE_ROW_ENTRIES = 11       # one evaluation of a line search, in entries per row
-    STEP_EVALUATIONS = 3        # evaluations of the line search per step
 
 
 cdef struct task_t:
@@ -59,9 +54,9 @@ cdef struct task_t:
     islands_t islands           # target of p.islands, if this call computed the islands
     double* by_island           # NULL, or the array (islands, 2) that `score_t.by_island` points to
     int32_t cold                # 1: start from the zero impulse, 0: from lam
-    double cost_limit           # ns, limit of the estimated cost, at which the current iterate is the result; inf: no limit
+    deadline_t* deadline        # time at which the present iterate is the result, or NULL
     bint solved
-    bint limit_reached          # the cost limit was reached
+    bint is_late                # the deadline has ended the steps
     int32_t counts[N_COUNTS]    # steps, factorisations, exchanges, evaluations; or as in `solve_small`
     double* lam                 # (m) N s
     double* slack_error         # (2 m + 1) w, e
@@ -108,32 +103,6 @@ cdef inline bint judge_zero_impulse_of_task(task_t* j, workspace_t* islands, dou
         return False
     j.p.islands = v.p.islands
     return True
-
-
-cdef inline double estimate_task_cost(const task_t* j, const limits_t* l, double work, int32_t factored,
-                                      double lines) noexcept nogil:
-    """Return the estimated cost [ns] of setup, judgement, `factored` factorisations and `lines` line-search evaluations."""
-    cdef double pass_cost = estimate_newton_step_cost(&j.p, &j.g, l, 0.0)
-    return ((SETUP_PASSES + FACTOR_PASSES * factored) * pass_cost + 0.5 * factored * l.work * work
-            + LINE_ROW_ENTRIES * l.entry * j.p.n_rows * lines)
-
-
-cdef inline int32_t run_newton_within_cost(task_t* j, const view_t* v, const options_t* o, const workspace_t* r,
-                                           const limits_t* l) noexcept nogil:
-    """Run Newton's steps while their estimated cost is below the task's limit; set `limit_reached` if the limit ends them.
-
-    Each call runs as many steps as the remaining cost permits if every step factorises. Steps without a factorisation cost
-    less, so that the calls are repeated.
-    """
-    cdef info_t info = info_t(0, 0, 0, 0, 0.0, NULL, NULL)
-    cdef int32_t code = MORE
-    cdef double each = estimate_task_cost(j, l, r.work, 1, STEP_EVALUATIONS) - estimate_task_cost(j, l, r.work, 0, 0.0), fit = 1.0
-    while code == MORE and fit >= 1.0:
-        fit = (j.cost_limit - estimate_task_cost(j, l, r.work, info.factorisations, info.evaluations)) / each
-        code = lav_step(v, o, r, <int32_t>max(fit, 0.0) if fit < o.budget else o.budget, j.lam, &info)
-    j.counts[0], j.counts[1], j.counts[2], j.counts[3] = info.work, info.factorisations, info.rounds, info.evaluations
-    j.limit_reached = code == MORE
-    return code
 
 
 cdef inline bint set_impulse_of_empty_rows(const task_t* j) noexcept nogil:
@@ -200,7 +169,9 @@ cdef inline void solve_task(task_t* j, workspace_t* workspace, workspace_t* isla
                             double tol) noexcept nogil:
     """Solve and judge a task of J and M by Newton's method, if its estimated cost is within the limits."""
     cdef view_t v
-    cdef options_t o = options_t(NEWTON, NEWTON_STEPS_PER_ISLAND, 0, 0, has_wide(), tol, 0.0, 0.0, limits.values, 0.0)
+    cdef options_t o = options_t(NEWTON, NEWTON_STEPS_PER_ISLAND, 0, 0, has_wide(), tol, 0.0, 0.0, limits.values, 0.0,
+                                 j.deadline)
+    cdef info_t info = info_t(0, 0, 0, 0, 0.0, NULL, NULL)
     cdef workspace_t r
     cdef int32_t m = j.p.n_rows, code = NEEDS_WORKSPACE
     cdef newton_cost_t cost
@@ -228,8 +199,6 @@ cdef inline void solve_task(task_t* j, workspace_t* workspace, workspace_t* isla
         code = lav_start(&v, &o, &r, j.lam)
     if code != NEEDS_WORKSPACE or cost.fixed + cost.per_work * r.work > max_newton_cost(&j.p, &j.g, limits, r.islands, soft):
         return
-    if m > limits.coulomb_rows and cost.fixed + cost.per_work * r.work > j.cost_limit:
-        return                                          # In a short time sweeps reach a smaller residual.
     if not grow_workspace_to(workspace, 0, r.n_real):
         return
     r.real = workspace.real
@@ -244,8 +213,10 @@ cdef inline void solve_task(task_t* j, workspace_t* workspace, workspace_t* isla
         return
     # steps, judgement
     lav_start(&v, &o, &r, j.lam)
-    code = run_newton_within_cost(j, &v, &o, &r, limits)
-    if code != REACHED and not j.limit_reached:
+    code = lav_step(&v, &o, &r, o.budget, j.lam, &info)
+    j.counts[0], j.counts[1], j.counts[2], j.counts[3] = info.work, info.factorisations, info.rounds, info.evaluations
+    j.is_late = has_passed(j.deadline, 0.0)
+    if code != REACHED and not j.is_late:
         return
     if not grow_workspace_to(workspace, 0, judge_task_workspace_size(j)):
         return
@@ -350,7 +321,7 @@ cdef inline int32_t solve_small_task(task_t* j, task_workspaces_t* workspaces, c
         return LEFT
     if not derive_small_problem(&s, &workspaces.bound):
         return LEFT
-    code = solve_small(&s, rules, j.lam, j.cold, tol, j.cost_limit, j.slack_error, &workspaces.call, j.counts)
+    code = solve_small(&s, rules, j.lam, j.cold, tol, j.deadline, j.slack_error, &workspaces.call, j.counts)
     copy_small_judgement(j, &s)
     j.push = workspaces.call.work.real + (j.p.n_rows if code == RESULT_IS_START else 0)
     if code != RESULT_IS_START and code != RESULT_SOLVED:

@@ -1,4 +1,4 @@
-"""Interface of an iterative method: three functions on plain structs that neither use Python, nor allocate, nor read a clock.
+"""Interface of an iterative method: three functions on plain structs that neither use Python nor allocate.
 
     view_t v                      the problem: blocks with d and nu, and one of A, bodies, J and M
     options_t o                   method, tolerance, budget
@@ -14,6 +14,7 @@ state in r. Neither r nor the arrays of v may move between `start` and the last 
 """
 from libc.stdint cimport int32_t, int64_t
 
+from lavender_ext.core.deadline cimport Deadline, deadline_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport view_t
 
@@ -24,7 +25,7 @@ cdef enum:                      # outcomes
     ROUNDOFF_LIMIT = 2          # the residual is within twice the round-off floor
     STUCK = 3                   # the method makes no progress
     CERTIFICATE = 4             # `direction` may prove that no solution exists: the caller checks it, and may step again
-    SPENT = 5                   # the budget is used up, or `stop` is set
+    SPENT = 5                   # the budget is used up, `stop` is set, or the deadline has passed
     NEEDS_WORKSPACE = 6
     UNFIT = 7                   # the method does not accept this problem
     BROKEN = 8                  # a factorisation has no acceptable pivots
@@ -42,6 +43,7 @@ cdef struct options_t:
     double v0                   # judge's velocity error of the zero impulse, m/s
     double most                 # maximum doubles of one factor; the method does not accept a problem that needs more
     double work                 # multiply-adds of one factor above which no workspace is bound; 0: no limit
+    deadline_t* deadline        # time at which a step ends with the present result, or NULL
 
 
 cdef struct workspace_t:
@@ -86,5 +88,6 @@ cdef class Method:
     cdef workspace_t space
     cdef info_t info
     cdef method_t own
+    cdef readonly Deadline deadline     # of `options.deadline`
     cdef readonly int how       # the last outcome: one of `OUTCOMES`
     cdef void set_target_and_clear_statistics(self, double tol, int budget) noexcept

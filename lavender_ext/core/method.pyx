@@ -1,6 +1,7 @@
 """The class `Method`: steps and statistics of a method of core/method.pxd for Python."""
 import numpy as np
 
+from lavender_ext.core.deadline cimport get_pointer
 from lavender_ext.core.method cimport (BROKEN, CERTIFICATE, ROUNDOFF_LIMIT, LOST, MORE, REACHED, SPENT, STUCK, options_t, info_t)
 
 OUTCOMES = {"more": MORE, "reached": REACHED, "floor": ROUNDOFF_LIMIT, "stuck": STUCK, "certificate": CERTIFICATE, "spent": SPENT,
@@ -29,6 +30,10 @@ cdef class Method:
         with nogil:
             self.how = self.own.step(&self.view, &self.options, &self.space, work, &impulse[0], &self.info)
         return self.how
+
+    def set_deadline(self, deadline):
+        """Set the time at which a step ends with the present result; None or a deadline without a limit: no end."""
+        self.deadline, self.options.deadline = deadline, get_pointer(deadline)
 
     def limit_work(self, int units):
         """Limit the remaining work to at most `units` units."""

@@ -8,6 +8,7 @@ The mass matrix of a problem and the normal matrix of Newton's method over its v
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy
 
+from lavender_ext.core.deadline cimport deadline_t, entry_cost, has_passed
 from lavender_ext.core.tree_solve cimport axpy_subtract, axpy_subtract_2
 from lavender_ext.core.validate cimport min_magnitude
 
@@ -127,12 +128,14 @@ cdef inline int32_t factor_tree(int32_t n, const int32_t* mptr, const int32_t* m
                 while lidx[at] != j:
                     at += 1
                 lval[at] = mval[q]
-    return factor_tree_matrix(n, lptr, lidx, lval, pivot, inv_pivot, min_mass_pivot_ratio())
+    return factor_tree_matrix(n, lptr, lidx, lval, pivot, inv_pivot, min_mass_pivot_ratio(), NULL)
 
 
 cdef inline int32_t factor_tree_matrix(int32_t n, const int32_t* lptr, const int32_t* lidx, double* lval, double* pivot,
-                                       double* inv_pivot, double min_pivot) noexcept nogil:
+                                       double* inv_pivot, double min_pivot, deadline_t* deadline) noexcept nogil:
     """Overwrite M in the pattern of L with L, D and 1 / D of (1); return -1, or the row of a pivot that is too small.
+
+    At the deadline, the row that comes next is returned.
 
     lptr indexes both lidx and lval. `pivot` and `inv_pivot` contain the diagonal of M. A pivot is too small if it is at most
     `min_pivot` M_kk, or below `min_magnitude`. Consecutive rows of a chain, which have the same columns except themselves,
@@ -155,8 +158,15 @@ cdef inline int32_t factor_tree_matrix(int32_t n, const int32_t* lptr, const int
         # the other rows
         for a in range(count - s, -1, -1):
             eliminate_chain_rows(lptr, lidx, lval, pivot, inv_pivot, k, lidx[first + a], a, row, s)
+        if deadline != NULL and has_passed(deadline, 0.5 * s * count * (entry_cost() + sparse_velocity_cost() * count)):
+            return k
         k -= s
     return -1
+
+
+cdef inline double sparse_velocity_cost() noexcept nogil:
+    """Return the time [ns] of a multiply-add of a factor over velocities: "sparse velocities" of the rates."""
+    return 2.92
 
 
 cdef inline bint invert_pivot(const double* pivot, double* inv_pivot, int32_t k, double min_pivot) noexcept nogil:

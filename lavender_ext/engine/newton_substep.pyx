@@ -141,7 +141,7 @@ cdef inline int32_t solve_newton_substep(const blocks_t* p, const rows_t* r, war
     if not memory.header[1]:
         return UNDECIDED
     problem = view_t(p[0], NULL, r, NULL)
-    o = options_t(0, MAX_SUBSTEP_FACTORISATIONS, 0, 0, has_wide(), tol, e0, v0, 1.0 / 0.0, 0.0)
+    o = options_t(0, MAX_SUBSTEP_FACTORISATIONS, 0, 0, has_wide(), tol, e0, v0, 1.0 / 0.0, 0.0, NULL)
     # `lav_newton_plan` computed the pattern
     n = workspace_t(memory.header[1], INDEX_LIMIT, memory.newton, workspace, 1, 0, 0, 0.0)
     return run_newton_stages(&problem, &o, &n, s, lam, v)
@@ -198,7 +198,7 @@ cdef public int32_t lav_newton_substep(const int32_t* size, double* real, int32_
     set_angular_joint_weights(&p, &r, memory.nu)
     p.nu = memory.nu
     s.keeps_start = not all_stages                      # Sweeps follow, which begin from the start.
-    s.trace = trace
+    s.trace, s.deadline = trace, NULL
     s.relative = 0.0
     find_substep_islands(&p, &r, &s, memory.islands, memory.reference, &islands)
     result = solve_newton_substep(&p, &r, &s, tol, all_stages, &memory, take_doubles(&a, 0), e.impulse, e.dv)

@@ -8,6 +8,7 @@ c[i, t] c[i, 0]. The method is right-looking: one division, one product and one 
 """
 from libc.stdint cimport int32_t, int64_t
 
+from lavender_ext.core.deadline cimport deadline_t, has_passed, reading_interval
 from lavender_ext.factor.factors cimport clear_pivot_statistics, pivots_t
 from lavender_ext.factor.tiles cimport axpy_subtract
 
@@ -117,14 +118,35 @@ cdef inline void factor_band_ldl_columns(int32_t begin, int32_t end, int32_t wid
             axpy_subtract(last - 1, x[i] * inv, col + 1, x + i + 1)
 
 
+cdef inline double band_work_cost() noexcept nogil:
+    """Return the time [ns] of a column of a band divided by its squared height: "band work" of the rates."""
+    return 0.4
+
+
 cdef inline int32_t full_columns(int32_t n, int32_t width) noexcept nogil:
     """Return the number of columns that have all `width` rows, which come first; 0 if width is 0."""
     return n - width + 1 if n >= width > 0 else 0
 
 
+cdef inline void factor_band_ldl_before_deadline(int32_t n, int32_t width, double* c, const double* size, double tiny,
+                                                 double* x, pivots_t* out, deadline_t* deadline) noexcept nogil:
+    """Factor the columns of full height by (1) in pieces, until the deadline; the pivots after it count as small."""
+    cdef int32_t i = 0, end, full = full_columns(n, width)
+    cdef double cost = band_work_cost() * width * width
+    cdef int32_t columns = <int32_t>max(1.0, reading_interval() / cost)
+    while i < full:
+        end = i + columns if i + columns <= full else full
+        factor_band_ldl_columns(i, end, width, width, c, size, tiny, x, out)
+        if has_passed(deadline, cost * (end - i)):
+            out.small += n - end
+            return
+        i = end
+    factor_band_ldl_columns(full, n, width, 0, c, size, tiny, x, out)
+
+
 cdef inline void factor_band_ldl(int32_t n, int32_t width, double* c, const double* size, double tiny, double* x,
-                                 pivots_t* out) noexcept nogil:
-    """Factor by (1); pivots are compared with size (n) > 0.
+                                 pivots_t* out, deadline_t* deadline) noexcept nogil:
+    """Factor by (1); pivots are compared with size (n) > 0. The pivots after the deadline count as small.
 
     If x is not NULL, the first half of `solve_band_ldl` is applied to it, which is hidden by the latency of the divisions.
     """
@@ -132,6 +154,9 @@ cdef inline void factor_band_ldl(int32_t n, int32_t width, double* c, const doub
     clear_pivot_statistics(out)
     if width == 2:
         factor_tridiagonal_ldl(n, c, size, tiny, x, out)
+        return
+    if deadline != NULL:
+        factor_band_ldl_before_deadline(n, width, c, size, tiny, x, out, deadline)
         return
     if width == 6:                                      # Chains of joints with three rows have this width: constant loop bounds.
         factor_band_ldl_columns(0, full, 6, 6, c, size, tiny, x, out)

@@ -9,9 +9,10 @@ largest entries of their columns.
 """
 from libc.stdint cimport int32_t, int64_t
 
+from lavender_ext.core.deadline cimport deadline_t
 from lavender_ext.core.dot cimport dot
 from lavender_ext.factor.panels cimport (LU_STRIP, factor_panel_by_cholesky, gemm_subtract_lower, gemm_subtract_nonzeros,
-                                         factor_panel_by_lu, swap_entries)
+                                         factor_panel_by_lu, has_passed_after_product, swap_entries)
 from lavender_ext.factor.tiles cimport axpy_subtract
 
 
@@ -24,12 +25,14 @@ cdef inline int64_t panel_offset(int32_t n, int32_t k) noexcept nogil:
     return <int64_t>k * n - <int64_t>PANEL_COLUMNS * (k // PANEL_COLUMNS) * (k // PANEL_COLUMNS - 1) // 2 * PANEL_COLUMNS
 
 
-cdef inline int32_t dense_cholesky(int32_t wide, int32_t n, const double* a, const double* min_pivot, double* l) noexcept nogil:
+cdef inline int32_t dense_cholesky(int32_t wide, int32_t n, const double* a, const double* min_pivot, double* l,
+                                   deadline_t* deadline) noexcept nogil:
     """Write the factor (1) of a symmetric a (n, n) to l; return the number of lost pivots.
 
     l has `cholesky_workspace_size` of `linear.pxd`. The entries of a at and after the diagonal of each row are read. 1 / L_jj
     is stored on the diagonal. A pivot is lost if it does not exceed min_pivot (n); its column of L is zero. If min_pivot is
-    NULL, pivots must be positive, and the factorisation ends with the first panel that loses one.
+    NULL, pivots must be positive, and the factorisation ends with the first panel that loses one. It ends at the deadline, too,
+    and the other pivots count as lost.
     """
     cdef int32_t k, p, j, t, w, lost = 0
     cdef double zero[PANEL_COLUMNS]
@@ -50,11 +53,14 @@ cdef inline int32_t dense_cholesky(int32_t wide, int32_t n, const double* a, con
         # Subtract the earlier panels.
         p = 0
         while p < k:
-            gemm_subtract_lower(wide, n - k, w, PANEL_COLUMNS, l + panel_offset(n, p) + (k - p), n - p, panel, n - k)
+            gemm_subtract_lower(wide, n - k, w, PANEL_COLUMNS, l + panel_offset(n, p) + (k - p), n - p, panel, n - k,
+                                deadline)
             p += PANEL_COLUMNS
         if min_pivot != NULL:
             bound = min_pivot + k
-        lost += factor_panel_by_cholesky(wide, w, n - k, panel, bound)
+        lost += factor_panel_by_cholesky(wide, w, n - k, panel, bound, deadline)
+        if deadline != NULL and deadline.passed:
+            return lost + n - k
         if lost and min_pivot == NULL:
             return lost
         k += PANEL_COLUMNS
@@ -83,18 +89,19 @@ cdef inline void dense_cholesky_solve(int32_t n, const double* l, double* x) noe
             x[k + j] = (x[k + j] - dot(a + 1, x + k + j + 1, rows - j - 1)) * a[0]
 
 
-cdef inline int32_t dense_lu(int32_t wide, int32_t n, double* a, int32_t* swap, double min_pivot) noexcept nogil:
+cdef inline int32_t dense_lu(int32_t wide, int32_t n, double* a, int32_t* swap, double min_pivot,
+                             deadline_t* deadline) noexcept nogil:
     """Overwrite N (n, n), row-major, with the factors of P N^T = L U; return the number of lost pivots.
 
     a then contains L and U by columns, 1 / U_jj on the diagonal, and swap (n) the exchanges. A pivot is lost if it is not finite
-    or does not exceed min_pivot; the factorisation ends with the first panel that loses one.
+    or does not exceed min_pivot; the factorisation ends with the first panel that loses one, or at the deadline.
     """
     cdef int32_t k = 0, j, j0, t, w, columns, lost
     cdef double* y
     cdef double upper[PANEL_COLUMNS * LU_STRIP]
     while k < n:
         w = PANEL_COLUMNS if k + PANEL_COLUMNS <= n else n - k
-        lost = factor_panel_by_lu(wide, w, n - k, n - k, a + <int64_t>k * (n + 1), n, swap + k, min_pivot, upper)
+        lost = factor_panel_by_lu(wide, w, n - k, n - k, a + <int64_t>k * (n + 1), n, swap + k, min_pivot, upper, deadline)
         if lost:
             return lost
         # Exchange the rows of the earlier columns.
@@ -113,6 +120,8 @@ cdef inline int32_t dense_lu(int32_t wide, int32_t n, double* a, int32_t* swap, 
                     upper[t * columns + j] = y[t]
             gemm_subtract_nonzeros(wide, n - k - w, columns, w, a + <int64_t>k * n + k + w, n, upper,
                                    a + <int64_t>j0 * n + k + w, n)
+            if has_passed_after_product(deadline, n - k - w, columns, w):
+                return n - k
             j0 += columns
         for t in range(k, k + w):
             swap[t] += k

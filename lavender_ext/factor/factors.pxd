@@ -1,6 +1,8 @@
 """Structs of the factors of `linear.pxd`, without the functions that compute them."""
 from libc.stdint cimport int32_t, int64_t
 
+from lavender_ext.core.deadline cimport deadline_t
+
 
 cdef extern from *:
     """
@@ -60,6 +62,7 @@ cdef struct supernodal_t:
     int32_t* link               # (supernodes) next descendant in the same list
     int32_t* next_row           # (supernodes) first row of a supernode with an update that has not been done
     interrupt_t* interrupt      # checks for signals, or NULL
+    deadline_t* deadline        # time at which a factorisation ends, or NULL
 
 
 cdef struct sparse_t:

@@ -24,6 +24,7 @@ The fallback is a factorisation by the caller. There is one: SuperLU of SciPy (`
 from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.arena cimport arena_t
+from lavender_ext.core.deadline cimport deadline_t
 from lavender_ext.factor.factors cimport block_matrix_t, interrupt_t, pivots_t, sparse_t
 
 
@@ -75,6 +76,7 @@ cdef struct linear_t:
     block_matrix_t blocks
     double largest              # max |A_ij| of the last L U of ROWS
     const fallback_t* fallback  # factorisation by the caller, or NULL
+    deadline_t* deadline        # time at which a factorisation ends, with lost pivots, or NULL
 
 
 cdef inline double backward_tolerance() noexcept nogil:
@@ -85,11 +87,13 @@ cdef inline double backward_tolerance() noexcept nogil:
 cdef inline void analyse_dense(linear_t* f, int32_t n) noexcept nogil:
     """Set the order of a full matrix."""
     f.kind, f.n, f.cost = DENSE, n, <double>n * n * n / 6.0
+    f.deadline = NULL
 
 
 cdef inline void analyse_band(linear_t* f, int32_t n, int32_t width) noexcept nogil:
     """Set the order of a symmetric matrix with `width` diagonals at and below the main one."""
     f.kind, f.n, f.width, f.cost = BAND, n, width, 0.5 * n * width * width
+    f.deadline = NULL
 
 
 cdef inline void analyse_tree(linear_t* f, int32_t n, const int32_t* lptr, const int32_t* lidx, double* values,
@@ -99,6 +103,7 @@ cdef inline void analyse_tree(linear_t* f, int32_t n, const int32_t* lptr, const
     `scale` must have the diagonal as well.
     """
     f.kind, f.n, f.lptr, f.lidx, f.matrix, f.diagonal = TREE, n, lptr, lidx, values, diagonal
+    f.deadline = NULL
 
 
 cdef int64_t cholesky_workspace_size(int32_t n) noexcept nogil

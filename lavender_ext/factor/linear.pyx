@@ -7,6 +7,7 @@ import numpy as np
 
 from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles, take_integers
 from lavender_ext.core.dot cimport dot
+from lavender_ext.core.deadline cimport Deadline, get_pointer
 from lavender_ext.core.tree cimport factor_tree_matrix
 from lavender_ext.core.tree_solve cimport solve_tree_factor
 from lavender_ext.core.validate cimport norm_inf
@@ -182,6 +183,11 @@ cdef void bind_block_factor_values(block_matrix_t* f, bint lu, int32_t wide, are
 # -- factor ------------------------------------------------------------------------------------------------------
 
 
+cdef inline bint is_late(const linear_t* f) noexcept nogil:
+    """Return whether the deadline has ended the factorisation."""
+    return f.deadline != NULL and f.deadline.passed
+
+
 cdef inline void shift_dense(const linear_t* f) noexcept nogil:
     """Add shift D to the diagonal."""
     cdef int32_t i
@@ -214,15 +220,15 @@ cdef inline void factor_dense(linear_t* f) noexcept nogil:
             for i in range(f.n):
                 f.scale[i] = f.tiny * f.d[i]
             min_pivot = f.scale
-        f.pivots.small = dense_cholesky(f.wide, f.n, f.matrix, min_pivot, f.lower)
+        f.pivots.small = dense_cholesky(f.wide, f.n, f.matrix, min_pivot, f.lower, f.deadline)
         f.factored = CHOLESKY if f.pivots.small == 0 or min_pivot != NULL else NO_FACTOR
-        if f.pivots.small == 0 or not f.by & LU:
+        if f.pivots.small == 0 or not f.by & LU or is_late(f):
             return
     elif f.d != NULL:
         scale_dense(f)
     else:
         shift_dense(f)
-    f.pivots.small = dense_lu(f.wide, f.n, f.matrix, f.swap, f.tiny)
+    f.pivots.small = dense_lu(f.wide, f.n, f.matrix, f.swap, f.tiny, f.deadline)
     f.factored = LU if f.pivots.small == 0 else NO_FACTOR
 
 
@@ -232,7 +238,7 @@ cdef inline void factor_band(linear_t* f) noexcept nogil:
     if f.shift != 0.0:
         for i in range(f.n):
             f.matrix[<int64_t>i * f.width] += f.shift * f.d[i]
-    factor_band_ldl(f.n, f.width, f.matrix, f.d, f.tiny, f.ahead, &f.pivots)
+    factor_band_ldl(f.n, f.width, f.matrix, f.d, f.tiny, f.ahead, &f.pivots, f.deadline)
     f.factored = CHOLESKY
 
 
@@ -245,7 +251,7 @@ cdef inline void factor_compressed_rows(linear_t* f) noexcept nogil:
     for i in range(f.n if f.d != NULL else 0):
         negative += not f.d[i] > 0.0
     f.pivots.small = negative if negative else factor_sparse(&f.rows, lu, f.d, f.shift, f.tiny)
-    if f.pivots.small and f.fallback != NULL:
+    if f.pivots.small and f.fallback != NULL and not is_late(f):
         replace_factor_by_fallback(f)
 
 
@@ -257,8 +263,12 @@ cdef inline void replace_factor_by_fallback(linear_t* f) noexcept nogil:
 
 
 cdef int32_t factor_linear_system_matrix(linear_t* f) noexcept nogil:
-    """Factor A + shift D; return the number of lost pivots. For BAND, `pivots` also contains the number of negative pivots."""
+    """Factor A + shift D, until the deadline; return the number of lost pivots.
+
+    For BAND, `pivots` also contains the number of negative pivots.
+    """
     cdef int32_t lost
+    f.rows.factor.deadline = f.blocks.factor.deadline = f.deadline
     clear_pivot_statistics(&f.pivots)
     if f.kind == DENSE:
         factor_dense(f)
@@ -271,7 +281,7 @@ cdef int32_t factor_linear_system_matrix(linear_t* f) noexcept nogil:
         f.pivots.small = factor_blocks(&f.blocks, f.by == LU)
     else:
         f.factored = CHOLESKY
-        lost = factor_tree_matrix(f.n, f.lptr, f.lidx, f.matrix, f.diagonal, f.scale, f.tiny)
+        lost = factor_tree_matrix(f.n, f.lptr, f.lidx, f.matrix, f.diagonal, f.scale, f.tiny, f.deadline)
         f.pivots.small, f.pivots.first_small = lost >= 0, lost
     return f.pivots.small
 
@@ -534,8 +544,10 @@ cdef class LinearSystem:
             return np.inf
         return self.f.cost
 
-    def factor(self, data, d=None, double shift=0.0, double tiny=0.0, bint lu=False):
+    def factor(self, data, d=None, double shift=0.0, double tiny=0.0, bint lu=False, Deadline deadline=None):
         """Factor A + shift D as L U (`lu`) or L L^T; return the number of pivots that do not exceed tiny d.
+
+        The result is -1 if the deadline has passed before the end.
 
         Parameters
         ----------
@@ -562,8 +574,11 @@ cdef class LinearSystem:
             self.f.d = &metric[0]
         self.f.rows.data = self.f.matrix = <double*>&x[0]
         self.f.shift, self.f.tiny, self.f.by = shift, tiny, LU if lu else CHOLESKY
+        self.f.deadline = get_pointer(deadline)
         with nogil:
             lost = factor_linear_system_matrix(&self.f)
+        if is_late(&self.f):
+            self.f.factored, lost = NO_FACTOR, -1
         if self.python.interrupt.stopped:
             self.f.factored = NO_FACTOR
         self.python.raise_error()

@@ -9,6 +9,7 @@ A panel is stored column by column; its first `width` rows are those of its own 
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 
+from lavender_ext.core.deadline cimport deadline_t, entry_cost, has_passed, product_cost
 from lavender_ext.factor.tiles cimport axpy_subtract, gemm_subtract_nt, is_large_product, solve_three_columns
 
 
@@ -18,9 +19,14 @@ cdef enum:
     LU_STRIP = 12               # number of columns of (2) that are finished together: the width of four tiles
 
 
+cdef inline bint has_passed_after_product(deadline_t* deadline, double m, double n, double k) noexcept nogil:
+    """Count a product of (m, k) and (k, n) that is added to a matrix; return whether the deadline has passed."""
+    return deadline != NULL and has_passed(deadline, m * n * (entry_cost() + product_cost() * k))
+
+
 cdef inline void gemm_subtract_lower(int32_t wide, int32_t m, int32_t n, int32_t k, const double* a, int64_t lda, double* c,
-                                     int64_t ldc) noexcept nogil:
-    """Subtract A B^T from C (m, n) on and below its diagonal; B is the first n rows of A (m, k).
+                                     int64_t ldc, deadline_t* deadline) noexcept nogil:
+    """Subtract A B^T from C (m, n) on and below its diagonal, until the deadline; B is the first n rows of A (m, k).
 
     Entries above the diagonal are changed within strips of LU_STRIP columns, or of CHOLESKY_BLOCK columns of a large product.
     """
@@ -29,15 +35,17 @@ cdef inline void gemm_subtract_lower(int32_t wide, int32_t m, int32_t n, int32_t
     while j < n:
         columns = strip if j + strip <= n else n - j
         gemm_subtract_nt(wide, m - j, columns, k, a + j, lda, a + j, lda, c + j + j * ldc, ldc)
+        if has_passed_after_product(deadline, m - j, columns, k):
+            return
         j += columns
 
 
-cdef inline int32_t factor_panel_by_cholesky(int32_t wide, int32_t width, int32_t rows, double* a,
-                                             const double* min_pivot) noexcept nogil:
+cdef inline int32_t factor_panel_by_cholesky(int32_t wide, int32_t width, int32_t rows, double* a, const double* min_pivot,
+                                             deadline_t* deadline) noexcept nogil:
     """Factor the panel a (rows, width) by (1) in place; return the number of pivots that are too small.
 
-    A pivot must exceed min_pivot (width), or, if that is NULL, 1e-15 of its value before the last strip. The column of L of a
-    pivot that is too small is zero.
+    The pivots after the deadline count as too small. A pivot must exceed min_pivot (width), or, if that is NULL, 1e-15 of its value
+    before the last strip. The column of L of a pivot that is too small is zero.
     """
     cdef int32_t j, j0 = 0, t, n, lost = 0, block = 0
     cdef double x
@@ -49,9 +57,11 @@ cdef inline int32_t factor_panel_by_cholesky(int32_t wide, int32_t width, int32_
         if j0 == block + CHOLESKY_BLOCK:
             block = j0
             gemm_subtract_lower(wide, rows - j0, CHOLESKY_BLOCK if j0 + CHOLESKY_BLOCK <= width else width - j0, j0,
-                                a + j0, rows, a + j0 + <int64_t>j0 * rows, rows)
+                                a + j0, rows, a + j0 + <int64_t>j0 * rows, rows, deadline)
         gemm_subtract_nt(wide, rows - j0, n, j0 - block, a + j0 + <int64_t>block * rows, rows, a + j0 + <int64_t>block * rows,
                          rows, a + j0 + <int64_t>j0 * rows, rows)
+        if has_passed_after_product(deadline, rows - j0, n, j0 - block):
+            return width - j0
         for j in range(n):
             diagonal[j] = a[(j0 + j) + <int64_t>(j0 + j) * rows]
         # Factor the diagonal block.
@@ -109,11 +119,12 @@ cdef inline void swap_entries(double* y, int32_t n, const int32_t* swap) noexcep
 
 
 cdef inline int32_t factor_panel_by_lu(int32_t wide, int32_t width, int32_t rows, int32_t candidates, double* a, int64_t lda,
-                                       int32_t* swap, double min_pivot, double* scratch) noexcept nogil:
+                                       int32_t* swap, double min_pivot, double* scratch, deadline_t* deadline) noexcept nogil:
     """Factor the panel a (rows, width) by (2) in place; return the number of pivots that are too small.
 
-    The pivot of a column is its largest entry among the first `candidates` rows, whose exchange is written to swap (width). It
-    must be finite and exceed min_pivot; otherwise its column of L is zero. scratch has LU_STRIP width doubles.
+    The pivots after the deadline count as too small. The pivot of a column is its largest entry among the first `candidates` rows,
+    whose exchange is written to swap (width). It must be finite and exceed min_pivot; otherwise its column of L is zero. scratch
+    has LU_STRIP width doubles.
     """
     cdef int32_t j, j0 = 0, t, n, i, best, lost = 0
     cdef double x, largest
@@ -130,6 +141,8 @@ cdef inline int32_t factor_panel_by_lu(int32_t wide, int32_t width, int32_t rows
                     axpy_subtract(j0 - t - 1, y[t], a + (t + 1) + t * lda, y + t + 1)
                 scratch[t * n + j - j0] = y[t]
         gemm_subtract_nonzeros(wide, rows - j0, n, j0, a + j0, lda, scratch, a + j0 + j0 * lda, lda)
+        if has_passed_after_product(deadline, rows - j0, n, j0):
+            return width - j0
         # Factor the strip.
         for j in range(j0, j0 + n):
             y = a + j * lda

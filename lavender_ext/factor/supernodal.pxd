@@ -15,7 +15,8 @@ from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memset
 
 from lavender_ext.factor.factors cimport interrupt_t, supernodal_t
-from lavender_ext.factor.panels cimport LU_STRIP, factor_panel_by_cholesky, gemm_subtract_lower, factor_panel_by_lu
+from lavender_ext.factor.panels cimport (LU_STRIP, factor_panel_by_cholesky, factor_panel_by_lu, gemm_subtract_lower,
+                                         has_passed_after_product)
 from lavender_ext.factor.tiles cimport add_vector, axpy_subtract, gemm_subtract_nt
 
 
@@ -25,8 +26,10 @@ cdef inline double interrupt_check_interval() noexcept nogil:
 
 
 cdef inline bint count_work_and_check_stop(const supernodal_t* f, double work) noexcept nogil:
-    """Count `work` multiply-adds; return whether this check, or an earlier one, ended the factorisation."""
+    """Count `work` multiply-adds; return whether a signal or the deadline ends the factorisation."""
     cdef interrupt_t* c = f.interrupt
+    if f.deadline != NULL and f.deadline.passed:
+        return True
     if c == NULL:
         return False
     c.work += work
@@ -80,6 +83,21 @@ cdef inline void add_scratch_to_panel(const supernodal_t* f, int32_t begin, int3
         row = run_end
 
 
+cdef inline void subtract_product(const supernodal_t* f, int32_t m, int32_t n, int32_t k, const double* a, int32_t lda,
+                                  const double* b, int32_t ldb, double* c, int64_t ldc) noexcept nogil:
+    """Subtract A B^T from C (m, n); with a deadline in strips of columns, until it."""
+    cdef int32_t j = 0, columns
+    if f.deadline == NULL:
+        gemm_subtract_nt(f.wide, m, n, k, a, lda, b, ldb, c, ldc)
+        return
+    while j < n:
+        columns = LU_STRIP if j + LU_STRIP <= n else n - j
+        gemm_subtract_nt(f.wide, m, columns, k, a, lda, b + j, ldb, c + j * ldc, ldc)
+        if has_passed_after_product(f.deadline, m, columns, k):
+            return
+        j += columns
+
+
 cdef inline void subtract_column_runs(const supernodal_t* f, int32_t m, int32_t n, int32_t k, const double* u, int32_t ldu,
                                       const double* a, int32_t lda, const int32_t* columns, int32_t base, double* c,
                                       int32_t ldc) noexcept nogil:
@@ -89,7 +107,7 @@ cdef inline void subtract_column_runs(const supernodal_t* f, int32_t m, int32_t 
         run_end = j + 1
         while run_end < n and columns[run_end] - columns[j] == run_end - j:
             run_end += 1
-        gemm_subtract_nt(f.wide, m, run_end - j, k, u, ldu, a + j, lda, c + <int64_t>ldc * (columns[j] - base), ldc)
+        subtract_product(f, m, run_end - j, k, u, ldu, a + j, lda, c + <int64_t>ldc * (columns[j] - base), ldc)
         j = run_end
 
 
@@ -111,19 +129,19 @@ cdef inline void subtract_descendant(const supernodal_t* f, int32_t i, int32_t k
     f.next_row[k] = q + n
     if not lu:
         if is_run:
-            gemm_subtract_lower(f.wide, m, n, width, a, rows, panel + ld * low + low, ld)
+            gemm_subtract_lower(f.wide, m, n, width, a, rows, panel + ld * low + low, ld, f.deadline)
         else:
             memset(f.scratch, 0, sizeof(double) * m * n)
-            gemm_subtract_lower(f.wide, m, n, width, a, rows, f.scratch, m)
+            gemm_subtract_lower(f.wide, m, n, width, a, rows, f.scratch, m, f.deadline)
             add_scratch_to_panel(f, q, end, 0, n, columns, base, ld, panel)
         return
     # update of the columns of L (and of the diagonal block of U)
     u = f.upper + f.upper_offset[k] + r
     if is_run:
-        gemm_subtract_nt(f.wide, m, n, width, a, rows, u, below, panel + ld * low + low, ld)
+        subtract_product(f, m, n, width, a, rows, u, below, panel + ld * low + low, ld)
     else:
         memset(f.scratch, 0, sizeof(double) * m * n)
-        gemm_subtract_nt(f.wide, m, n, width, a, rows, u, below, f.scratch, m)
+        subtract_product(f, m, n, width, a, rows, u, below, f.scratch, m)
         add_scratch_to_panel(f, q, end, 0, n, columns, base, ld, panel)
     # update of the rows of U
     if m > n:
@@ -133,7 +151,7 @@ cdef inline void subtract_descendant(const supernodal_t* f, int32_t i, int32_t k
             subtract_column_runs(f, m - n, n, width, u + n, below, a, rows, columns, base, panel + low - own, beside)
         else:
             memset(f.scratch, 0, sizeof(double) * (m - n) * n)
-            gemm_subtract_nt(f.wide, m - n, n, width, u + n, below, a, rows, f.scratch, m - n)
+            subtract_product(f, m - n, n, width, u + n, below, a, rows, f.scratch, m - n)
             add_scratch_to_panel(f, q + n, end, own, n, columns, base, beside, panel)
 
 
@@ -186,13 +204,15 @@ cdef inline int32_t factor_supernode_by_lu(const supernodal_t* f, int32_t width,
                                            int32_t* swap, double min_pivot) noexcept nogil:
     """Factor one panel a and its rows u of U, transposed, by (2) and (3); return the number of pivots that are too small."""
     cdef int32_t j, j0 = 0, t, n, rows = width + below
-    cdef int32_t lost = factor_panel_by_lu(f.wide, width, rows, width, a, rows, swap, min_pivot, f.scratch)
-    if below == 0:
+    cdef int32_t lost = factor_panel_by_lu(f.wide, width, rows, width, a, rows, swap, min_pivot, f.scratch, f.deadline)
+    if below == 0 or f.deadline != NULL and f.deadline.passed:
         return lost
     swap_columns(u, width, below, swap)
     while j0 < width:                                   # Solve with L.
         n = LU_STRIP if j0 + LU_STRIP <= width else width - j0
         gemm_subtract_nt(f.wide, below, n, j0, u, below, a + j0, rows, u + <int64_t>j0 * below, below)
+        if has_passed_after_product(f.deadline, below, n, j0):
+            return width
         for j in range(j0 + 1, j0 + n):
             for t in range(j0, j):
                 axpy_subtract(below, a[j + <int64_t>t * rows], u + <int64_t>t * below, u + <int64_t>j * below)
@@ -204,7 +224,7 @@ cdef inline int32_t factor_supernode(const supernodal_t* f, int32_t i, const int
                                      double min_lu_pivot) noexcept nogil:
     """Factor supernode i, whose entries of N are filled in and whose `local_row` is set; return the number of lost pivots.
 
-    After a request to end, every pivot counts as lost.
+    After a request to end, or the deadline, every pivot counts as lost.
 
     min_pivot (n), by position, is that of `factor_panel_by_cholesky`, or NULL; min_lu_pivot that of `factor_panel_by_lu`.
     """
@@ -222,7 +242,8 @@ cdef inline int32_t factor_supernode(const supernodal_t* f, int32_t i, const int
     if lu:
         lost = factor_supernode_by_lu(f, width, below, a, f.upper + f.upper_offset[i], f.swap + f.first[i], min_lu_pivot)
     else:
-        lost = factor_panel_by_cholesky(f.wide, width, width + below, a, min_pivot + f.first[i] if min_pivot != NULL else NULL)
+        lost = factor_panel_by_cholesky(f.wide, width, width + below, a, min_pivot + f.first[i] if min_pivot != NULL else NULL,
+                                        f.deadline)
     link_descendant(f, i, f.row_ptr[i])
     return lost
 

@@ -63,7 +63,7 @@ from lavender_ext.newton.run cimport (ACTIVE_SET, AUGMENTED_NEWTON, DAMPED_NEWTO
                                       is_budget_spent, is_finished, is_over, newton_t, pop_phase, push_phase, restore_best_of_all,
                                       restore_best_before_phase, judge_and_keep_best_point, store_earlier_best, write_unknown)
 from lavender_ext.newton.steps cimport begin_interior_point, has_free_rows, compute_proximal_weight
-from lavender_ext.newton.system cimport (BARRIER, BODIES, factor_newton_system, multiply_system_matrix,
+from lavender_ext.newton.system cimport (BARRIER, BODIES, factor_newton_system, has_passed_after_part, multiply_system_matrix,
                                          solve_newton_system)
 
 
@@ -448,11 +448,13 @@ cdef inline void start_newton_solve(newton_t* n, const double* lam) noexcept nog
 
 
 cdef inline int32_t step_newton_solve(newton_t* n, int32_t work) noexcept nogil:
-    """Do at least `work` factorisations, unless the solve ends before; return the outcome so far."""
+    """Do at least `work` factorisations, unless the solve or the deadline ends before; return the outcome so far."""
     cdef int32_t last = n.s.factorisations + work
     n.needs_check = 0
     while n.depth > 0 and not n.needs_check and (n.stop or n.s.factorisations < last):
         step_phase(n)
+        if has_passed_after_part(&n.s):
+            n.stop = 1
     if n.needs_check:
         return CERTIFICATE
     if n.depth > 0:

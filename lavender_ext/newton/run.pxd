@@ -20,7 +20,7 @@ from lavender_ext.judge.score cimport make_empty_score, relative_residual, score
 from lavender_ext.newton.interior cimport interior_t
 from lavender_ext.newton.natural_map cimport compute_convex_residual
 from lavender_ext.newton.scaling cimport bind_element_indices, bind_element_values, scale_elements, scaled_t
-from lavender_ext.newton.system cimport system_t, multiply_system_matrix
+from lavender_ext.newton.system cimport has_passed_after_part, multiply_system_matrix, system_t
 
 
 cdef enum:                      # phases
@@ -422,6 +422,7 @@ cdef inline double judge_and_keep_best_point(newton_t* n, const double* z) noexc
     """
     cdef double residual = judge_point(n, z, False), combined
     cdef view_t v = view_t(n.problem.p, n.problem.a, n.problem.r, n.problem.g)
+    has_passed_after_part(&n.s)
     if residual < n.best:
         n.best = residual
         copy_vector(n, n.best_z, z)

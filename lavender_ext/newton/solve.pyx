@@ -104,7 +104,7 @@ cdef int32_t step_newton_system(const view_t* v, const options_t* o, const works
                                 info_t* info) noexcept nogil:
     cdef newton_t* n = state_of(r)
     cdef int32_t how
-    n.budget, n.proven, n.stop = o.budget, o.proven, o.stop
+    n.budget, n.proven, n.stop, n.linear.deadline = o.budget, o.proven, o.stop, o.deadline
     how = step_newton_solve(n, work)
     if n.best <= n.tol or n.island_best.seen == 0:
         write_impulse(n, n.best_z, lam)

@@ -16,6 +16,7 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy, memset
 
+from lavender_ext.core.deadline cimport has_passed
 from lavender_ext.core.csr cimport csr_row_dot
 from lavender_ext.core.validate cimport all_finite, norm_inf
 from lavender_ext.core.dot cimport dot
@@ -207,7 +208,7 @@ cdef inline int32_t factor_sparse(system_t* s, int32_t what, double eps) noexcep
         f.by, f.d = CHOLESKY, s.q
         for j in range(s.e.m):
             s.q[j] = f.rows.data[s.coupled.diagonal[j]]         # A pivot is compared with its diagonal entry.
-        if factor_linear_system_matrix(f) == 0 or f.fallback != NULL:
+        if factor_linear_system_matrix(f) == 0 or f.fallback != NULL or f.deadline != NULL and f.deadline.passed:
             return f.pivots.small == 0
         f.by = LU
         f.d = NULL
@@ -238,8 +239,18 @@ cdef inline void solve_dense(system_t* s, double* x) noexcept nogil:
 # -- (1) to (3) ------------------------------------------------------------------------------------------------
 
 
+cdef inline bint has_passed_after_part(const system_t* s) noexcept nogil:
+    """Count a sixth of a step without its factorisation, and return whether the deadline has passed.
+
+    A step takes 306 ns per row: "row" of the rates.
+    """
+    return has_passed(s.linear.deadline, 51.0 * s.e.m)
+
+
 cdef inline int32_t factor_newton_system(system_t* s, int32_t what, double eps) noexcept nogil:
-    """Factor (1), (2), or (3) with the last `evaluate_system_natural_map`; return 0 if a pivot fails."""
+    """Factor (1), (2), or (3) with the last `evaluate_system_natural_map`; return 0 if a pivot fails, or after the deadline."""
+    if has_passed_after_part(s):
+        return 0
     s.factorisations += 1
     if s.augmented:
         return s.others.factor(s.others.at, what, eps)
@@ -282,6 +293,7 @@ cdef inline void solve_newton_system(system_t* s, int32_t what, const double* r,
     """Solve (1) or (2) for dz in `out`, which must not be r."""
     cdef int32_t j, m = s.e.m
     cdef const double* left = s.pair if what == PAIR else s.bt
+    has_passed_after_part(s)
     if s.form == BODIES and not s.augmented:
         multiply_by_element_matrices(s.e, s.v, r, s.t, False)
         apply_body_inverse(s, s.t, s.q)
@@ -315,6 +327,7 @@ cdef inline double evaluate_system_natural_map(system_t* s, const double* z, con
 cdef inline void solve_natural_map_system(system_t* s, const double* r, double* out) noexcept nogil:
     """Solve (3) for dz in `out`, which must not be r."""
     cdef int32_t j, m = s.e.m
+    has_passed_after_part(s)
     if s.form == BODIES and not s.augmented:
         multiply_by_element_matrices(s.e, s.einv, r, s.t, False)
         apply_body_inverse(s, s.t, s.q)

@@ -13,6 +13,7 @@ from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.arena cimport arena_t, take_doubles, take_integers
 from lavender_ext.core.block_types cimport blocks_t
+from lavender_ext.core.deadline cimport deadline_t
 from lavender_ext.core.view cimport rows_t
 
 
@@ -49,6 +50,7 @@ cdef struct warm_t:
     double relative             # relative residual of lam
     double* trace               # (MAX_TRACED_SCORES, 3) or NULL: work so far, E [sqrt J], max |e_n| [N s] of each score
     int32_t n_traced
+    deadline_t* deadline        # time at which the sweeps or the factorisation end without a result, or NULL
 
 
 cdef inline void bind_warm_start(warm_t* s, const blocks_t* p, const rows_t* r, arena_t* a) noexcept nogil:

@@ -78,6 +78,6 @@ cdef void judge_iterate(direct_t* t) noexcept nogil
 cdef class Pivoting:
     cdef direct_t t
     cdef Data p, judged
-    cdef object reals, ints, order, outside, error
+    cdef object reals, ints, order, outside, error, deadline
 
     cdef int raise_error(self, int32_t code) except -1

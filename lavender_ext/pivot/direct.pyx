@@ -28,6 +28,7 @@ from libc.string cimport memcpy
 
 import numpy as np
 
+from lavender_ext.core.deadline cimport get_pointer
 from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles, take_integers
 from lavender_ext.core.block cimport clip
 from lavender_ext.core.problem cimport Data
@@ -158,7 +159,7 @@ cdef inline int32_t judge_and_refine_exchanges(direct_t* t, int32_t code) noexce
 # -- linear systems and exchanges --------------------------------------------------------------------------------
 
 cdef inline int32_t factor_linear_system(direct_t* t) noexcept nogil:
-    """Factor A with all rows free; return SOLVED, SMALL_PIVOT, INDEFINITE, or ROUNDS_USED if an outside factor is not started."""
+    """Factor A with all rows free; return SOLVED, SMALL_PIVOT, INDEFINITE, or ROUNDS_USED after the deadline."""
     if not t.s.is_factored:
         factor_all_rows(&t.s)
     if t.s.late:
@@ -516,6 +517,10 @@ cdef class Pivoting:
         self.t.least, self.t.sweeps = least, sweeps
         memcpy(self.t.start, &start[0], self.t.s.n * sizeof(double))
 
+    def set_deadline(self, deadline):
+        """Set the time at which rounds and compiled factors end, or None."""
+        self.deadline, self.t.s.deadline = deadline, get_pointer(deadline)
+
     def advance(self, int max_rounds):
         """Do up to `max_rounds` rounds, refine and judge; return the result of the step (table in direct.pyx)."""
         cdef int32_t code
@@ -551,7 +556,7 @@ cdef class Pivoting:
 
     @property
     def late(self):
-        """Whether an outside factor was not started because of the deadline."""
+        """Whether the deadline has ended the rounds."""
         return bool(self.t.s.late)
 
     @property

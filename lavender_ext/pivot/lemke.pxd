@@ -12,7 +12,7 @@ cpdef enum:                     # results of `follow_lemke_paths`
     DONE = 0                    # the residual is at rounding, or every path has ended
     PIVOTS = 1                  # the pivots of the call are used up
     RAY = 2                     # no variable leaves: `get_ray_direction` may be a certificate
-    LATE = 3                    # a factor at the end of a path was not started, because of the deadline
+    LATE = 3                    # the deadline has passed
 
 
 cdef struct dictionary_t:

@@ -27,7 +27,7 @@ States of a solve, and the events that change them:
     START  -> WALK     a dictionary is built; z is basic unless s = 0 is the solution
     WALK   -> WALK     the pivots of the call are used up: returns PIVOTS
     WALK   -> FINISH   z has left, or the path is too long, or no row leaves: then returns RAY, whose direction the host checks
-    FINISH -> FINISH   a factor would end after the deadline: returns LATE
+    WALK -> WALK, FINISH -> FINISH   the deadline has passed: returns LATE
     FINISH -> START    the residual is above rounding: another path, with another covering vector c
     FINISH -> OVER     the residual is at rounding, or there were MAX_PATHS paths: returns DONE
 
@@ -40,6 +40,7 @@ from libc.string cimport memcpy
 
 import numpy as np
 
+from lavender_ext.core.deadline cimport has_passed
 from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles, take_integers
 from lavender_ext.core.validate cimport norm_inf
 from lavender_ext.core.order cimport next_random
@@ -383,7 +384,7 @@ cdef inline void begin_lemke_path(lemke_t* l) noexcept nogil:
 
 
 cdef inline int32_t follow_lemke_path(lemke_t* l, int32_t max_pivots) noexcept nogil:
-    """Pivot until z leaves (DONE), no variable leaves (RAY), or there are `max_pivots` pivots (PIVOTS)."""
+    """Pivot until z leaves (DONE), no variable leaves (RAY), there are `max_pivots` pivots (PIVOTS), or it is LATE."""
     cdef dictionary_t* d = &l.d
     cdef int32_t r, leaving
     if d.entering == NO_COLUMN:
@@ -398,6 +399,8 @@ cdef inline int32_t follow_lemke_path(lemke_t* l, int32_t max_pivots) noexcept n
         if leaving == 2 * d.n_pairs:
             return DONE
         d.entering = column_of_nonbasic_variable(d, complementary_variable(d, leaving))
+        if has_passed(l.t.s.deadline, <double>d.width * d.n_pairs):     # 1 ns per entry: "dictionary pivot" of the rates
+            return LATE
     return PIVOTS
 
 
@@ -486,8 +489,8 @@ cdef int32_t follow_lemke_paths(lemke_t* l, int32_t pivots) noexcept nogil:
             begin_lemke_path(l)
         if l.state == WALK:
             code = follow_lemke_path(l, min(max_pivots, l.max_pivots))
-            if code == PIVOTS and l.n_pivots < l.max_pivots:
-                return PIVOTS
+            if code == PIVOTS and l.n_pivots < l.max_pivots or code == LATE:
+                return code
             judge_path_impulse(l)
             begin_bound_exchanges(l.t)
             l.state = FINISH

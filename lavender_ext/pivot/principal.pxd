@@ -1,6 +1,7 @@
 """Declarations of principal pivoting (`principal.pyx`): its state, results and operations."""
 from libc.stdint cimport int32_t
 
+from lavender_ext.core.deadline cimport deadline_t
 from lavender_ext.core.arena cimport arena_t
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport csr_t
@@ -48,9 +49,10 @@ cdef struct pivoting_t:
     int32_t exchanged           # number of changes of rows between free and a bound so far
     int32_t factorisations
     int32_t n_rounds
-    int32_t late                # An outside factor was not started, because of the deadline.
+    deadline_t* deadline        # time at which rounds and compiled factors end, or NULL
+    int32_t late                # The deadline has passed.
     void* outside               # owner of an outside factor, whose rows are the rows with a place >= 0, numbered as in A; or NULL
-    outside_factor_t factor_outside     # returns the number of small pivots; -1 if it was not started
+    outside_factor_t factor_outside     # returns the number of small pivots; -1 after the deadline
     outside_solve_t solve_outside       # y (n_free) <- solution
 
 

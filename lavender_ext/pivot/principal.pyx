@@ -13,6 +13,7 @@ factors D^-1/2 (A_FF + s D_FF) D^-1/2, dense, with row exchanges for the largest
 from libc.math cimport fabs
 from libc.stdint cimport int32_t, int64_t
 
+from lavender_ext.core.deadline cimport has_passed
 from lavender_ext.core.arena cimport arena_t, take_doubles, take_integers
 from lavender_ext.core.block cimport project_row_update
 from lavender_ext.core.csr cimport csr_row_dot
@@ -105,9 +106,11 @@ cdef void factor_free_rows(pivoting_t* s, double* x) noexcept nogil:
         copy_free_rows_to_dense_matrix(s)
     else:
         copy_free_rows_to_band(s)
+    s.linear.deadline = s.deadline
     factor_linear_system_matrix(&s.linear)
     s.factorisations += 1
     s.is_factored = 1
+    s.late = s.deadline != NULL and s.deadline.passed
 
 
 cdef inline void solve_free_rows(pivoting_t* s, double* y) noexcept nogil:
@@ -274,7 +277,7 @@ cdef inline bint is_solved_with_all_rows_free(pivoting_t* s) noexcept nogil:
         if s.p.lower[i] == s.p.upper[i]:
             return False
     factor_all_rows(s)
-    if s.linear.pivots.negative > 0 or s.linear.pivots.small > 0:
+    if s.late or s.linear.pivots.negative > 0 or s.linear.pivots.small > 0:
         s.is_factored = 0
         return False
     solve_with_all_rows_free(s)
@@ -285,10 +288,19 @@ cdef inline bint is_solved_with_all_rows_free(pivoting_t* s) noexcept nogil:
     return True
 
 
+cdef inline double symmetric_sweep_cost() noexcept nogil:
+    """Return the time [ns] of a symmetric sweep, or of a round without its factor, per entry of A."""
+    return 4.0
+
+
 cdef int32_t run_exchange_rounds(pivoting_t* s, int32_t max_rounds) noexcept nogil:
-    """Factor, solve and exchange, at most `max_rounds` times, until no row is infeasible or an outside factor is not started."""
+    """Factor, solve and exchange, at most `max_rounds` times, until no row is infeasible or the deadline has passed."""
     cdef int32_t _, n_infeasible
+    cdef double cost = symmetric_sweep_cost() * s.a.indptr[s.n]
     for _ in range(max_rounds):
+        if has_passed(s.deadline, cost):
+            s.late = 1
+            return ROUNDS_USED
         s.n_rounds += 1
         set_bound_rows_to_bounds(s)
         compute_slack_and_rounding(s)

@@ -1,6 +1,7 @@
 """Solver call for small problems: `derive_small_problem` once, then `solve_small` from any start, on a copy for each thread."""
 from libc.stdint cimport int32_t
 
+from lavender_ext.core.deadline cimport deadline_t
 from lavender_ext.core.method cimport workspace_t
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport view_t
@@ -48,7 +49,7 @@ cdef bint can_use_small_call(const blocks_t* p) noexcept nogil
 cdef bint are_all_rows_bounded(const blocks_t* p) noexcept nogil
 cdef bint derive_small_problem(small_problem_t* s, workspace_t* workspace) noexcept nogil
 cdef void judge_small_impulse(small_problem_t* s, const double* lam, double* both, double* scratch) noexcept nogil
-cdef int32_t solve_small(small_problem_t* s, const small_rules_t* rules, double* own, bint cold, double tol, double max_cost,
+cdef int32_t solve_small(small_problem_t* s, const small_rules_t* rules, double* own, bint cold, double tol, deadline_t* deadline,
                          double* both, solve_workspaces_t* workspaces, int32_t* counts) noexcept nogil
 
 

@@ -19,6 +19,7 @@ import numpy as np
 
 from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles, take_integers
 from lavender_ext.core.arrays cimport as_double_pointer, make_read_only, ndarray
+from lavender_ext.core.deadline cimport deadline_t, get_pointer, has_passed
 from lavender_ext.core.csr cimport measure_asymmetry_and_bandwidth
 from lavender_ext.core.block_types cimport (CONE, CONTACT_ROLLING, N_FRICTION_ARRAYS, ROUND, blocks_t, get_friction_arrays,
                                             has_independent_rows, bind_friction_arrays)
@@ -48,7 +49,6 @@ cdef enum:
     ACTIVE_SET_SWEEPS = 2       # number of sweeps that predict which rows are free
     MAX_PASS_EXCHANGES = 32     # largest number of rounds of exchanges in one pass
     LEMKE_PIVOTS_PER_ROW = 8    # largest number of pivots of Lemke's paths, per row
-    EXCHANGE_NS_PER_ROW = 50    # estimated cost [ns] of a round of exchanges per row, in addition to its factorisation
     FULL_SWEEP_ROWS = 12        # Islands with at most this many rows get all sweeps before their factorisations.
     MAX_KEPT_DOUBLES = 4096     # A larger workspace is freed after a run, since many problems may be kept for long.
     INTERRUPT_CHECK_WORK = 5000000      # multiply-adds between two checks for Ctrl-C, a few milliseconds
@@ -142,54 +142,44 @@ cdef inline bint is_direct_solve_converged(const direct_t* t, double tol, bint t
     return t.relative <= tol and (is_solved_to_rounding(t) or (tol_suffices and t.solved and not t.linear))
 
 
-cdef inline int32_t count_remaining_rounds(const direct_t* t, double max_rounds) noexcept nogil:
-    """Return the largest number of rounds of the next step: MAX_PASS_EXCHANGES, or fewer if `max_rounds` in total are reached."""
-    cdef double remaining = max_rounds - t.s.n_rounds
-    return MAX_PASS_EXCHANGES if remaining > MAX_PASS_EXCHANGES else <int32_t>max(remaining, 0.0)
-
-
-cdef inline bint run_exchanges(direct_t* t, const double* start, double tol, bint tol_suffices, double max_rounds) noexcept nogil:
+cdef inline bint run_exchanges(direct_t* t, const double* start, double tol, bint tol_suffices) noexcept nogil:
     """Solve by exchanges into `best`; return whether the result is converged.
 
-    Passes with a shifted matrix end if one does not halve the residual or is stuck, or after `max_rounds` rounds in total.
+    Passes with a shifted matrix end if one does not halve the residual or is stuck, or at the deadline.
     """
     cdef int32_t code
     begin_direct_solve(t, start)
-    code = step_direct_solve(t, count_remaining_rounds(t, max_rounds))
+    code = step_direct_solve(t, MAX_PASS_EXCHANGES)
     # If A is singular, passes with a shift follow.
     if t.symmetric and t.state == PASS and (code == SMALL_PIVOT or t.linear):
         code = PASS_HALVED
-        while code == PASS_HALVED and t.s.n_rounds < max_rounds:
-            code = step_direct_solve(t, count_remaining_rounds(t, max_rounds))
+        while code == PASS_HALVED and not t.s.late:
+            code = step_direct_solve(t, MAX_PASS_EXCHANGES)
             if not t.relative < INFINITY:
                 return False
     return is_direct_solve_converged(t, tol, tol_suffices)
 
 
-cdef inline int32_t run_lemke_paths(direct_t* t, double tol, double* remaining_cost, workspace_t* workspace) noexcept nogil:
+cdef inline int32_t run_lemke_paths(direct_t* t, double tol, workspace_t* workspace) noexcept nogil:
     """Follow Lemke's paths after stuck exchanges, with exchanges at the end of each.
 
-    Returns the number of pivots, -1 if the residual is above tol. remaining_cost [ns] is reduced by their cost.
+    Returns the number of pivots, -1 if the residual is above tol.
     """
     cdef lemke_t l
     cdef arena_t arena = make_arena(workspace.real, workspace.index)
-    cdef double each = 2.0 * <double>t.s.n ** 2
     cdef int32_t limit = LEMKE_PIVOTS_PER_ROW * t.s.n
-    cdef int32_t last = limit if remaining_cost[0] > limit * each else <int32_t>(remaining_cost[0] / each)
     bind_lemke_arrays(&l, t, &arena)
     if not fits_workspace(workspace, &arena):
         if not grow_workspace_to_arena(workspace, &arena):
             return -1
         bind_lemke_arrays(&l, t, &arena)
     begin_lemke_solve(&l)
-    while follow_lemke_paths(&l, last - l.n_pivots) == RAY:
+    while follow_lemke_paths(&l, limit - l.n_pivots) == RAY:
         pass
-    if last < limit:
-        remaining_cost[0] -= l.n_pivots * each
     return l.n_pivots if t.relative <= tol else -1
 
 
-cdef bint solve_by_pivoting(const small_problem_t* s, double* own, double tol, bint follows, double* remaining_cost,
+cdef bint solve_by_pivoting(const small_problem_t* s, double* own, double tol, bint follows, deadline_t* deadline,
                             solve_workspaces_t* workspaces, int32_t* counts) noexcept nogil:
     """Solve free or bounded rows by factorisations and exchanges; return whether there is a result.
 
@@ -199,24 +189,23 @@ cdef bint solve_by_pivoting(const small_problem_t* s, double* own, double tol, b
     """
     cdef direct_t t
     cdef arena_t arena = make_arena(workspaces.work.real, workspaces.work.index)
-    cdef int32_t path = 0, m = s.v.p.n_rows
-    cdef double each = EXCHANGE_NS_PER_ROW * m + 0.1 * m * (s.band + 1.0) ** 2
+    cdef int32_t path = 0
     cdef bint ended
     t.v, t.e0, t.v0, t.least = s.v, s.zero_residual[0], s.zero_residual[1], 1e-13
     t.linear, t.symmetric, t.sweeps = s.linear, s.symmetric, ACTIVE_SET_SWEEPS
     t.s.a, t.s.p, t.s.band, t.s.order, t.s.linear.tiny = s.over.a, &s.over.p, s.band, NULL, 1e-13
+    t.s.deadline, t.s.late = deadline, 0
     bind_direct_arrays(&t, &arena)
     if not fits_workspace(&workspaces.work, &arena):
         if not grow_workspace_to_arena(&workspaces.work, &arena):
             return False
         bind_direct_arrays(&t, &arena)
     # exchanges, then Lemke's paths
-    ended = run_exchanges(&t, own, tol, follows, remaining_cost[0] / each)
-    remaining_cost[0] -= t.s.n_rounds * each
-    if not ended and remaining_cost[0] > 0.0:
-        path = run_lemke_paths(&t, tol, remaining_cost, &workspaces.more) if follows and not t.linear and not t.solved else -1
+    ended = run_exchanges(&t, own, tol, follows)
+    if not ended and not has_passed(deadline, 0.0):
+        path = run_lemke_paths(&t, tol, &workspaces.more) if follows and not t.linear and not t.solved else -1
     if not ended:
-        ended = (path >= 0 and t.relative <= tol) or (not remaining_cost[0] > 0.0 and t.relative < INFINITY)
+        ended = (path >= 0 and t.relative <= tol) or (has_passed(deadline, 0.0) and t.relative < INFINITY)
     if ended:
         memcpy(own, t.best, t.s.n * sizeof(double))
     path = max(path, 0)
@@ -231,12 +220,12 @@ cdef inline void store_work_counts(const friction_run_t* o, int32_t n_subproblem
     counts[3], counts[4], counts[5] = <int32_t>o.factorisations, o.factorised, n_subproblems
 
 
-cdef bint solve_by_sweeps(const small_problem_t* s, double* own, double tol, int32_t swept, double* remaining_cost,
+cdef bint solve_by_sweeps(const small_problem_t* s, double* own, double tol, int32_t swept, deadline_t* deadline,
                           solve_workspaces_t* workspaces, int32_t* counts) noexcept nogil:
     """Solve contacts as one subproblem, with at most `swept` sweeps before factorisations; counts as in `store_work_counts`."""
     cdef int32_t m = s.v.p.n_rows, n = s.over.r.n_bodies if s.over.r != NULL else 0
     cdef subproblem_t sub
-    cdef friction_run_t o = friction_run_t(tol, swept, swept, has_wide(), 0, 0, 0, 0.0, remaining_cost[0], 0, 0)
+    cdef friction_run_t o = friction_run_t(tol, swept, swept, has_wide(), 0, 0, 0, 0.0, deadline, 0, 0)
     cdef bint good
     if not grow_workspace_to(&workspaces.work, s.v.p.n_blocks, subproblem_work_size(m, n) + m):
         return False
@@ -245,30 +234,30 @@ cdef bint solve_by_sweeps(const small_problem_t* s, double* own, double tol, int
     sub.e0, sub.v0 = s.zero_residual[0], s.zero_residual[1]
     good = solve_subproblem(&sub, &o, &workspaces.more, workspaces.work.real + m, workspaces.work.index)
     memcpy(own, sub.answer, m * sizeof(double))
-    remaining_cost[0] = o.remaining_cost
     store_work_counts(&o, 1, counts)
-    return good or not o.remaining_cost > 0.0
+    return good or has_passed(deadline, 0.0)
 
 
-cdef int32_t solve_small(small_problem_t* s, const small_rules_t* rules, double* own, bint cold, double tol, double max_cost,
+cdef int32_t solve_small(small_problem_t* s, const small_rules_t* rules, double* own, bint cold, double tol, deadline_t* deadline,
                          double* both, solve_workspaces_t* workspaces, int32_t* counts) noexcept nogil:
     """Solve and judge from `own` (m) [N s], or from the zero impulse if `cold`, into `own`; return the result code.
 
-    both (2 m) receives the slack and the error of the result, counts the work (`store_work_counts`); the call ends at an
-    estimated cost of `max_cost` [ns]."""
+    both (2 m) receives the slack and the error of the result, counts the work (`store_work_counts`). At the deadline the
+    iterate is the result.
+    """
     cdef int64_t m = s.v.p.n_rows, scratch = m + count_judge_scratch(&s.v)
     memset(counts, 0, N_COUNTS * sizeof(int32_t))
     if not grow_workspace_to(&workspaces.work, 0, scratch):
         return RESULT_FAILED
     if set_start_of_small_problem(s, rules, own, cold, tol, both, workspaces.work.real):
         return RESULT_IS_START
-    if not (solve_by_pivoting(s, own, tol, rules.follows, &max_cost, workspaces, counts) if s.pivots
-            else solve_by_sweeps(s, own, tol, rules.swept, &max_cost, workspaces, counts)):
+    if not (solve_by_pivoting(s, own, tol, rules.follows, deadline, workspaces, counts) if s.pivots
+            else solve_by_sweeps(s, own, tol, rules.swept, deadline, workspaces, counts)):
         return RESULT_FAILED
     if not grow_workspace_to(&workspaces.work, 0, scratch):
         return RESULT_FAILED
     judge_small_impulse(s, own, both, workspaces.work.real)
-    return RESULT_SOLVED if s.pivots or s.relative <= tol or not max_cost > 0.0 else RESULT_FAILED
+    return RESULT_SOLVED if s.pivots or s.relative <= tol or has_passed(deadline, 0.0) else RESULT_FAILED
 
 
 cdef class Rules:
@@ -474,11 +463,11 @@ cdef class Small:
         with cython.critical_section(self):
             self.kept, r[0] = r[0], self.kept
 
-    def run(self, impulse, double tol, Rules rules, double max_cost=INFINITY):
+    def run(self, impulse, double tol, Rules rules, deadline=None):
         """Solve from `impulse` (m,) [N s], or from the zero impulse if it is None.
 
-        Returns (judged result or None if it is above tol, counters or None if `impulse` is the solution). The result at an
-        estimated cost of `max_cost` [ns] is returned even if it is above tol.
+        Returns (judged result or None if it is above tol, counters or None if `impulse` is the solution). The result at
+        the deadline is returned even if it is above tol.
         """
         cdef small_problem_t s = self.at
         cdef solve_workspaces_t workspaces
@@ -492,7 +481,8 @@ cdef class Small:
         if impulse is not None:
             memcpy(own, as_double_pointer(impulse, m), m * sizeof(double))
         try:
-            code = self.run_kernel(&s, &rules.at, own, impulse is None, tol, max_cost, <double*>both.data, &workspaces, counts)
+            code = self.run_kernel(&s, &rules.at, own, impulse is None, tol, get_pointer(deadline), <double*>both.data, &workspaces,
+                                   counts)
         finally:
             if workspaces.work.n_real <= MAX_KEPT_DOUBLES:
                 self.exchange_kept_workspace(&workspaces.work)
@@ -502,10 +492,10 @@ cdef class Small:
         return judged, None if code == RESULT_IS_START else tuple([counts[i] for i in range(N_COUNTS)])
 
     cdef int32_t run_kernel(self, small_problem_t* s, const small_rules_t* rules, double* own, bint cold, double tol,
-                            double max_cost, double* both, solve_workspaces_t* workspaces, int32_t* counts) except -1:
+                            deadline_t* deadline, double* both, solve_workspaces_t* workspaces, int32_t* counts) except -1:
         """Run `solve_small` without the interpreter."""
         with nogil:
-            return solve_small(s, rules, own, cold, tol, max_cost, both, workspaces, counts)
+            return solve_small(s, rules, own, cold, tol, deadline, both, workspaces, counts)
 
 
 cdef class Islands(Small):
@@ -545,9 +535,9 @@ cdef class Islands(Small):
                 size[label[i], 4] += 1
 
     cdef int32_t run_kernel(self, small_problem_t* s, const small_rules_t* rules, double* own, bint cold, double tol,
-                            double max_cost, double* both, solve_workspaces_t* workspaces, int32_t* counts) except -1:
+                            deadline_t* deadline, double* both, solve_workspaces_t* workspaces, int32_t* counts) except -1:
         cdef int64_t m = s.v.p.n_rows, scratch = m + count_judge_scratch(&s.v)
-        cdef friction_run_t o = friction_run_t(tol, rules.swept, rules.swept, has_wide(), 0, 0, 0, 0.0, max_cost, 0, 0)
+        cdef friction_run_t o = friction_run_t(tol, rules.swept, rules.swept, has_wide(), 0, 0, 0, 0.0, deadline, 0, 0)
         cdef bint good
         if not grow_workspace_to(&workspaces.work, 0, scratch):
             raise MemoryError(f"{m} rows")
@@ -559,7 +549,7 @@ cdef class Islands(Small):
         if not good:
             return RESULT_FAILED
         judge_small_impulse(s, own, both, workspaces.work.real)
-        return RESULT_SOLVED if s.relative <= tol or not o.remaining_cost > 0.0 else RESULT_FAILED
+        return RESULT_SOLVED if s.relative <= tol or has_passed(deadline, 0.0) else RESULT_FAILED
 
     cdef bint solve_islands(self, double* own, friction_run_t* o, workspace_t* r) except -1:
         """Solve the islands one after the other from `own` (m) [N s], into `own`; return whether all are solved."""

@@ -8,6 +8,7 @@ from libc.string cimport memcmp, memcpy, memset
 
 from lavender_ext.accelerate.accelerated cimport acceleration_t, lav_anderson
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE
+from lavender_ext.core.deadline cimport deadline_t, has_passed
 from lavender_ext.core.method cimport CERTIFICATE, MORE, NEEDS_WORKSPACE, options_t, workspace_t, info_t
 from lavender_ext.core.block_types cimport CONE, blocks_t
 from lavender_ext.core.view cimport view_t
@@ -27,8 +28,6 @@ cdef enum:
     EXTRAPOLATION_FACTOR = 4    # Sweeps continue if the present rate reaches tol within this multiple of the remaining checks.
     SWEEP_NS_PER_ROW = 15       # estimated cost of a sweep with its mixing [ns] per row of A; in addition 1 ns per entry of A
     SWEEP_NS_PER_BODY_ROW = 32  # estimated cost of a sweep with its mixing [ns] per row over bodies
-    FACTOR_NS_PER_ROW = 150     # estimated cost of a factorisation with its steps [ns] per row; in addition
-    CUBED_ROWS_PER_NS = 10      # the cube of the number of rows divided by this [1/ns]
 
 
 cdef struct subproblem_t:
@@ -52,7 +51,7 @@ cdef struct friction_run_t:     # settings and counters of a run over one or sev
     int64_t undone
     int64_t factorisations
     double factored             # multiply-adds of the factorisations
-    double remaining_cost       # ns, estimated cost that may still be spent; inf without a limit
+    deadline_t* deadline        # time at which the run ends with its iterate, or NULL
     int32_t factorised          # number of subproblems that used factorisations
     int32_t longest             # largest number of sweeps plus factorisations of one subproblem
 
@@ -73,8 +72,7 @@ cdef struct alternation_t:      # state of one subproblem
     workspace_t workspace
     info_t info
     int32_t how
-    double sweep                # estimated cost of a sweep, ns; no clock is read
-    double factor               # estimated cost of a factorisation with its steps, ns
+    double sweep                # estimated cost of a sweep, ns
 
 
 cdef inline int64_t subproblem_work_size(int64_t m, int64_t n_bodies) noexcept nogil:
@@ -103,11 +101,6 @@ cdef inline void bind_subproblem_arrays(alternation_t* t, double* work, int32_t*
     t.sweeps.exact, t.sweeps.start, t.sweeps.prepared = t.s.at != NULL, t.s.at, t.s.prepared
 
 
-cdef inline double estimate_cost_so_far(const alternation_t* t) noexcept nogil:
-    """Return the estimated cost [ns] of this subproblem so far."""
-    return t.c.iterations * t.sweep + t.info.factorisations * t.factor
-
-
 cdef inline double judge_subproblem_impulse(alternation_t* t, const double* lam) noexcept nogil:
     """Return the relative residual of lam (m) [N s], relative to the subproblem's zero impulse."""
     cdef const view_t* v = &t.s.v
@@ -134,7 +127,7 @@ cdef inline double continue_sweeps(alternation_t* t, double now, int32_t max_swe
     """
     cdef double before, tol = t.o.tol
     cdef int32_t step = MIN_CHECK_INTERVAL
-    while now > tol and t.c.iterations < max_sweeps and estimate_cost_so_far(t) < t.o.remaining_cost:
+    while now > tol and t.c.iterations < max_sweeps and not has_passed(t.o.deadline, step * t.sweep):
         before = now
         lav_anderson(&t.c, t.swept, t.c.iterations == 0, step)
         now = judge_subproblem_impulse(t, t.swept)
@@ -162,8 +155,7 @@ cdef inline bint start_newton(alternation_t* t) noexcept nogil:
 
 cdef inline double step_newton(alternation_t* t, int32_t steps) noexcept nogil:
     """Run up to `steps` factorisations and return the relative residual of `answer`."""
-    cdef double fit = (t.o.remaining_cost - estimate_cost_so_far(t)) / t.factor
-    cdef int32_t last = t.info.factorisations + (steps if fit > steps else <int32_t>max(fit, 0.0))
+    cdef int32_t last = t.info.factorisations + steps
     while t.info.factorisations < last and (t.how == MORE or t.how == CERTIFICATE):
         t.how = lav_step(&t.s.v, &t.options, &t.workspace, last - t.info.factorisations, t.s.answer, &t.info)
     return judge_subproblem_impulse(t, t.s.answer)
@@ -175,7 +167,7 @@ cdef inline double alternate_sweeps_and_newton(alternation_t* t) noexcept nogil:
     if not start_newton(t):
         return 1.0 / 0.0
     now = step_newton(t, FIRST_FACTORISATIONS)
-    if now > t.o.tol and estimate_cost_so_far(t) < t.o.remaining_cost:
+    if now > t.o.tol and not has_passed(t.o.deadline, 0.0):
         now = continue_sweeps(t, judge_subproblem_impulse(t, t.swept), RESUMED_SWEEP_RATIO * t.o.max_sweeps, t.s.v.p.law == CONE)
         if now > t.o.tol:
             return step_newton(t, MAX_SUBPROBLEM_FACTORISATIONS)
@@ -210,16 +202,15 @@ cdef inline bint solve_subproblem(subproblem_t* s, friction_run_t* o, workspace_
         now = judge_subproblem_impulse(&t, t.swept)
     else:
         now = zero_residual[2]
-    # estimated costs
     t.sweep = SWEEP_NS_PER_ROW * p.n_rows + (s.v.a.indptr[p.n_rows] if s.v.a != NULL else SWEEP_NS_PER_BODY_ROW * p.n_rows)
-    t.factor = FACTOR_NS_PER_ROW * p.n_rows + <double>p.n_rows ** 3 / CUBED_ROWS_PER_NS
     # sweeps, then Newton's method and sweeps alternately
     now = continue_sweeps(&t, now, o.first, True)
     if now <= o.tol or now < 1.0:
         memcpy(s.answer, t.swept, p.n_rows * sizeof(double))
-    if now > o.tol and estimate_cost_so_far(&t) < o.remaining_cost:
+    if now > o.tol and not has_passed(o.deadline, 0.0):
         o.factorised += 1
-        t.options = options_t(NEWTON, MAX_SUBPROBLEM_FACTORISATIONS, 0, 0, o.wide, o.tol, t.e0, t.v0, 1.0 / 0.0)
+        t.options = options_t(NEWTON, MAX_SUBPROBLEM_FACTORISATIONS, 0, 0, o.wide, o.tol, t.e0, t.v0, 1.0 / 0.0, 0.0,
+                              o.deadline)
         now = alternate_sweeps_and_newton(&t)
     # counters
     o.swept += t.c.iterations
@@ -228,9 +219,8 @@ cdef inline bint solve_subproblem(subproblem_t* s, friction_run_t* o, workspace_
     o.factored += t.info.factorisations * (<double>p.n_rows * p.n_rows * p.n_rows)
     if t.c.iterations + t.info.factorisations > o.longest:
         o.longest = t.c.iterations + t.info.factorisations
-    o.remaining_cost -= estimate_cost_so_far(&t)
-    # at the cost limit the better of both iterates is the result
-    if (now > o.tol and not o.remaining_cost > 0.0
+    # after the deadline the better of both iterates is the result
+    if (now > o.tol and has_passed(o.deadline, 0.0)
             and not judge_subproblem_impulse(&t, s.answer) <= judge_subproblem_impulse(&t, t.swept)):
         memcpy(s.answer, t.swept, p.n_rows * sizeof(double))
     return now <= o.tol

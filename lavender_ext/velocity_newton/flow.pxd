@@ -17,6 +17,7 @@ from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 from libc.string cimport memcpy, memset
 
+from lavender_ext.core.deadline cimport deadline_t
 from lavender_ext.core.block_projection cimport project_contact
 from lavender_ext.core.block cimport compute_block_error, compute_row_error
 from lavender_ext.core.generalized cimport multiply_whitened_panel, add_panel_transpose_product
@@ -123,6 +124,7 @@ cdef struct flow_t:
     double energy_limit         # sqrt J, limit of the present island
     double velocity_limit       # m/s
     int32_t steps               # remaining Newton steps
+    deadline_t* deadline        # time at which the steps end, or NULL
     int32_t factorisations
     int32_t rounds              # rounds of Coulomb friction
     int32_t evaluations         # evaluations of lambda(s) along a line

@@ -88,9 +88,10 @@ cdef inline int32_t advance_islands(const view_t* v, const options_t* o, const w
     info.relative = -1.0
     if left > 0 and not o.stop:
         s.f.steps = work = work if work < left else left
+        s.f.deadline = o.deadline
         how = solve_islands(&s.f, lam)
         s.done += work - s.f.steps
-        if how == MORE and s.done >= o.budget:
+        if how == MORE and (s.done >= o.budget or o.deadline != NULL and o.deadline.passed):
             how = SPENT
     info.work, info.factorisations = s.done, s.f.factorisations
     info.rounds, info.evaluations = s.f.rounds, s.f.evaluations

@@ -17,6 +17,7 @@ and with contacts, whose blocks of V may be full, with a the rows of the blocks 
 from libc.stdint cimport int32_t
 from libc.string cimport memcpy, memset
 
+from lavender_ext.core.deadline cimport entry_cost, has_passed, product_cost
 from lavender_ext.core.dot cimport dot
 from lavender_ext.factor.linear cimport (CHOLESKY, LU, analyse_dense, analyse_tree, factor_linear_system_matrix,
                                          solve_linear_system, linear_t)
@@ -287,6 +288,8 @@ cdef inline void form_normal_matrix(flow_t* f, int32_t island, bint square, bint
                 add_panel_to_dense_matrix(f, b, n, size)
             elif n > 0:
                 add_panel_to_sparse_matrix(f, b, n, size)
+            if f.deadline != NULL and has_passed(f.deadline, (entry_cost() + product_cost() * n) * nc * nc):
+                return                                  # `factor_normal_matrix` ends the step.
     store_v(f, island, False)
 
 
@@ -295,6 +298,8 @@ cdef inline bint factor_normal_matrix(flow_t* f, int32_t island, bint square) no
     cdef int32_t a, size = f.cptr[island + 1] - f.cptr[island], values
     cdef const int32_t* lptr = f.lptr + f.cptr[island]
     cdef linear_t* n = &f.linear
+    if f.deadline != NULL and f.deadline.passed:
+        return False
     f.factorisations += 1
     n.wide, n.shift, n.tiny, n.matrix = f.wide, 0.0, 0.0, f.factor
     n.d = NULL          # C++ converts no NULL through a temporary.
@@ -311,6 +316,7 @@ cdef inline bint factor_normal_matrix(flow_t* f, int32_t island, bint square) no
         analyse_tree(n, size, lptr, f.lidx, f.factor - lptr[0], f.factor + values)
         for a in range(size):
             n.scale[a] = n.diagonal[a]
+    n.deadline = f.deadline
     return factor_linear_system_matrix(n) == 0
 
 

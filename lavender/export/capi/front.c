@@ -54,6 +54,7 @@ struct lav_solver {
 #ifndef LAV_SWEEPS_ONLY
   struct accelerate_accelerated_acceleration_t acceleration;
   struct core_view_view_t view; /* The problem for newton: rows of A if A was formed. */
+  struct core_deadline_deadline_t limit; /* The same time, for the methods that read the clock. */
   struct core_method_options_t newton_options;
   struct core_method_workspace_t drive;
   int32_t driven;              /* Newton's method has begun with `newton_options`. */

@@ -204,9 +204,12 @@ static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out)
     how = begin_newton(s, budget->tol, budget->iterations);
   s->driven = 0;
   while (out->outcome == LAV_MAX_ITERATIONS && out->iterations < budget->iterations) {
-    how = k_step(&s->view, &s->newton_options, &s->drive, is_timed(budget) ? 1 : 1 << 30, s->impulse, &info);
+    how = k_step(&s->view, &s->newton_options, &s->drive, 1 << 30, s->impulse, &info);
     out->iterations = before + info.work;
-    if (how == core_method_SPENT) break;
+    if (how == core_method_SPENT) {
+      if (out->iterations < budget->iterations && is_late(s, budget)) out->outcome = LAV_TIME_LIMIT;
+      break;
+    }
     if (how == core_method_REACHED) {
       judge(s, s->impulse, 1, INFINITY, &now); /* Confirm it: the velocity form rounds sums in another order, and its squares may underflow. */
       if (now.relative <= budget->tol) out->outcome = LAV_CONVERGED;

@@ -302,6 +302,13 @@ static int32_t run(lav_solver *s, const lav_budget *requested, lav_result *out) 
   out->outcome = LAV_MAX_ITERATIONS;
   out->iterations = out->sweeps = out->restarts = 0;
   s->deadline = is_timed(budget) ? budget->clock(budget->clock_data) + budget->seconds : 0.0;
+#ifndef LAV_SWEEPS_ONLY
+  memset(&s->limit, 0, sizeof s->limit);
+  s->limit.end = s->deadline;
+  s->limit.now = budget->clock;
+  s->limit.at = budget->clock_data;
+  s->newton_options.deadline = s->direct.s.deadline = is_timed(budget) ? &s->limit : NULL;
+#endif
   if (!s->begun) {
     judge_stopping_test_begin_stopping_test(&s->stopping_test, &s->p, s->start[0], s->start[1], s->start[2], row->patience, s->score_workspace);
     s->stopping_test.keeps_last = s->options.method == LAV_PGS || s->options.method == LAV_SEQUENTIAL_IMPULSES

@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 
 from lavender.base.arrays import IntArray
-from lavender.base.deadline import Deadline
 from lavender.base.lu import splu
 from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.problem import Problem
@@ -59,19 +58,12 @@ class System:
 
     form = ""
     work = 0.0  # Multiply-adds of one factorisation.
-    expected_factor_seconds = 0.0  # Estimated time of the next factor [s].
-    # Factorisations by Python that are expected to end after this deadline are not started.
-    deadline: Deadline | None = None
+    factor_seconds = 0.0  # Upper bound of the time of a factorisation [s], on machines of the last ten years.
     dense = False  # Whether A is stored as a full matrix.
     entries = 0.0  # Number of entries of A.
 
     def __init__(self, problem: Problem, solve: Solve) -> None:
         self.problem, self.solve = problem, solve
-
-    def record_factor_time(self, seconds: float) -> None:
-        """Record the time of the last factorisation with the steps around it [s], to estimate the next time."""
-        if self.work > 0.0:
-            self.expected_factor_seconds = seconds
 
 
 class VelocitySystem(System):
@@ -88,7 +80,7 @@ class VelocitySystem(System):
         reused = like.layout if isinstance(like, VelocitySystem) and like.layout.serves(*structure) else None
         self.layout: Layout = reused or Layout(*structure)
         self.work = self.layout.work
-        self.expected_factor_seconds = 0.5e-9 * self.work
+        self.factor_seconds = 0.5e-9 * self.work
         solve.use_bodies(
             panel, columns, self.layout, solve.has_friction and problem.law == "coulomb", USE_WIDE_LANES
         )
@@ -113,8 +105,7 @@ class MatrixSystem(System):
         else:
             self.work = (1.0 if symmetric else 2.0) * solve.cost
             self.entries = float(solve.entries)
-        # Upper bounds of the time per multiply-add, on machines of the last ten years.
-        self.expected_factor_seconds = (0.3e-9 if self.dense else 1e-9) * self.work
+        self.factor_seconds = (0.3e-9 if self.dense else 1e-9) * self.work
 
 
 def make_system(

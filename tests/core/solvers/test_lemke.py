@@ -68,12 +68,3 @@ def test_lemke_stopped_by_its_budget_keeps_its_point():
     ):
         with pytest.raises(lv.CapabilityError, match=words):
             lv.solve(lv.Problem(np.ones(5001), cones, sp.eye_array(5001, format="csr")), "lemke")
-
-
-def test_a_dictionary_that_takes_longer_than_the_time_limit_is_not_formed():
-    problem = random_lcp(3, 120)
-    solution = lv.solve(problem, "lemke", time_limit=1e-5)
-    assert solution.status is lv.Status.TIME_LIMIT
-    assert "takes longer" in solution.message
-    assert not solution.work
-    assert lv.solve(problem, "lemke", time_limit=60.0).status is lv.Status.CONVERGED

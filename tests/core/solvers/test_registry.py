@@ -60,23 +60,6 @@ def test_solver_whose_refusal_raises_is_refused_alone(register):
         lv.solve(TINY, "unsure")
 
 
-@pytest.mark.parametrize("counted", ["long", -1.0, float("nan")])
-def test_a_cost_that_is_not_a_number_is_refused_by_the_solver_s_name(counted, register):
-    class Wrong:
-        def prepare(self, problem):
-            return problem
-
-        def run(self, state, impulse, n, tol, time_limit):
-            return lv.Claim(lv.Status.MAX_ITERATIONS, n)
-
-        def cost(self, problem):
-            return registry.Cost(counted)
-
-    register(named("wrong", factory=Wrong))
-    with pytest.raises(lv.InputError, match="cost of the set-up of solver 'wrong' is"):
-        lv.solve(TINY, "wrong", time_limit=10.0)
-
-
 def test_claim_of_more_iterations_than_the_limit_is_a_numerical_error(plug_in):
     name = plug_in(lambda problem, impulse: lv.Claim(lv.Status.MAX_ITERATIONS, 7, {}))
     solution = lv.solve(TINY, name, max_iter=5)
