@@ -162,17 +162,17 @@ class AdmmState:
             matrix, shift = make_pattern_symmetric(sp.csr_array(k.T @ sp.diags_array(e) @ k)), 1.0
             # Analyse the pattern for each rho, because entries may cancel for some values of rho.
             system = LinearSystem(get_sorted_csr_arrays(matrix)[:2], USE_WIDE_LANES)
-        done = _factor_shifted_matrix(system, matrix, shift, self.lu)
+        done = _factor_shifted_matrix(system, matrix, shift, self.lu, self.deadline)
         if not done and not self.is_over_bodies and not self.lu and self.problem.law == "linear":
             # L L^T failed, as for an indefinite matrix: try L U.
             self.lu = True
-            done = _factor_shifted_matrix(system, matrix, shift, True)
+            done = _factor_shifted_matrix(system, matrix, shift, True, self.deadline)
         if not done and self.lu and not self.full and m <= MAX_DENSE_RANK_ROWS:
             # L U by supernodes failed, since it cannot exchange rows across supernodes: try L U of a full matrix.
             self.full = True
             self.matrix = matrix = matrix.toarray()
             self.system = system = LinearSystem(m, USE_WIDE_LANES)
-            done = _factor_shifted_matrix(system, matrix, shift, True)
+            done = _factor_shifted_matrix(system, matrix, shift, True, self.deadline)
         if not done:
             raise _Breakdown(f"the factor of A + rho D broke down at rho = {rho:.1e}")
         return system, *extra
@@ -198,8 +198,10 @@ def _analyse_panels(system: LinearSystem) -> LinearSystem:
     return system
 
 
-def _factor_shifted_matrix(system: LinearSystem, matrix: Any, shift: float, lu: bool) -> bool:
-    """Factor M = matrix + shift; return whether the factorisation succeeded.
+def _factor_shifted_matrix(
+    system: LinearSystem, matrix: Any, shift: float, lu: bool, deadline: Deadline
+) -> bool:
+    """Factor M = matrix + shift; return whether the factorisation succeeded. Raise `_OutOfTime` after the deadline.
 
     L U must also solve a test system with a backward error within `BACKWARD_TOLERANCE`:
     max |r - M x| <= BACKWARD_TOLERANCE (max |M_ij| max |x| + max |r|).
@@ -208,7 +210,12 @@ def _factor_shifted_matrix(system: LinearSystem, matrix: Any, shift: float, lu: 
     # Copy a full matrix, because L U overwrites it.
     values = matrix.copy() if isinstance(matrix, np.ndarray) else get_sorted_csr_arrays(matrix)[2]
     largest = np.abs(values).max()
-    if not np.isfinite(largest) or _analyse_panels(system).factor(values, None, shift, PIVOT_TOLERANCE, lu):
+    if not np.isfinite(largest):
+        return False
+    lost = _analyse_panels(system).factor(values, None, shift, PIVOT_TOLERANCE, lu, deadline=deadline)
+    if lost < 0:
+        raise _OutOfTime
+    if lost:
         return False
     if not lu:
         return True

@@ -80,7 +80,7 @@ cdef class Deadline:
 
     def extend(self, double seconds):
         """Move the deadline by `seconds` that do not count."""
-        self.at.end += seconds
+        self.at.end, self.at.passed = self.at.end + seconds, 0
 
     def has_passed(self):
         """Read the clock and return whether the deadline has passed."""

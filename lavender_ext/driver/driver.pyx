@@ -1,11 +1,12 @@
 """The functions of `driver.pxd`, which call the method for a problem's form, and the class `Driver` for Python."""
 from libc.math cimport INFINITY
-from libc.stdint cimport int32_t, int64_t
+from libc.stdint cimport int32_t
 
-from lavender_ext.core.method cimport NEEDS_WORKSPACE, Method, method_t, options_t, workspace_t, info_t
-from lavender_ext.core.problem cimport Data, Workspace, allocate_bytes
+from lavender_ext.core.method cimport NEEDS_WORKSPACE, UNFIT, Method, method_t, options_t, workspace_t, info_t
+from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport NEWTON
+from lavender_ext.driver.host cimport free_workspace, start_method
 from lavender_ext.factor.factors cimport has_wide
 from lavender_ext.velocity_newton.method cimport islands_workspace_size, start_islands, advance_islands
 from lavender_ext.newton.rows cimport are_generalized_rows_faster
@@ -58,7 +59,7 @@ cdef class Driver(Method):
     -----
     `fits` is whether the method accepts the problem.
     """
-    cdef Workspace index, real
+    cdef workspace_t memory
     cdef readonly bint fits
 
     def __init__(self, Data data, double max_values=INFINITY, double work=INFINITY):
@@ -66,28 +67,20 @@ cdef class Driver(Method):
         self.options.method, self.options.wide, self.options.most = NEWTON, has_wide(), max_values
         self.options.work = work
         self.own = find_method_functions(&self.view)
-        self.fits = lav_workspace_size(&self.view, &self.options, &self.space) and self.analyse() == NEEDS_WORKSPACE
+        with nogil:
+            self.fits = start_method(&self.view, &self.options, &self.space, NULL, &self.memory, True) == NEEDS_WORKSPACE
 
-    cdef int32_t analyse(self) except -1:
-        """Start with integer workspace only: analyse the structure and compute the size of the real workspace."""
-        cdef int32_t how = NEEDS_WORKSPACE
-        cdef int64_t n_allocated = -1
-        while how == NEEDS_WORKSPACE and self.space.n_index > n_allocated:
-            n_allocated = self.space.n_index
-            self.index = allocate_bytes(n_allocated * sizeof(int32_t))
-            self.space.index = <int32_t*>self.index.at
-            with nogil:
-                how = lav_start(&self.view, &self.options, &self.space, NULL)
-        return how
+    def __dealloc__(self):
+        free_workspace(&self.memory)
 
     def start(self, const double[::1] impulse, double tol, int budget):
         """Start from impulse (m,) [N s], to a relative residual of `tol`, with `budget` units of work."""
         self.set_target_and_clear_statistics(tol, budget)
-        if self.real is None:
-            self.real = allocate_bytes(self.space.n_real * sizeof(double))
-            self.space.real = <double*>self.real.at
+        cdef int32_t how
         with nogil:
-            lav_start(&self.view, &self.options, &self.space, &impulse[0])
+            how = start_method(&self.view, &self.options, &self.space, &impulse[0], &self.memory, False)
+        if how == UNFIT:
+            raise MemoryError(f"{self.space.n_real} numbers")
 
     @property
     def work(self):

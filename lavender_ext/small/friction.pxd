@@ -12,8 +12,8 @@ from lavender_ext.core.deadline cimport deadline_t, has_passed
 from lavender_ext.core.method cimport CERTIFICATE, MORE, NEEDS_WORKSPACE, options_t, workspace_t, info_t
 from lavender_ext.core.block_types cimport CONE, blocks_t
 from lavender_ext.core.view cimport view_t
-from lavender_ext.driver.driver cimport NEWTON, lav_workspace_size, lav_start, lav_step
-from lavender_ext.small.workspace cimport grow_workspace_to
+from lavender_ext.driver.driver cimport NEWTON
+from lavender_ext.driver.host cimport start_method, step_method
 from lavender_ext.judge.measure cimport set_zero_impulse, find_reference, judge_view, relative_residual_of_score
 from lavender_ext.judge.score cimport make_empty_score, score_t
 from lavender_ext.sweep.serial cimport compute_sweep_velocities, sweep_context_t
@@ -137,34 +137,21 @@ cdef inline double continue_sweeps(alternation_t* t, double now, int32_t max_swe
     return now
 
 
-cdef inline bint start_newton(alternation_t* t) noexcept nogil:
-    """Start Newton's method from `answer`; return False without memory for it."""
-    cdef workspace_t* r = t.r
-    t.how = 0
-    if not lav_workspace_size(&t.s.v, &t.options, &t.workspace):
-        return False
-    t.info.factorisations = 0
-    while True:
-        if not grow_workspace_to(r, t.workspace.n_index, t.workspace.n_real):
-            return False
-        t.workspace.index, t.workspace.real = r.index, r.real
-        t.how = lav_start(&t.s.v, &t.options, &t.workspace, t.s.answer)
-        if t.how != NEEDS_WORKSPACE:
-            return t.how == MORE
-
-
 cdef inline double step_newton(alternation_t* t, int32_t steps) noexcept nogil:
     """Run up to `steps` factorisations and return the relative residual of `answer`."""
-    cdef int32_t last = t.info.factorisations + steps
-    while t.info.factorisations < last and (t.how == MORE or t.how == CERTIFICATE):
-        t.how = lav_step(&t.s.v, &t.options, &t.workspace, last - t.info.factorisations, t.s.answer, &t.info)
+    if t.how == MORE or t.how == CERTIFICATE:
+        t.how = step_method(&t.s.v, &t.options, &t.workspace, steps, t.s.answer, &t.info)
     return judge_subproblem_impulse(t, t.s.answer)
 
 
 cdef inline double alternate_sweeps_and_newton(alternation_t* t) noexcept nogil:
     """Alternate after slow sweeps: Newton's method, sweeps again, Newton's method up to `MAX_SUBPROBLEM_FACTORISATIONS`."""
     cdef double now
-    if not start_newton(t):
+    t.info.work = t.info.factorisations = 0
+    t.how = start_method(&t.s.v, &t.options, &t.workspace, t.s.answer, t.r, True)
+    if t.how == NEEDS_WORKSPACE:
+        t.how = start_method(&t.s.v, &t.options, &t.workspace, t.s.answer, t.r, False)
+    if t.how != MORE:
         return 1.0 / 0.0
     now = step_newton(t, FIRST_FACTORISATIONS)
     if now > t.o.tol and not has_passed(t.o.deadline, 0.0):
