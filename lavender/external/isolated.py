@@ -105,9 +105,8 @@ def call_backend(
         raise BackendFailed(f"the process of the backend sent an invalid answer ({error})") from None
     except RemoteError as error:
         idle_processes.append(process)
-        raise (
-            InputError(str(error)) if error.kind == "InputError" else BackendFailed(f"{error.kind}: {error}")
-        ) from None
+        is_input = error.kind == "InputError"
+        raise (InputError(str(error)) if is_input else BackendFailed(f"{error.kind}: {error}")) from None
     idle_processes.append(process)
     try:  # The answer may be invalid, since the backend's code can write to the process's output.
         work = {str(kind): int(count) for kind, count in fields["work"].items()}
@@ -163,7 +162,8 @@ def run_backend(
                 )
                 backend.run(tiny, None, Limits(1e-3, 1e-3, 100, None), {})
         return {}, ()
-    subprocesses.limit_cpu_time(STOPPABLE_LIMIT_RATIO * (limit.time_limit or 0.0) + CPU_TIME_MARGIN)
+    cores = os.cpu_count() or 1  # Some backends compute on all cores.
+    subprocesses.limit_cpu_time(cores * STOPPABLE_LIMIT_RATIO * (limit.time_limit or 0.0) + CPU_TIME_MARGIN)
     answer = backend.run(program, start, limit, settings)
     work = {str(kind): int(count) for kind, count in answer.work.items()}
     fields = {

@@ -101,34 +101,26 @@ def write_npz(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = 
     """
     check_problem(problem)
     arrays: dict[str, Any] = {"lavender_format": np.int64(FORMAT_VERSION), "b": problem.b}
-    for name in CONES:
-        arrays[name] = getattr(problem.cones, name.removeprefix("cones_"))
+    arrays |= {name: getattr(problem.cones, name.removeprefix("cones_")) for name in CONES}
     if problem.cones.has_rolling:
         arrays["cones_rolling"] = problem.cones.rolling
-    if problem.rows is not None:
-        for name in ROWS:
-            arrays[name] = getattr(problem.rows, name.removeprefix("rows_"))
-        arrays["compliance"] = problem.compliance
+    rows, general = problem.rows, problem.generalized
+    if rows is not None:
         operator = "rows"
-    elif problem.generalized is not None:
-        general = problem.generalized
-        for name, x in (("jac", general.jac), ("mass", general.mass)):
-            for part in ("data", "indices", "indptr"):
-                arrays[f"general_{name}_{part}"] = getattr(x, part)
-        arrays["general_v_free"] = general.v_free
-        arrays["compliance"] = problem.compliance
+        arrays |= {name: getattr(rows, name.removeprefix("rows_")) for name in ROWS}
+    elif general is not None:
         operator = "generalized"
+        for name in GENERALIZED[:-1]:
+            _, matrix, part = name.split("_")
+            arrays[name] = getattr(getattr(general, matrix), part)
+        arrays["general_v_free"] = general.v_free
     elif issparse(problem.matrix):
-        a = problem.matrix
+        operator, a = "csr", problem.matrix
         arrays |= dict(zip(CSR, (a.data, a.indices, a.indptr, np.array(a.shape, np.int64)), strict=True))
-        operator = "csr"
     else:
-        arrays["A"] = problem.matrix
-        operator = "dense"
-    if problem.guess is not None:
-        arrays["guess"] = problem.guess
-    if problem.key is not None:
-        arrays["key"] = problem.key
+        operator, arrays["A"] = "dense", problem.matrix
+    stored = {"compliance": problem.compliance, "guess": problem.guess, "key": problem.key}
+    arrays |= {name: x for name, x in stored.items() if x is not None}
     if impulse is not None:
         arrays["impulse"] = problem.impulse_array(impulse)
     names = None if problem.names is None else list(problem.names)
@@ -140,8 +132,8 @@ def write_npz(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = 
     }
     if problem.precision != "float64":
         meta["precision"] = problem.precision
-    if problem.generalized is not None:
-        meta["dof_names"] = problem.generalized.names
+    if general is not None:
+        meta["dof_names"] = general.names
     if problem.has_singular_program:
         meta["program"] = len(problem.qp.q)
     arrays["meta"] = np.frombuffer(json.dumps(meta).encode("ascii"), np.uint8)
@@ -173,22 +165,20 @@ def _read_own_format(archive: Archive) -> Stored:
     # Check the number of rows before bounds of that length are allocated.
     if ptr.ndim != 1 or len(ptr) == 0 or ptr[-1] != len(b):
         raise InputError(f"b has shape {b.shape}; cones.ptr must end with the number of its rows")
-    optional_parts: dict[str, Any] = {name: archive[name] for name in ("guess", "key") if name in archive}
-    optional_parts["precision"] = meta.get("precision", "float64")
+    parts: dict[str, Any] = {
+        name: archive[name] for name in ("guess", "key", "compliance") if name in archive
+    }
     if meta["operator"] == "rows":
-        parts: dict[str, Any] = {name.removeprefix("rows_"): archive[name] for name in ROWS}
-        optional_parts["rows"] = Rows(**parts)
-        optional_parts["compliance"] = archive["compliance"]
+        fields_of_rows: dict[str, Any] = {name.removeprefix("rows_"): archive[name] for name in ROWS}
+        parts["rows"] = Rows(**fields_of_rows)
     elif meta["operator"] == "generalized":
-        optional_parts["generalized"] = _build_generalized(archive, meta["dof_names"])
-        optional_parts["compliance"] = archive["compliance"]
+        parts["generalized"] = _build_generalized(archive, meta["dof_names"])
     else:
-        optional_parts["matrix"] = _read_matrix(archive)
+        parts["matrix"] = _read_matrix(archive)
     entries = [*CONES, *(["cones_rolling"] if "cones_rolling" in archive else [])]
     cones = Cones(**{name.removeprefix("cones_"): archive[name] for name in entries})
-    problem = Problem(
-        b, cones, friction=meta["friction"], names=meta["names"], name=meta["name"], **optional_parts
-    )
+    parts |= {name: meta[name] for name in ("friction", "names", "name", "precision") if name in meta}
+    problem = Problem(b, cones, **parts)
     if "program" in meta:
         n = check_int("program", meta["program"], high=problem.m)
         problem = replace(problem, qp=recover_program(problem.csr, problem.b, problem.cones, n), copy=False)

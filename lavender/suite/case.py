@@ -243,7 +243,7 @@ def parse_case_name(text: str) -> tuple[str, dict[str, Any]]:
         The text is not a name with parameters in brackets.
     """
     match = CASE_NAME.fullmatch(text) if isinstance(text, str) else None
-    body = match[2] if match and match[2] and match[2].strip() else ""
+    body = (match[2] or "").strip().removesuffix(",") if match else ""
     parameters = [part.partition("=") for part in body.split(",")] if body else []
     values = {name.strip(): _parse_value(value.strip()) for name, _, value in parameters}
     if match is None or len(values) < len(parameters) or "" in values or None in values.values():

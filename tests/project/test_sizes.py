@@ -26,7 +26,7 @@ LINES = {
     "lavender/export": 2548,
     "lavender/external": 2306,
     "lavender/gradient": 1452,
-    "lavender/io": 5615,
+    "lavender/io": 5605,
     "lavender/judge": 1651,
     "lavender/problem": 5407,
     "lavender/programs": 389,
