@@ -80,6 +80,13 @@ assert "projected_gradients" in lv.available(lv.Problem.lcp([[1.0]], [1.0]))
 """
 
 RUN_COMMAND = "from lavender.cli.entry import main; main()"
+PRINT_HELP = """
+import contextlib
+from lavender.cli.entry import main
+for command in sys.argv[1:]:
+    with contextlib.suppress(SystemExit):
+        main([command, "--help"])
+"""
 
 #: Arguments of the commands that run solvers or list them; the other commands print their help.
 ARGUMENTS = {
@@ -117,11 +124,16 @@ def test_every_module_imports_with_an_added_solver(run_with_solver):
     run_with_solver(IMPORT_EVERYTHING)
 
 
-@pytest.mark.parametrize("command", sorted(COMMANDS))
-def test_every_command_runs_with_an_added_solver(run_with_solver, command):
-    printed = run_with_solver(RUN_COMMAND, command, *ARGUMENTS.get(command, ("--help",)))
-    if {"projected_gradients", "solvers"} & {command, *ARGUMENTS.get(command, ())}:
+@pytest.mark.parametrize("command", ARGUMENTS)
+def test_command_with_an_added_solver_runs(run_with_solver, command):
+    printed = run_with_solver(RUN_COMMAND, command, *ARGUMENTS[command])
+    if {"projected_gradients", "solvers"} & {command, *ARGUMENTS[command]}:
         assert "projected_gradients" in printed
+
+
+def test_help_of_other_commands_with_an_added_solver_is_printed(run_with_solver):
+    others = sorted(set(COMMANDS) - set(ARGUMENTS))
+    assert run_with_solver(PRINT_HELP, *others).count("Usage: ") == len(others)
 
 
 def test_broken_plug_in_is_reported_once_by_a_report_with_workers(tmp_path):
