@@ -54,7 +54,7 @@ def test_lists_take_commas_or_blanks_and_files_may_follow(lavender, path, tmp_pa
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
-@pytest.mark.parametrize("stop", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("stop", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.nightly)])
 def test_report_stopped_by_a_signal_keeps_records_and_writes_the_page(stop, tmp_path):
     # A problem that nothing solves in the time: every run to a tolerance takes its limit.
     out = tmp_path / "out"
