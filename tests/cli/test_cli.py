@@ -36,13 +36,11 @@ def test_report_and_check_of_a_false_claim_mark_it_contradicted(lavender, path, 
     assert "claim contradicted" in out and "1 claims are contradicted" in out
 
 
-@pytest.mark.parametrize(("coupling", "code"), [(-1.0, 3), (0.0, 1)])
-def test_solve_command_ends_with_3_only_for_a_proven_claim_of_infeasibility(
-    lavender, tmp_path, plug_in, coupling, code
-):
+@pytest.mark.parametrize(("a", "code"), [(-1.0, 3), (0.0, 1)])
+def test_solve_command_ends_with_3_only_for_a_proven_claim_of_infeasibility(lavender, tmp_path, plug_in, a, code):
     """With A = [[1, -1], [-1, 1]] and b = (1, 1), y = (1, 1) proves that there is no solution."""
     plug_in(lambda problem, impulse: lv.Claim(lv.Status.INFEASIBLE, 1, certificate=np.ones(2)), "unsure", laws={"lcp"})
-    lv.Problem.lcp([[1.0, coupling], [coupling, 1.0]], [1.0, 1.0]).save(tmp_path / "p.npz")
+    lv.Problem.lcp([[1.0, a], [a, 1.0]], [1.0, 1.0]).save(tmp_path / "p.npz")
     assert lavender("solve", tmp_path / "p.npz", "--solver", "unsure")[0] == code
 
 

@@ -227,18 +227,6 @@ def test_two_dimensions_are_a_plane_of_three():
     np.testing.assert_allclose(velocity[:, 2:5], 0.0, rtol=0.0, atol=1e-7)
 
 
-def test_our_solvers_agree_on_every_kind_of_block():
-    builder = lv.RowBuilder([1.0, 0.5, 2.0, 1.0], [3.0, 1.0, 2.0, 0.5], VELOCITY, DT, PLACES)
-    add_everything(builder, lambda x, y: (x, y), None)
-    problem = builder.problem()
-    expected = builder.velocity_after(problem, lv.solve(problem, tol=1e-11).impulse)
-    names = lv.available(problem, external=False)
-    assert len(names) >= 4
-    for name in names:
-        _, velocity = solved(builder, name, tol=1e-9)
-        np.testing.assert_allclose(velocity, expected, rtol=0.0, atol=1e-5, err_msg=name)
-
-
 def test_keys_carry_impulses_to_blocks_in_another_order():
     def build(order):
         builder = planar((0.3, -1.0, 0.0))
