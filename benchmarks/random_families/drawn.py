@@ -17,6 +17,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy import spatial
 
 from benchmarks.random_families.wild import (
     FORMS,
@@ -34,7 +35,6 @@ from benchmarks.random_families.wild import (
 )
 from lavender.base.errors import check_name
 from lavender.base.lazy_import import sparse as sp
-from lavender.base.lazy_import import spatial
 from lavender.problem import Problem
 from lavender.problem.cones import Cones
 from lavender.suite.build import Bodies, Contacts, add_horizontal_velocity, map_scalar

@@ -20,10 +20,10 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
+from scipy import spatial
 
 from lavender.base.arrays import FloatArray
 from lavender.base.lazy_import import sparse as sp
-from lavender.base.lazy_import import spatial
 from lavender.problem import Problem
 from lavender.suite.build import (
     Bodies,
