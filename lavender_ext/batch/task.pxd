@@ -30,7 +30,8 @@ from lavender_ext.small.call cimport (N_COUNTS, RESULT_IS_START, RESULT_SOLVED, 
                                       small_problem_t, small_rules_t, solve_small, solve_workspaces_t, can_use_small_call)
 from lavender_ext.small.limits cimport (estimate_newton_cost_terms, limits_t, max_factorisation_work,
                                         max_newton_cost, newton_cost_t)
-from lavender_ext.driver.host cimport fits_workspace, grow_workspace_to, grow_workspace_to_arena, start_method, step_method
+from lavender_ext.driver.host cimport grow_workspace_to, start_method, step_method
+from lavender_ext.small.workspace cimport fits_workspace, grow_workspace_to_arena
 from lavender_ext.batch.world cimport THIN_PADDING, LEFT, READY, STARTED, TRIED, compress_dense_rows
 from lavender_ext.velocity_newton.soft cimport needs_no_proximal_terms
 

@@ -1,13 +1,11 @@
 """Start a method in growing memory, and step it: for Python, small calls and batches.
 
-`start_method` grows the memory until the method has its workspace, and starts it. `step_method` steps until the work is done, the
-deadline has passed (`core/deadline.pxd`) or the method ends. C and WebAssembly call `lav_start` and `lav_step` in memory of theirs.
-Memory is reused for a sequence of problems: allocating new pages costs more than solving a small one.
+The method reads the deadline of its options. C and WebAssembly call `lav_start` and `lav_step` in memory of theirs. Memory is
+reused for a sequence of problems: allocating new pages costs more than solving a small one.
 """
 from libc.stdint cimport int32_t, int64_t
 from libc.stdlib cimport free, malloc
 
-from lavender_ext.core.arena cimport arena_t, make_arena
 from lavender_ext.core.method cimport CERTIFICATE, MORE, NEEDS_WORKSPACE, UNFIT, info_t, options_t, workspace_t
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport lav_start, lav_step, lav_workspace_size
@@ -31,19 +29,6 @@ cdef inline bint grow_workspace_to(workspace_t* r, int64_t n_index, int64_t n_re
         r.real = <double*>malloc(size * sizeof(double))
         r.n_real = size if r.real != NULL else 0
     return n_index <= r.n_index and n_real <= r.n_real
-
-
-cdef inline bint fits_workspace(const workspace_t* r, const arena_t* a) noexcept nogil:
-    """Return whether the arrays that were taken from an arena are within the workspace in which it began."""
-    return a.n_index <= r.n_index and a.n_real <= r.n_real
-
-
-cdef inline bint grow_workspace_to_arena(workspace_t* r, arena_t* a) noexcept nogil:
-    """Grow the workspace to the sizes that an arena has counted, and begin the arena in it; return False if out of memory."""
-    if not grow_workspace_to(r, a.n_index, a.n_real):
-        return False
-    a[0] = make_arena(r.real, r.index)
-    return True
 
 
 cdef inline void free_workspace(workspace_t* r) noexcept nogil:
