@@ -342,9 +342,10 @@ def as_csr(name: str, value: Any, *, copy: bool = True, unit: str = "", too_many
 
 def get_common_precision(*values: Any) -> str:
     """Return "float32" if all values that are not None are dense or sparse arrays of float32, else "float64"."""
+    for x in values:
+        if getattr(x, "dtype", None) is FLOAT64:
+            return "float64"
     types = {getattr(x, "dtype", None) for x in values if x is not None}
-    if FLOAT64 in types:
-        return "float64"
     # float32 in the other byte order is a different dtype of the same precision.
     is_single = bool(types) and all(isinstance(x, np.dtype) and x.newbyteorder("=") == FLOAT32 for x in types)
     return "float32" if is_single else "float64"

@@ -377,17 +377,13 @@ class Builders(Operators):
         m = generalized.m
         if cones is None:
             cones = make_contacts_of_rows("J", m, mu, tangents)
-        if isinstance(cones, Cones) and cones.n_rows != m:
+        elif isinstance(cones, Cones) and cones.n_rows != m:
             hint = (
                 " (a contact has a normal and two tangents, or tangents=0, 1)" if np.any(cones.kind) else ""
             )
             raise InputError(f"J has {m} rows; {cones.n_rows} are needed, as the cones have{hint}")
-        more.setdefault(
-            "precision", get_common_precision(J, *(M if isinstance(M, (list, tuple)) else [M]), v_free)
-        )
-        target = as_array("target", target, (m,), unit="m/s")
-        if compliance is not None:
-            compliance = as_array("compliance", compliance, (m,), unit="1/kg")
+        if "precision" not in more:
+            more["precision"] = get_common_precision(J, *(M if isinstance(M, (list, tuple)) else [M]), v_free)
         return cls(
             generalized.bias(target),  # `Problem` rejects entries that are not finite.
             cones,
@@ -510,9 +506,7 @@ class Builders(Operators):
         if general is not None and general.m != self.m:
             raise InputError(f"J has {general.m} rows; {self.m} are needed, as the problem has")
         if target is not None and general is not None:
-            # `Problem` rejects entries that are not finite.
-            with np.errstate(over="ignore", invalid="ignore"):
-                b = as_array("target", target, (self.m,), unit="m/s") - general.velocity_of(general.v_free)
+            b = general.bias(target)
         # Copy arrays here, so that the new problem can use them with copy=False.
         rhs = self.b if b is None else as_array("b", b, (self.m,), unit="m/s")
         start = None if guess is None else as_array("guess", guess, (self.m,), unit="N s")

@@ -163,6 +163,9 @@ class Cones:
 
     @classmethod
     def _from_blocks(cls, blocks: kernels.Blocks) -> Cones:
+        """Wrap blocks; raise InputError if they have a fault."""
+        if blocks.fault:
+            _raise_fault(FAULT_NAMES[blocks.fault], int(blocks.index), blocks.arrays)
         return make_instance(cls, {"_blocks": blocks})
 
     @classmethod
@@ -284,10 +287,7 @@ class Cones:
         >>> skates.shaped("box") == lv.Cones.contacts([(0.02, 0.8)] * 4, shape="box")
         True
         """
-        blocks = make_contact_blocks(mu, tangents, patch_radius, rolling, count, shape)
-        if blocks.fault:
-            _raise_fault(FAULT_NAMES[blocks.fault], int(blocks.index), blocks.arrays)
-        return cls._from_blocks(blocks)
+        return cls._from_blocks(make_contact_blocks(mu, tangents, patch_radius, rolling, count, shape))
 
     @property
     def n_blocks(self) -> int:

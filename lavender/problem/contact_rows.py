@@ -34,6 +34,8 @@ def make_contacts_of_rows(
     name: str, m: int, mu: Any, tangents: Any, patch_radius: Any = None, rolling: Any = None
 ) -> Cones:
     """Build contacts with equal numbers of rows from m rows and a mu for each contact; `name` has the rows."""
+    if type(mu) is float and tangents is None and patch_radius is None and rolling is None and m % 3 == 0:
+        return Cones.contacts(mu, count=m // 3)
     check_unmasked("mu", mu)
     angular_rows = (patch_radius is not None) + 2 * (rolling is not None)
     is_ellipse = len(get_shape("mu", mu)) > 1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from lavender.base.arrays import (
     as_names,
     check_choice,
     check_finite,
+    check_finite_and_in_range,
     check_int,
     check_nonnegative_magnitudes,
     check_unmasked,
@@ -80,7 +81,7 @@ class Names(Sequence[str]):
         return tuple, (self._names,)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class ProblemData:
     """Checked fields of a `Problem`; derived classes compute everything that follows from them."""
 
@@ -100,79 +101,77 @@ class ProblemData:
     qp: Any = field(default=None, repr=False, compare=False)
     derived: Derived = field(init=False, repr=False)
 
-    if TYPE_CHECKING:  # Declare the parameters, which accept more types than the fields have.
-
-        def __init__(
-            self, b: ArrayLike, cones: Cones, matrix: Any = ..., rows: Rows | None = ..., friction: str = ...,
-            compliance: ArrayLike | None = ..., guess: ArrayLike | None = ..., key: Any = ...,
-            names: Sequence[str] | None = ..., name: str = ..., copy: bool = ..., generalized: Generalized | None = ...,
-            precision: str = ..., qp: Any = ...,
-        ) -> None: ...  # fmt: skip
-
-    def __post_init__(self) -> None:
-        put = object.__setattr__
-        if not isinstance(self.cones, Cones):
+    def __init__(
+        self, b: ArrayLike, cones: Cones, matrix: Any = None, rows: Rows | None = None, friction: str = "coulomb",
+        compliance: ArrayLike | None = None, guess: ArrayLike | None = None, key: Any = None,
+        names: Sequence[str] | None = None, name: str = "", copy: bool = True, generalized: Generalized | None = None,
+        precision: str = "", qp: Any = None,
+    ) -> None:  # fmt: skip
+        if not isinstance(cones, Cones):
             raise InputError(
-                f"cones is a {type(self.cones).__name__}; a Cones is needed (Cones.bounded, Cones.contacts)"
+                f"cones is a {type(cones).__name__}; a Cones is needed (Cones.bounded, Cones.contacts)"
             )
-        m, k = self.cones.n_rows, self.cones.n_blocks
-        put(self, "derived", Derived())
-        put(self, "b", as_array("b", self.b, (m,), unit="m/s", copy=self.copy))
-        check_rhs(self.b)
-        if (self.matrix is None) + (self.rows is None) + (self.generalized is None) != 2:
+        m, k = cones.n_rows, cones.n_blocks
+        rhs = as_array("b", b, (m,), unit="m/s", copy=copy)
+        check_rhs(rhs)
+        if (matrix is None) + (rows is None) + (generalized is None) != 2:
             raise InputError(
-                f"{sum(x is not None for x in (self.matrix, self.rows, self.generalized))} of matrix=, "
-                "rows= and generalized= are given; exactly one is needed"
+                f"{sum(x is not None for x in (matrix, rows, generalized))} of matrix=, rows= and generalized= are "
+                "given; exactly one is needed"
             )
-        if isinstance(self.friction, str) and self.friction in ("box", "pyramid", "pyramidal"):
+        if not isinstance(friction, str) or friction not in FRICTION_LAWS:
+            hint = " (a separate bound for each tangent is a shape of the contacts: shape='box')"
+            is_shape = isinstance(friction, str) and friction in ("box", "pyramid", "pyramidal")
             raise InputError(
-                f"friction is {self.friction!r}; 'coulomb' or 'cone' is needed (a separate bound for each "
-                "tangent is a shape of the contacts: shape='box')"
+                f"friction is {friction!r}; 'coulomb' or 'cone' is needed{hint if is_shape else ''}"
             )
-        put(self, "friction", check_choice("friction", self.friction, FRICTION_LAWS))
-        if self.precision is None or (isinstance(self.precision, str) and not self.precision):
-            put(self, "precision", getattr(self.rows, "precision", "float64"))
-        put(self, "precision", check_choice("precision", self.precision, PRECISIONS))
-        if self.friction != "cone" and self.cones.has_round:
+        friction = str(friction)  # NumPy's strings have another repr.
+        if precision is None or (isinstance(precision, str) and not precision):
+            precision = getattr(rows, "precision", "float64")
+        if type(precision) is not str or precision != "float64":
+            precision = check_choice("precision", precision, PRECISIONS)
+        if friction != "cone" and cones.has_round:
             raise InputError(
                 "Coulomb's law is not supported for a round cone of more than two tangents: give friction='cone'"
             )
-        if self.rows is not None:
-            self._check_rows(self.rows, m, k)
-        elif self.generalized is not None:
-            self._check_generalized(self.generalized, m)
-        else:
-            put(self, "matrix", check_matrix(self.matrix, m, self.copy))
-            if issparse(self.matrix):
-                # Store the checked arrays separately, because callers can replace the arrays of the matrix object.
-                put(self, "_compressed", (self.matrix.indptr, self.matrix.indices, self.matrix.data))
-            if self.compliance is not None:
-                raise InputError(
-                    "compliance is given for a problem with a matrix A; A already contains compliance on "
-                    "its diagonal: add it there, or give rows= or generalized="
-                )
-        if self.guess is not None:
-            guess = as_array("guess", self.guess, (m,), finite=False, unit="N s", copy=self.copy)
-            check_finite("guess [N s]", guess)
-            put(self, "guess", guess)
-        if self.key is not None:
-            get_shape("key", self.key)
-            check_unmasked("key", self.key)
-            key = np.asarray(self.key)
-            if key.shape != (k,) or key.dtype.kind not in "ui":
-                raise InputError(
-                    f"key has shape {key.shape} and dtype {key.dtype}; ({k},) integers are needed"
-                )
-            if key.dtype.kind == "i" and key.size and key.min() < 0:
-                i = int(key.argmin())
-                raise InputError(f"key has {key[i]} at [{i}]; integers from 0 to 2**64 - 1 are needed")
-            put(self, "key", mark_read_only(key.astype(np.uint64)))
-        if self.names is not None and not (isinstance(self.names, Names) and len(self.names) == k):
-            put(self, "names", as_names("blocks", self.names, k))
-        put(self, "name", str(self.name))
-        self.law  # noqa: B018 - computed with the checks, because every solve reads it
         # `copy` applies to this call only: problems derived from this one copy by default.
-        put(self, "copy", True)
+        fields = self.__dict__
+        fields.update(
+            b=rhs, cones=cones, matrix=matrix, rows=rows, friction=friction, compliance=None, guess=None, key=None,
+            names=names, name=str(name), copy=True, generalized=generalized, precision=precision, qp=qp,
+            derived=Derived(), law=_find_law(cones, friction),
+        )  # fmt: skip
+        if matrix is None:
+            fields["compliance"] = _convert_compliance(compliance, m, copy)
+        elif compliance is not None:
+            raise InputError(
+                "compliance is given for a problem with a matrix A; A already contains compliance on its diagonal: add "
+                "it there, or give rows= or generalized="
+            )
+        if rows is not None:
+            self._check_rows(rows, k)
+        elif generalized is not None:
+            if not isinstance(generalized, Generalized):
+                raise InputError(f"generalized is a {type(generalized).__name__}; a Generalized is needed")
+            if generalized.m != m:
+                raise InputError(f"J has {generalized.m} rows; {m} are needed, as the cones have")
+            self._set_view()
+        else:
+            matrix = fields["matrix"] = check_matrix(matrix, m, copy)
+            if issparse(matrix):
+                # Store the checked arrays separately, because callers can replace the arrays of the matrix object.
+                fields["_compressed"] = (matrix.indptr, matrix.indices, matrix.data)
+        if guess is not None:
+            fields["guess"] = as_array("guess", guess, (m,), finite=False, unit="N s", copy=copy)
+            check_finite("guess [N s]", fields["guess"])
+        if key is not None:
+            fields["key"] = _convert_keys(key, k)
+        if names is not None and not (isinstance(names, Names) and len(names) == k):
+            fields["names"] = as_names("blocks", names, k)
+        self._check_magnitudes()
+
+    def _check_magnitudes(self) -> None:
+        """Raise InputError if an entry of A's diagonal may be too large."""
 
     def _set_rhs(self, b: FloatArray) -> None:
         """Replace the zeros of a new problem's right-hand side by b (m,) [m/s].
@@ -181,14 +180,12 @@ class ProblemData:
         """
         self.b.setflags(write=True)
         self.b[:] = b
-        as_array("b", self.b, (self.m,), unit="m/s", copy=False)
-        check_rhs(self.b)
+        check_rhs(mark_read_only(self.b))
 
-    def _check_rows(self, rows: Rows, m: int, k: int) -> None:
-        """Raise InputError if the rows do not fit the cones of k blocks with m rows, or the compliance is invalid."""
+    def _check_rows(self, rows: Rows, k: int) -> None:
+        """Raise InputError if the rows do not fit the cones of k blocks."""
         if not isinstance(rows, Rows):
             raise InputError(f"rows is a {type(rows).__name__}; a Rows is needed")
-        self._check_compliance(m)
         kj = rows.n_joints
         if kj + rows.n_contacts == k and are_joints_then_contacts(self.cones._blocks, rows.joint_ptr):
             return
@@ -199,21 +196,11 @@ class ProblemData:
                 "bounded rows for each joint is needed, followed by a contact block (not ROUND) for each "
                 "contact"
             )
-        if not np.array_equal(self.cones.ptr[: kj + 1], rows.joint_ptr):
-            raise InputError(
-                f"cones.ptr begins with {self.cones.ptr[: kj + 1].tolist()!s:.60} and rows.joint_ptr is "
-                f"{rows.joint_ptr.tolist()!s:.60}; cones.ptr must begin with rows.joint_ptr: one block for each "
-                "joint, with the same number of rows"
-            )
-
-    def _check_generalized(self, generalized: Generalized, m: int) -> None:
-        """Raise InputError if J does not have m rows, or the compliance is invalid; set the view for kernels."""
-        if not isinstance(generalized, Generalized):
-            raise InputError(f"generalized is a {type(generalized).__name__}; a Generalized is needed")
-        if generalized.m != m:
-            raise InputError(f"J has {generalized.m} rows; {m} are needed, as the cones have")
-        self._check_compliance(m)
-        self._set_view()
+        raise InputError(
+            f"cones.ptr begins with {self.cones.ptr[: kj + 1].tolist()!s:.60} and rows.joint_ptr is "
+            f"{rows.joint_ptr.tolist()!s:.60}; cones.ptr must begin with rows.joint_ptr: one block for each "
+            "joint, with the same number of rows"
+        )
 
     def _set_view(self) -> None:
         """Set the view for kernels of a problem in generalised coordinates."""
@@ -225,15 +212,6 @@ class ProblemData:
             self.compliance,
             FRICTION_NUMBER[self.friction],
         )
-
-    def _check_compliance(self, m: int) -> None:
-        """Convert the compliance to a checked array (m,) [1/kg]; the default is 0."""
-        put = object.__setattr__
-        if self.compliance is None:
-            put(self, "compliance", mark_read_only(np.zeros(m)))
-            return
-        put(self, "compliance", as_array("compliance", self.compliance, (m,), unit="1/kg", copy=self.copy))
-        check_nonnegative_magnitudes("compliance", self.compliance, "1/kg")
 
     # -- size and kind --------------------------------------------------------------------------
 
@@ -260,8 +238,7 @@ class ProblemData:
     @cached_property
     def law(self) -> str:
         """Problem class, determined by the blocks: "linear", "lcp", "coulomb" or "cone"."""
-        blocks = self.cones._blocks
-        return "linear" if blocks.is_free else "lcp" if blocks.is_bounded_rows else self.friction
+        return _find_law(self.cones, self.friction)
 
     def impulse_array(self, impulse: ArrayLike, name: str = "impulse") -> FloatArray:
         """Return a writable copy of `impulse` (m,) [N s]; raise InputError if it has a wrong shape or is not finite."""
@@ -374,9 +351,38 @@ class ProblemData:
         return format_html_table(facts, self.name or "Problem")
 
 
+def _find_law(cones: Cones, friction: str) -> str:
+    """Return the problem class of blocks with a law of friction."""
+    blocks = cones._blocks
+    return "linear" if blocks.is_free else "lcp" if blocks.is_bounded_rows else friction
+
+
+def _convert_compliance(compliance: ArrayLike | None, m: int, copy: bool) -> FloatArray:
+    """Convert a compliance to a checked array (m,) [1/kg]; the default is 0."""
+    if compliance is None:
+        return mark_read_only(np.zeros(m))
+    array = as_array("compliance", compliance, (m,), unit="1/kg", copy=copy)
+    check_nonnegative_magnitudes("compliance", array, "1/kg")
+    return array
+
+
+def _convert_keys(key: Any, k: int) -> np.ndarray:
+    """Convert keys to a checked array (k,) of uint64."""
+    get_shape("key", key)
+    check_unmasked("key", key)
+    array = np.asarray(key)
+    if array.shape != (k,) or array.dtype.kind not in "ui":
+        raise InputError(f"key has shape {array.shape} and dtype {array.dtype}; ({k},) integers are needed")
+    if array.dtype.kind == "i" and array.size and array.min() < 0:
+        i = int(array.argmin())
+        raise InputError(f"key has {array[i]} at [{i}]; integers from 0 to 2**64 - 1 are needed")
+    return mark_read_only(array.astype(np.uint64))
+
+
 def check_rhs(b: FloatArray) -> None:
-    """Raise InputError if the largest |b_i| [m/s] is not 0 but below MIN_MAGNITUDE."""
+    """Raise InputError unless b [m/s] is finite and in range, and max |b_i| is 0 or at least MIN_MAGNITUDE."""
     if not is_rhs_valid(b):
+        check_finite_and_in_range("b [m/s]", b, "m/s")
         max_abs = np.abs(b).max()
         raise InputError(
             f"the largest entry of b [m/s] is {max_abs:g}, at [{int(np.argmax(np.abs(b)))}]; it must be 0 "

@@ -32,7 +32,7 @@ from lavender.base.lazy_import import sparse as sp
 from lavender.problem.derived import cached_property
 from lavender_ext.core import generalized as kernels
 from lavender_ext.core.assemble import dense_to_csr, mirror_lower_triangle, stack_csr_matrices
-from lavender_ext.core.checks import MIN_MAGNITUDE, as_plain_array, make_instance
+from lavender_ext.core.checks import MAX_MAGNITUDE, MIN_MAGNITUDE, as_plain_array, make_instance
 from lavender_ext.factor.graph import order_for_elimination
 
 # M is rejected if |M_ij - M_ji| exceeds this fraction of sqrt(M_ii M_jj); rounding of sums in float64 causes less.
@@ -140,7 +140,7 @@ class Generalized:
         """Return a copy with another J or v*; None keeps the present one. M and its factor are shared."""
         if jac is None:
             free = self.v_free if v_free is None else v_free
-            free = as_array("v_free", free, (self.nv,), unit="m/s, rad/s")
+            free = as_array("v_free", free, self.v_free.shape, unit="m/s, rad/s")
             return make_instance(Generalized, self.__dict__ | {"v_free": free})
         if self.order is not None:
             return Generalized(jac, self.mass, self.v_free if v_free is None else v_free, self.names)
@@ -189,9 +189,9 @@ class Generalized:
         like: kernels.Operator | None = None,
     ) -> None:
         """Set all attributes from checked arrays, and factor M."""
-        n = len(v_free)
-        self.__dict__["v_free"] = v_free
-        self.__dict__["names"] = None if names is None else as_names("velocities", names, n)
+        n, attributes = len(v_free), self.__dict__
+        attributes["v_free"] = v_free
+        attributes["names"] = None if names is None else as_names("velocities", names, n)
         self._make_operator(jac, mass, n, like)
         self._factor()
 
@@ -221,8 +221,7 @@ class Generalized:
 
     def _factor(self) -> None:
         """Factor M; raise InputError if it is not positive definite."""
-        self.operator.factor()
-        row = self.operator.failed
+        row = self.operator.factor()
         if row >= 0:
             velocity = row if self.order is None else int(self.order[row])
             raise InputError(
@@ -296,11 +295,18 @@ class Generalized:
         out: FloatArray = self.operator.multiply_jacobian(v if self.order is None else v[self.order])
         return out
 
-    def bias(self, target: FloatArray) -> FloatArray:
-        """Compute b = target - J v* (m,) [m/s, rad/s] for targets (m,)."""
+    def bias(self, target: Any) -> FloatArray:
+        """Compute b = target - J v* (m,) [m/s, rad/s] for a target, scalar or (m,)."""
+        if type(target) is not float or not abs(target) <= MAX_MAGNITUDE:
+            target = as_array("target", target, (self.m,), unit="m/s")
+        result: FloatArray = target - self.multiply_by_v_free()
+        return result
+
+    def multiply_by_v_free(self) -> FloatArray:
+        """Compute J v* (m,) [m/s, rad/s]."""
         v = self.v_free if self.order is None else self.v_free[self.order]
-        values: FloatArray = as_array("target", target, (self.m,), finite=False)
-        return values - self.operator.multiply_jacobian(v)
+        result: FloatArray = self.operator.multiply_jacobian(v)
+        return result
 
     def momentum_of(self, v: FloatArray) -> FloatArray:
         """Compute M v (nv,) [kg m/s] for velocities v (nv,)."""
@@ -379,10 +385,13 @@ def _restore_unfactored(jac: sp.csr_array, mass: sp.csr_array) -> Generalized:
 
 def _convert_jacobian(jac: Any, n: int) -> Compressed:
     """Convert J to checked compressed rows."""
+    compressed = dense_to_csr(jac)
     sparse = issparse(jac)
-    array = jac if sparse else as_array_view("J", jac, (None, None))
+    array = jac if compressed is not None or sparse else as_array_view("J", jac, (None, None))
     if len(array.shape) != 2 or array.shape[1] != n:
         raise InputError(f"J has shape {array.shape}; (any, {n}) is needed, as M has {n} velocities")
+    if compressed is not None:
+        return compressed
     return convert_to_compressed_rows("J", array) if sparse else dense_to_csr(array)
 
 
@@ -414,17 +423,21 @@ def extract_lower_triangle(
     InputError
         The matrix is not square, or not symmetric to `max_asymmetry`; the message then ends with `hint`.
     """
-    sparse = issparse(matrix)
-    array = matrix if sparse else as_array_view(name, matrix, (None, None))
-    if len(array.shape) != 2 or array.shape[0] != array.shape[1]:
-        raise InputError(f"{name} has shape {array.shape}; a square matrix is needed")
-    lower, (i, j, asymmetry) = (
-        kernels.lower_triangle_of_csr(*convert_to_compressed_rows(name, array))
-        if sparse
-        else kernels.lower_triangle_of_dense(array)
-    )
+    found = kernels.lower_triangle_of_dense(matrix, max_asymmetry)
+    array = matrix
+    if found is None:
+        sparse = issparse(matrix)
+        array = matrix if sparse else as_array_view(name, matrix, (None, None))
+        if len(array.shape) != 2 or array.shape[0] != array.shape[1]:
+            raise InputError(f"{name} has shape {array.shape}; a square matrix is needed")
+        found = (
+            kernels.lower_triangle_of_csr(*convert_to_compressed_rows(name, array))
+            if sparse
+            else kernels.lower_triangle_of_dense(array, max_asymmetry)
+        )
+    lower, (i, j, asymmetry) = found
     if asymmetry > max_asymmetry:
-        entries: Any = sp.csr_array(array) if sparse else array
+        entries: Any = sp.csr_array(array) if issparse(array) else array
         row, column = (i, j) if names is None else (names[i], names[j])
         at, mirrored = float(entries[i, j]), float(entries[j, i])
         raise InputError(

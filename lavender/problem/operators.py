@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from lavender.problem.data import ProblemData, check_rhs
 from lavender.problem.derived import Derived, cached_property, computed_once
 from lavender_ext.core import assemble
 from lavender_ext.core.assemble import dense_to_csr
-from lavender_ext.core.checks import MAX_MAGNITUDE, make_instance, max_abs_of_array
+from lavender_ext.core.checks import MAX_MAGNITUDE, has_entry_above, make_instance
 from lavender_ext.core.problem import LAWS as FRICTION_NUMBER
 from lavender_ext.core.problem import Data, clip_zero_to_bounds
 from lavender_ext.factor import sparse
@@ -28,29 +27,19 @@ SEMIDEFINITE_SHIFT = 1e-12
 # If entries of J and M^-1 do not exceed this, A_ii cannot exceed MAX_MAGNITUDE and is not checked.
 MAX_SAFE_ENTRY = 1e15
 MAX_INDEXABLE_ENTRIES = 2**31  # A with this many entries or more is not formed: its indices have 32 bits.
-# Cached properties that depend on A alone, and fields that do not change with b.
+# Fields and cached properties that depend neither on the law of friction nor on b, and those that do not depend on b.
 SHARED_ARRAYS = ("csr", "jacobian", "whitened", "bandwidth", "_compressed", "_couplings", "_matrix_asymmetry")
 FIELDS_BESIDES_RHS = (
-    "cones",
-    "matrix",
-    "rows",
-    "friction",
-    "compliance",
-    "key",
-    "names",
-    "name",
-    "copy",
-    "precision",
-    "law",
-)
-get_fields_besides_rhs = attrgetter(*FIELDS_BESIDES_RHS)
+    "cones", "matrix", "rows", "friction", "compliance", "key", "names", "name", "copy", "precision", "law",
+)  # fmt: skip
+# Key in `Derived.cache` of the values of FIELDS_BESIDES_RHS, for the next problem with another b.
+BESIDES_RHS_KEY = "lavender.problem.operators: fields besides b"
 
 
 class Operators(ProblemData):
     """A, J, and the arrays that kernels and the judge read, derived from the fields of a problem."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check_magnitudes(self) -> None:
         if self.matrix is None and self._has_large_entries():
             self.metric  # noqa: B018 - raises the error now, not in a solve
 
@@ -79,27 +68,29 @@ class Operators(ProblemData):
             other.derived.view = self.derived.view.with_law(law, b)
 
     def _with_rhs(self, b: FloatArray, generalized: Any, guess: FloatArray | None) -> Any:
-        """Return a problem of the same A with another checked right-hand side b (m,) [m/s] and start."""
+        """Return a problem of the same A with another right-hand side b (m,) [m/s], used without a copy."""
         check_rhs(b)
-        values = dict(zip(FIELDS_BESIDES_RHS, get_fields_besides_rhs(self)))  # noqa: B905 - strict= takes longer
-        values |= {"b": b, "generalized": generalized, "guess": guess, "derived": Derived(), "qp": None}
-        other: Operators = make_instance(type(self), values)
+        derived = Derived()
+        same = self.derived.cache.get(BESIDES_RHS_KEY) or {
+            name: getattr(self, name) for name in FIELDS_BESIDES_RHS
+        }
+        derived.cache[BESIDES_RHS_KEY] = same
+        values = {"b": b, "generalized": generalized, "guess": guess, "derived": derived, "qp": None}
+        other: Operators = make_instance(type(self), same | values)
         self._share_operator(other)
-        if generalized is not None and other.derived.view is None:
+        if generalized is not None and derived.view is None:
             other._set_view()
         return other
 
     def _has_large_entries(self) -> bool:
         """Return whether an entry of J, M^-1 or the compliance exceeds MAX_SAFE_ENTRY: A_ii may be too large."""
-        if self.compliance is not None and max_abs_of_array(self.compliance) > MAX_SAFE_ENTRY:
-            return True
-        if self.generalized is not None:
-            return bool(self.generalized.operator.has_entry_above(MAX_SAFE_ENTRY))
-        r = self.rows
-        return r is not None and any(
-            max_abs_of_array(x.reshape(-1)) > MAX_SAFE_ENTRY
-            for x in (r.jac, r.arm_a, r.arm_b, r.inv_mass, r.inv_inertia)
-        )
+        r, general, c = self.rows, self.generalized, self.compliance
+        if general is not None:
+            return bool(
+                general.operator.has_entry_above(MAX_SAFE_ENTRY) or has_entry_above(MAX_SAFE_ENTRY, c)
+            )
+        assert r is not None
+        return bool(has_entry_above(MAX_SAFE_ENTRY, c, r.jac, r.arm_a, r.arm_b, r.inv_mass, r.inv_inertia))
 
     @property
     def asymmetry(self) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from math import dist, hypot, inf
 from typing import Any
 
@@ -21,37 +21,46 @@ from lavender.base.arrays import (
 from lavender.base.errors import InputError
 from lavender.problem.rows import check_and_symmetrise_inertia
 from lavender_ext.core.checks import MIN_MAGNITUDE, find_body_fault
-from lavender_ext.core.row_blocks import BLOCK_TYPES, RowBlocks
+from lavender_ext.core.row_blocks import ARGUMENTS, FAULTS, RowBlocks
 
-#: Numbers of the types of blocks; a key has the type (4 bits), body a + 1 (22), body b + 1 (22), and the feature (16).
-BLOCK_NUMBERS = {name: number for number, name in enumerate(BLOCK_TYPES)}
+#: Types of blocks; a key has the number of the type (4 bits), body a + 1 (22), body b + 1 (22), and the feature (16).
+BLOCK_TYPES = tuple(ARGUMENTS)
+#: Names of the arguments of each type of block in the order of `RowBlocks.add`: vectors, then numbers.
+NAMES = {
+    block_type: [name.rstrip("?") for name in vectors + numbers]
+    for block_type, (vectors, numbers) in ARGUMENTS.items()
+}
 MAX_KEYED_BODIES = 2**22 - 1  # More bodies do not fit into the 22 bits of a key.
 MAX_FEATURE = 2**16 - 1  # Larger features do not fit into the 16 bits of a key.
-# [-] A normal is rejected if its length differs from 1 by more; float32 causes 1e-7.
-NORMAL_LENGTH_TOLERANCE = 1e-5
 # Columns of (v_x, v_y, omega_z) in the velocities of a body in three dimensions.
 PLANAR_VELOCITIES = (0, 1, 5)
-#: Arguments of each type of block in the order of `RowBlocks.add`: vectors, then numbers. Those with "?" may be None.
-ARGUMENTS = {
-    "hinge": ("anchor", "anchor_b?", "axis", "axis_b?"),
-    "ball": ("anchor", "anchor_b?"),
-    "weld": ("anchor", "anchor_b?", "angle_error"),
-    "slider": ("anchor", "anchor_b?", "axis", "angle_error"),
-    "distance": ("anchor_a", "anchor_b", "length?"),
-    "motor": ("axis?", "anchor?", "speed", "max_torque?", "max_force?"),
-    "limit": ("axis?", "anchor?", "value", "lower", "upper"),
-    "spring": ("anchor_a", "anchor_b", "length", "stiffness", "damping"),
-    "gear": ("axis_a", "axis_b?", "ratio", "angle_error"),
-    "contact": ("point", "normal", "tangent?", "gap", "mu", "restitution", "restitution_threshold"),
-}
+# Axes of rotation, or directions of travel, which two dimensions do not have, or which have two components.
+ROTATION_AXES = ("axis?", "axis_a?", "axis_b?")
 #: Ranges of numbers that may not be negative.
-RANGES: dict[str, dict[str, float]] = {
-    name: {"low": 0.0}
-    for name in (
-        "length", "max_torque", "max_force", "stiffness", "damping", "mu", "restitution", "restitution_threshold",
-    )
+RANGES = {name: {"low": 0.0} for name in ("length", "max_torque", "max_force", "stiffness", "damping", "mu")} | {
+    "restitution": {"low": 0.0, "high": 1.0}, "restitution_threshold": {"low": 0.0},
 }  # fmt: skip
-RANGES["restitution"]["high"] = 1.0
+#: Messages of the faults of row_blocks.pyx; `argument` is the one that a fault refers to, `given` its value.
+MESSAGES = {
+    "axis_given": "{argument} is {given!r:.60}; in two dimensions all rotation is about z: leave it out",
+    "axis_missing": "{argument} is None; a vector ({dimensions},) in world coordinates is needed",
+    "length": "{argument} has length {size:g}; a direction is needed",
+    "anchor_given": "anchor is given with max_torque, which acts everywhere on the body: leave anchor out, or give "
+    "max_force",
+    "anchor_missing": "anchor is None; a motor with max_force needs the point at which the force acts",
+    "rod": "length is {length}, and anchor_a and anchor_b are {span:g} m apart; a positive length is needed, as a rod "
+    "of length 0 has no direction: give length, or use ball for two points that coincide",
+    "spring": "stiffness is {stiffness:g} N/m and damping is {damping:g} N s/m; at least one must be positive, so that "
+    f"dt (damping + dt stiffness) is at least {MIN_MAGNITUDE:g}",
+    "motor": "max_torque is {max_torque} and max_force is {max_force}; exactly one of the two is needed: max_torque "
+    "for rotation, max_force for travel",
+    "limits": "lower is {lower:g} and upper is {upper:g}; lower must not exceed upper, and at least one must be "
+    "finite: change one of the two",
+    "ratio": "ratio is 0; a nonzero number is needed: 0 would stop a and leave b free",
+    "normal": "normal has length {size:g}; a unit vector from a to b is needed",
+    "tangent_given": "tangent is {tangent!r:.60}; in two dimensions it follows from the normal: leave it out",
+    "parallel": "tangent is {tangent!r:.60}, which is parallel to the normal; another direction is needed, or None",
+}
 
 
 def name_block(key: int) -> str:
@@ -162,136 +171,44 @@ class RowAssembly:
             raise InputError(f"a and b are both {same}; two bodies are needed, at most one of them static")
         return found[0], found[1]
 
-    def _check_vector(self, name: str, value: ArrayLike, unit: str = "") -> list[float]:
-        """Return a vector of the builder's dimension."""
-        if get_shape(name, value) == ():  # Reject a scalar here, as `as_array` would repeat it.
-            raise InputError(f"{name} is {value!r:.60}; a vector ({self._dimensions},) is needed")
-        vector: list[float] = as_array(name, value, (self._dimensions,), unit=unit).tolist()
-        return vector
-
-    def _check_direction(self, name: str, value: ArrayLike) -> list[float]:
-        """Return a vector that is not 0."""
-        vector = self._check_vector(name, value)
-        if hypot(*vector) < MIN_MAGNITUDE:
-            raise InputError(f"{name} has length {hypot(*vector):g}; a direction is needed")
-        return vector
-
-    def _check_rotation_axis(self, name: str, value: ArrayLike | None) -> list[float] | None:
-        """Return an axis of rotation; None in two dimensions."""
-        if self._is_planar:
-            if value is not None:
-                raise InputError(
-                    f"{name} is {value!r:.60}; in two dimensions all rotation is about z: leave it out"
-                )
-            return None
-        if value is None:
-            raise InputError(
-                f"{name} is None; a vector (3,) in world coordinates is needed in three dimensions"
-            )
-        return self._check_direction(name, value)
-
-    def _check_motor_axis(self, x: dict[str, Any], is_linear: bool) -> None:
-        """Check axis and anchor of a motor or limit: of travel at the anchor, or of rotation."""
-        if not is_linear:
-            if x["anchor"] is not None:
-                raise InputError(
-                    "anchor is given with max_torque, which acts everywhere on the body: leave anchor out, "
-                    "or give max_force"
-                )
-            x["axis"] = self._check_rotation_axis("axis", x["axis"])
-        elif x["anchor"] is None:
-            raise InputError("anchor is None; a motor with max_force needs the point at which the force acts")
-        elif x["axis"] is None:
-            raise InputError(f"axis is None; the direction of travel ({self._dimensions},) is needed")
-        else:
-            x["axis"] = self._check_direction("axis", x["axis"])
-
-    def _check_frame(self, x: dict[str, Any]) -> None:
-        """Check normal and tangent of a contact."""
-        normal = x["normal"] = self._check_vector("normal", x["normal"])
-        size = hypot(*normal)
-        if abs(size - 1.0) > NORMAL_LENGTH_TOLERANCE:
-            raise InputError(f"normal has length {size:g}; a unit vector from a to b is needed")
-        if x["tangent"] is None:
-            return
-        if self._is_planar:
-            raise InputError(
-                f"tangent is {x['tangent']!r:.60}; in two dimensions it follows from the normal: leave it out"
-            )
-        tangent = self._check_direction("tangent", x["tangent"])
-        sine = np.linalg.norm(np.cross(tangent, normal)) / (hypot(*tangent) * size)
-        if sine < 2.0 * NORMAL_LENGTH_TOLERANCE:
-            raise InputError(
-                f"tangent is {x['tangent']!r:.60}, which is parallel to the normal; another direction is needed, "
-                "or None"
-            )
-        x["tangent"] = tangent
-
-    def _check_number(self, block_type: str, name: str, value: Any) -> Any:
-        """Return a number of a block, or the error of an orientation."""
-        if name == "angle_error" and block_type != "gear" and not self._is_planar:
-            return as_array("angle_error", value, (3,), unit="rad").tolist()
-        unlimited = {"lower": -inf, "upper": inf}.get(name)
-        if isinstance(value, (float, np.floating)) and float(value) == unlimited:
-            return unlimited
-        return check_float(name, value, **RANGES.get(name, {}))
-
-    def _check_values(self, block_type: str, values: Iterable[Any]) -> tuple[Any, ...]:
-        """Return the arguments of one block as lists and floats; raise InputError at an invalid one."""
-        x: dict[str, Any] = {}
-        for name, value in zip(ARGUMENTS[block_type], values, strict=True):
-            word = name.rstrip("?")
-            if (value is None and word != name) or word.startswith("axis") or word in ("normal", "tangent"):
-                x[word] = value
-            elif word.startswith(("anchor", "point")):
-                x[word] = self._check_vector(word, value, "m")
+    def _convert_values(self, block_type: str, values: Iterable[Any]) -> tuple[Any, ...]:
+        """Return the arguments of one block as lists and floats; raise InputError if one has a wrong type or range."""
+        vectors, numbers = ARGUMENTS[block_type]
+        converted: list[Any] = []
+        for i, (argument, value) in enumerate(zip(vectors + numbers, values, strict=True)):
+            name = argument.rstrip("?")
+            is_vector, width = self._get_width(block_type, i)
+            if value is None and name != argument:
+                converted.append(None)
+            elif argument in ROTATION_AXES and self._is_planar and get_shape(name, value) != (2,):
+                raise InputError(MESSAGES["axis_given"].format(argument=name, given=value))
+            elif is_vector:
+                if width == self._dimensions and name != "angle_error" and get_shape(name, value) == ():
+                    raise InputError(f"{name} is {value!r:.60}; a vector ({width},) is needed")
+                unit = "m" if name.startswith(("anchor", "point")) else ""
+                converted.append(as_array(name, value, (width,), unit=unit).tolist())
+            elif isinstance(value, (float, np.floating)) and value == {"lower": -inf, "upper": inf}.get(name):
+                converted.append(float(value))
             else:
-                x[word] = self._check_number(block_type, word, value)
-        if block_type == "contact":
-            self._check_frame(x)
-        elif block_type == "slider":
-            x["axis"] = self._check_direction("axis", x["axis"])
-        elif block_type == "distance":
-            length = dist(x["anchor_a"], x["anchor_b"]) if x["length"] is None else x["length"]
-            if not length > MIN_MAGNITUDE:
-                cause = (
-                    "anchor_a and anchor_b coincide and length is None"
-                    if x["length"] is None
-                    else "length is 0"
-                )
-                raise InputError(
-                    f"{cause}; a positive length is needed, as a rod of length 0 has no direction: give length, or "
-                    "use ball for two points that coincide"
-                )
-        elif block_type == "spring":
-            k, c = x["stiffness"], x["damping"]
-            if self._dt * (c + self._dt * k) < MIN_MAGNITUDE:
-                raise InputError(
-                    f"stiffness is {k:g} N/m and damping is {c:g} N s/m; at least one must be positive, so that "
-                    f"dt (damping + dt stiffness) is at least {MIN_MAGNITUDE:g}"
-                )
-        elif block_type == "motor":
-            if (x["max_torque"] is None) == (x["max_force"] is None):
-                state = "neither is given" if x["max_torque"] is None else "both are given"
-                raise InputError(
-                    f"of max_torque and max_force {state}; exactly one of the two is needed: max_torque for "
-                    "rotation, max_force for travel"
-                )
-            self._check_motor_axis(x, x["max_force"] is not None)
-        elif block_type == "limit":
-            low, high = x["lower"], x["upper"]
-            if low > high or (low == -inf and high == inf):
-                wanted = "lower must not exceed upper" if low > high else "at least one must be finite"
-                raise InputError(f"lower is {low:g} and upper is {high:g}; {wanted}: change one of the two")
-            self._check_motor_axis(x, x["anchor"] is not None)
-        elif block_type in ("hinge", "gear"):
-            first, second = ("axis", "axis_b") if block_type == "hinge" else ("axis_a", "axis_b")
-            x[first] = self._check_rotation_axis(first, x[first])
-            if x[second] is not None:
-                x[second] = self._check_rotation_axis(second, x[second])
-            if x.get("ratio") == 0.0:
-                raise InputError("ratio is 0; a nonzero number is needed: 0 would stop a and leave b free")
-        return tuple(x.values())
+                converted.append(check_float(name, value, **RANGES.get(name, {})))
+        return tuple(converted)
+
+    def _get_width(self, block_type: str, i: int) -> tuple[bool, int]:
+        """Return whether argument i of a type of block is a vector, and its length."""
+        vectors, _ = ARGUMENTS[block_type]
+        if i < len(vectors) and vectors[i] == "angle_error":
+            return not self._is_planar, 3
+        return i < len(vectors), self._dimensions
+
+    def _describe_fault(self, block_type: str, values: Sequence[Any]) -> str:
+        """Return the message of the last fault of `_blocks`; `values` are the converted arguments of the block."""
+        x, i = dict(zip(NAMES[block_type], values, strict=True)), self._blocks.argument
+        more = {"argument": NAMES[block_type][i], "given": values[i], "dimensions": self._dimensions}
+        if isinstance(values[i], list):
+            more["size"] = hypot(*values[i])
+        if block_type == "distance":
+            more["span"] = dist(x["anchor_a"], x["anchor_b"])
+        return MESSAGES[FAULTS[self._blocks.fault]].format(**x, **more)
 
     def _check_feature(self, block_type: str, pair: tuple[int, int], feature: int | None) -> int:
         """Return the feature of a new block."""
@@ -320,12 +237,13 @@ class RowAssembly:
         """Add a block and return its key; `values` are its ARGUMENTS."""
         if not isinstance(name, str):
             raise InputError(f"name is {name!r:.60}; a text is needed")
-        number = BLOCK_NUMBERS[block_type]
+        number = BLOCK_TYPES.index(block_type)
         key: int | None = self._blocks.add(number, a, b, feature, values)
         if key is None:  # An argument is invalid, or needs a conversion.
-            pair, values = self._check_pair(a, b), self._check_values(block_type, values)
+            pair, values = self._check_pair(a, b), self._convert_values(block_type, values)
             key = self._blocks.add(number, *pair, self._check_feature(block_type, pair, feature), values)
-            assert key is not None, "the checks of row_blocks.pyx differ from those of this file"
+            if key is None:
+                raise InputError(self._describe_fault(block_type, values))
         if name:
             self._names[key] = name
         return key
@@ -339,21 +257,23 @@ class RowAssembly:
         numbers = None if feature is None else as_array("feature", feature, (n,), dtype=np.int32)
         labels = None if names is None else as_names("names", names, n)
         arrays = [
-            None if value is None else self._as_values(block_type, name.rstrip("?"), value, n)
-            for name, value in zip(ARGUMENTS[block_type], values, strict=True)
+            None if value is None else self._as_values(block_type, k, value, n)
+            for k, value in enumerate(values)
         ]
         keys = np.empty(n, np.uint64)
-        i = self._blocks.add_many(BLOCK_NUMBERS[block_type], pairs, numbers, tuple(arrays), keys)
+        i = self._blocks.add_many(BLOCK_TYPES.index(block_type), pairs, numbers, tuple(arrays), keys)
         if i >= 0:
             try:
                 pair = self._check_pair(*pairs[i].tolist())
                 single: list[Any] = [x if x is None else x[i].tolist() for x in arrays]
                 if self._is_planar and block_type in ("weld", "slider"):
                     single[-1] = single[-1][2]  # The angle of the orientation error.
-                self._check_values(block_type, single)
+                single = list(self._convert_values(block_type, single))
                 self._check_feature(block_type, pair, None if numbers is None else int(numbers[i]))
             except InputError as error:
                 raise InputError(f"{block_type} {i}: {error}") from None
+            if FAULTS[self._blocks.fault] != "conversion":
+                raise InputError(f"{block_type} {i}: {self._describe_fault(block_type, single)}")
             raise InputError(
                 f"{block_type} {i}: an earlier one of the same bodies has its feature, or they are more than "
                 f"{MAX_FEATURE + 1}; different features up to {MAX_FEATURE} are needed"
@@ -362,18 +282,15 @@ class RowAssembly:
             self._names.update(zip(keys.tolist(), labels, strict=True))
         return keys
 
-    def _as_values(self, block_type: str, name: str, value: ArrayLike, n: int) -> FloatArray:
-        """Convert an argument of n blocks to an array; one vector or number is repeated."""
-        is_vector = name.startswith(("anchor", "point", "axis")) or name in ("normal", "tangent")
-        width = self._dimensions
-        if name == "angle_error" and block_type != "gear":
-            is_vector, width = not self._is_planar, 3
+    def _as_values(self, block_type: str, k: int, value: ArrayLike, n: int) -> FloatArray:
+        """Convert argument k of n blocks to an array; one vector or number is repeated."""
+        name, (is_vector, width) = NAMES[block_type][k], self._get_width(block_type, k)
         if not is_vector:
-            array = as_array(name, value, (n,), finite=block_type != "limit" or name == "value")
+            array = as_array(name, value, (n,), finite=name not in ("lower", "upper"))
             return array if width == self._dimensions else np.outer(array, (0.0, 0.0, 1.0))
-        if get_shape(name, value) in ((), (width,)):
-            vector = (
-                as_array(name, value, (width,)) if name == "angle_error" else self._check_vector(name, value)
-            )
-            return np.tile(vector, (n, 1))
+        shape = get_shape(name, value)
+        if shape == () and name != "angle_error":
+            raise InputError(f"{name} is {value!r:.60}; vectors ({n}, {width}) are needed, or one vector")
+        if shape in ((), (width,)):
+            return np.tile(as_array(name, value, (width,)), (n, 1))
         return as_array(name, value, (n, width))

@@ -14,9 +14,11 @@ import numpy as np
 
 from lavender.base.arrays import ArrayLike, FloatArray, check_int
 from lavender.base.errors import InputError, check_name
+from lavender.problem.cones import Cones
 from lavender.problem.data import Names
+from lavender.problem.friction import check_shape
 from lavender.problem.problem import Problem
-from lavender.problem.row_assembly import ARGUMENTS, PLANAR_VELOCITIES, RowAssembly, name_block
+from lavender.problem.row_assembly import NAMES, PLANAR_VELOCITIES, RowAssembly, name_block
 from lavender.problem.rows import Rows
 
 
@@ -407,10 +409,10 @@ class RowBuilder(RowAssembly):
         TypeError
             The method has no argument of this name, or an argument is missing.
         """
-        check_name("block_type", block_type, [name for name in ARGUMENTS if name != "contact"])
+        check_name("block_type", block_type, [name for name in NAMES if name != "contact"])
         bound = signature(getattr(type(self), block_type)).bind(self, None, None, **arguments)
         bound.apply_defaults()
-        values = [bound.arguments[name.rstrip("?")] for name in ARGUMENTS[block_type]]
+        values = [bound.arguments[name] for name in NAMES[block_type]]
         return self._add_many(block_type, bodies, feature, names, values)
 
     # -- results -------------------------------------------------------------------------------------------------
@@ -432,40 +434,19 @@ class RowBuilder(RowAssembly):
         Problem
             `lv.solve(problem, impulse=problem.carry(previous))` starts from the solution of the step before.
         """
-        rows, joints, contacts = self._blocks.export()
-        tangents = np.where(contacts["mu"] > 0.0, np.int32(self._dimensions - 1), np.int32(0))
-        data = Rows(
-            inv_mass=self._inv_mass,
-            inv_inertia=self._inv_inertia,
-            v_free=self._velocity,
-            jac=np.ascontiguousarray(rows["jac"]),
-            joint_ptr=np.append(np.int32(0), np.cumsum(joints["n_rows"], dtype=np.int32)),
-            joint_body=np.ascontiguousarray(joints["body"]),
-            contact_body=np.ascontiguousarray(contacts["body"]),
-            **{
-                name: np.ascontiguousarray(contacts[name]) for name in ("normal", "tangent", "arm_a", "arm_b")
-            },
-            copy=False,
-        )
-        first = len(rows) + np.append(0, np.cumsum(1 + tangents))
-        target, compliance = np.zeros(first[-1]), np.zeros(first[-1])
-        target[: len(rows)], compliance[: len(rows)] = rows["target"], rows["compliance"]
-        target[first[:-1]] = contacts["target"]
-        keys = np.append(joints["key"], contacts["key"])
+        is_box = check_shape("shape", shape) == "box"
+        blocks, rows, b, compliance, keys = self._blocks.export(is_box)
         given = dict(self._names)
-        return Problem.from_rows(
-            data,
-            target,
-            lower=rows["lower"],
-            upper=rows["upper"],
-            mu=contacts["mu"],
-            tangents=tangents,
-            shape=shape,
+        return Problem(
+            b,
+            Cones._from_blocks(blocks),
+            rows=Rows(self._inv_mass, self._inv_inertia, self._velocity, **rows, copy=False),
             friction=friction,
             compliance=compliance,
             key=keys,
             names=Names(len(keys), lambda: [given.get(key) or name_block(key) for key in keys.tolist()]),
             name=name,
+            copy=False,
         )
 
     def rows_of(self, key: int) -> slice:

@@ -11,7 +11,7 @@ from lavender.base.arrays import FloatArray, IntArray
 from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.problem import Problem
 from lavender.problem.data import Names
-from lavender_ext.core.checks import MIN_MAGNITUDE, max_abs_of_array
+from lavender_ext.core.checks import is_rhs_valid
 
 
 def find_islands(problem: Problem) -> tuple[int, IntArray]:
@@ -42,7 +42,7 @@ def restrict_to_blocks(problem: Problem, blocks: IntArray, rows: IntArray) -> Pr
     names = Names(len(blocks), lambda: [problem.block_name(i) for i in blocks])
     attributes: dict[str, Any] = {"friction": problem.friction, "names": names, "name": problem.name}
     b: FloatArray = problem.b[rows]
-    b = b if max_abs_of_array(b) >= MIN_MAGNITUDE else np.zeros(len(rows))
+    b = b if is_rhs_valid(b) else np.zeros(len(rows))
     if problem.generalized is not None:
         assert problem.compliance is not None
         trees = problem.generalized.trees

@@ -15,7 +15,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, cast
 
 import numpy as np
 
-from lavender.base.arrays import ArrayLike, FloatArray, are_equal, check_bool, check_float, check_int
+from lavender.base.arrays import (
+    ArrayLike,
+    FloatArray,
+    are_equal,
+    as_array,
+    check_bool,
+    check_float,
+    check_int,
+    mark_read_only,
+)
 from lavender.base.deadline import NEVER, Deadline, read_clock
 from lavender.base.errors import BREAKDOWN, CapabilityError, InputError, InUse, UnknownName, format_error
 from lavender.judge.certificates import prove_infeasibility
@@ -246,17 +255,25 @@ class Prepared:
 
     def _update_problem(self, problem: Problem | None, b: Any, v_free: Any) -> Problem:
         """Return the prepared problem with a new right-hand side b or a new v*, see `solve`."""
-        original, target = self._original, None
+        original = self._original
         if problem is not None:
             raise InputError(
                 "problem is given with b or v_free: give problem.updated(b=...), or leave problem out"
             )
         general = original.generalized
-        if v_free is not None and b is None and general is not None:
-            if self._target is None or self._target[0] is not original:
-                self._target = original, original.b + general.velocity_of(general.v_free)
-            target = self._target[1]
-        updated = original.updated(b=b, v_free=v_free, target=target)
+        if original.has_singular_program or (v_free is not None and general is None):
+            return original.updated(b=b, v_free=v_free)
+        target, moved, known = None, general, self._target
+        if b is not None:
+            b = as_array("b", b, (original.m,), unit="m/s")
+        if v_free is not None:
+            assert general is not None
+            moved = general.with_jacobian(None, v_free)
+            if b is None:
+                is_known = known is not None and known[0] is original
+                target = known[1] if known and is_known else original.b + general.multiply_by_v_free()
+                b = mark_read_only(target - moved.multiply_by_v_free())
+        updated: Problem = original._with_rhs(b, moved, None)
         if target is not None:
             self._target = updated, target
         return updated

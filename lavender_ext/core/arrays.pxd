@@ -5,6 +5,8 @@ from libc.stdlib cimport calloc, free
 
 import numpy as np
 
+from lavender_ext.core.validate cimport has_invalid_number
+
 cdef extern from *:
     """
     /* The leading fields of NumPy's array and dtype structs: an ABI that has not changed since NumPy 1.0. */
@@ -82,6 +84,28 @@ cdef inline double* as_double_pointer(object array, Py_ssize_t n) except? NULL:
 cdef inline int32_t* as_int_pointer(object array, Py_ssize_t n) except? NULL:
     """Return the address of n contiguous int32 values."""
     return <int32_t*>get_checked_data_pointer(array, n, 1, INT, NULL)
+
+
+cdef inline const double* get_plain_matrix(object value, Py_ssize_t* m, Py_ssize_t* n, Py_ssize_t* nonzeros):
+    """Return the address of a C-contiguous float64 matrix with valid numbers, and its shape; NULL for any other value.
+
+    `nonzeros` receives an upper bound of its nonzeros; only in large matrices they are counted, for the sake of memory.
+    """
+    cdef ndarray x
+    cdef const double* at
+    cdef Py_ssize_t i, count = 0
+    if type(value) is not ndarray:
+        return NULL
+    x = <ndarray>value
+    if x.nd != 2 or not x.flags & C_CONTIGUOUS or not has_element_type(x, DOUBLE):
+        return NULL
+    m[0], n[0], at = x.dimensions[0], x.dimensions[1], <const double*>x.data
+    nonzeros[0] = m[0] * n[0]
+    if nonzeros[0] > 32768:
+        for i in range(m[0] * n[0]):
+            count += at[i] != 0.0
+        nonzeros[0] = count
+    return NULL if has_invalid_number(at, m[0] * n[0]) else at
 
 
 cdef inline object make_read_only(object array):

@@ -10,6 +10,7 @@ from libc.string cimport memcpy
 
 import numpy as np
 
+from lavender_ext.core.arrays cimport get_plain_matrix, make_read_only, ndarray
 from lavender_ext.core.csr cimport transpose_csr
 from lavender_ext.core.faults cimport NO_FAULT, find_matrix_fault
 from lavender_ext.core.mass cimport THIN_PADDING, compress_dense_rows
@@ -247,21 +248,24 @@ def form_delassus_matrix(Data p, Py_ssize_t max_entries, int32_t[::1] start, int
     return (indptr_, *entries)
 
 
-def dense_to_csr(const double[:, ::1] a, double sign=1.0):
-    """Return the nonzeros of a dense matrix times `sign` as (indptr, indices, data), int32; nnz must be below 2^31."""
-    cdef Py_ssize_t i, j, n = a.shape[0], m = a.shape[1], nnz = 0, q
-    for i in range(n):
-        for j in range(m):
-            nnz += a[i, j] != 0.0
+def dense_to_csr(a, double sign=1.0):
+    """Return the nonzeros of a dense matrix times `sign` as (indptr, indices, data), int32; nnz must be below 2^31.
+
+    None is returned unless the matrix is a C-contiguous float64 array with valid numbers.
+    """
+    cdef Py_ssize_t n = 0, m = 0, nnz = 0, q
+    cdef const double* entries = get_plain_matrix(a, &n, &m, &nnz)
+    if entries == NULL:
+        return None
     all_indices, values = np.empty(n + 1 + nnz + THIN_PADDING, np.int32), np.empty(nnz + THIN_PADDING)
-    cdef int32_t[::1] indices = all_indices
-    cdef double[::1] data = values
-    compress_dense_rows(&a[0, 0] if n and m else NULL, m, <int32_t>n, <int32_t>m, &indices[0], &indices[n + 1], &data[0])
+    cdef int32_t* indices = <int32_t*>(<ndarray>all_indices).data
+    cdef double* data = <double*>(<ndarray>values).data
+    nnz = compress_dense_rows(entries, m, <int32_t>n, <int32_t>m, indices, indices + n + 1, data)
     if sign != 1.0:
         for q in range(nnz):
             data[q] *= sign
-    all_indices.setflags(False)
-    values.setflags(False)
+    make_read_only(all_indices)
+    make_read_only(values)
     return all_indices[:n + 1], all_indices[n + 1:n + 1 + nnz], values[:nnz]
 
 

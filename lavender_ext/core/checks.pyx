@@ -4,11 +4,11 @@ The checks report no reasons. If a check fails, the caller validates again in de
 """
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core cimport validate
 from lavender_ext.core.arrays cimport DOUBLE, C_CONTIGUOUS, as_double_pointer, as_int_pointer, has_element_type, ndarray
 from lavender_ext.core.faults cimport (NO_FAULT, body_tolerances_t, find_body_fault as find_body_fault_of, find_matrix_fault,
                                         find_pointer_fault, is_valid_rhs, measure_frame_error, orthonormalise_frame)
-from lavender_ext.core.validate cimport find_invalid_magnitude, has_invalid_number, max_magnitude, min_magnitude
+from lavender_ext.core.validate cimport (any_magnitude_above, find_invalid_magnitude, has_invalid_number, max_magnitude,
+                                         min_magnitude, norm_inf)
 from lavender_ext.core.view cimport rows_t
 
 cdef extern from "Python.h":
@@ -67,24 +67,33 @@ def all_in_valid_range(x):
     return not has_invalid_number(as_double_pointer(x, x.size), x.size)
 
 
-def find_invalid_magnitude_in_array(const double[::1] x):
+def find_invalid_magnitude_in_array(x):
     """Return the index of the first number that is neither 0 nor in [MIN_MAGNITUDE, MAX_MAGNITUDE], or -1."""
-    return find_invalid_magnitude(&x[0], x.shape[0]) if x.shape[0] else -1
+    return find_invalid_magnitude(as_double_pointer(x, x.size), x.size)
 
 
 def max_abs_of_array(x):
     """Return max |x_i| of a float64 array: 0 if it is empty, NaN if any entry is NaN."""
-    return validate.norm_inf(as_double_pointer(x, x.size), x.size)
+    return norm_inf(as_double_pointer(x, x.size), x.size)
 
 
-def are_pointers_valid(const int32_t[::1] ptr, int min_size):
-    """Return whether the pointers begin with 0 and increase by at least min_size."""
-    return ptr.shape[0] > 0 and find_pointer_fault(&ptr[0], ptr.shape[0] - 1, 2147483647, min_size) < 0
+def has_entry_above(double bound, *arrays):
+    """Return whether any |x_i| of these float64 arrays is above `bound` or NaN."""
+    for x in arrays:
+        if any_magnitude_above(as_double_pointer(x, x.size), x.size, bound):
+            return True
+    return False
 
 
-def is_rhs_valid(const double[::1] b):
+def are_pointers_valid(ptr, int min_size):
+    """Return whether the pointers (int32) begin with 0 and increase by at least min_size."""
+    n = len(ptr)
+    return n > 0 and find_pointer_fault(as_int_pointer(ptr, n), n - 1, 2147483647, min_size) < 0
+
+
+def is_rhs_valid(b):
     """Return whether a right-hand side has no fault (core/faults.pxd)."""
-    return b.shape[0] == 0 or is_valid_rhs(&b[0], b.shape[0])
+    return len(b) == 0 or is_valid_rhs(as_double_pointer(b, len(b)), len(b))
 
 
 def are_lower_triangles_valid(const int32_t[::1] indptr, const int32_t[::1] indices):

@@ -5,12 +5,12 @@ from libc.string cimport memcmp, memset
 
 import numpy as np
 
-from lavender_ext.core.arrays cimport as_double_pointer, as_int_pointer, ndarray
+from lavender_ext.core.arrays cimport as_double_pointer, as_int_pointer, get_plain_matrix, ndarray
 from lavender_ext.core.validate cimport any_magnitude_above
 from lavender_ext.core.condition cimport estimate_condition
 from lavender_ext.core.generalized cimport multiply_jacobian_transpose, multiply_jacobian_row, solve_mass_matrix
 from lavender_ext.core.mass cimport (THIN_PADDING, relative_entry_asymmetry, compress_lower_triangle, factor_mass,
-                                     count_mass_factor_work, is_symmetric, ordering_pays_off)
+                                     count_mass_factor_work, ordering_pays_off)
 from lavender_ext.core.tree cimport find_tree_factor_pattern
 
 cdef object new = np.empty, I4 = np.dtype(np.int32)
@@ -81,7 +81,7 @@ cdef class Operator:
         self.keep, self.failed = [marks], -1
 
     def factor(self):
-        """Compute L and D, and estimate the condition of M."""
+        """Compute L and D, and estimate the condition of M; return `failed`."""
         cdef int32_t n = self.g.n
         factor = new(4 * <int64_t>n + self.g.lptr[n] + 1)
         cdef double* numbers = <double*>(<ndarray>factor).data
@@ -89,6 +89,7 @@ cdef class Operator:
         self.failed = factor_mass(&self.g, numbers + 2 * n, numbers, numbers + n)
         if self.failed < 0:
             self.g.condition = estimate_condition(&self.g, numbers + 2 * n + self.g.lptr[n] + 1)
+        return self.failed
 
     def share_factor(self, Operator other):
         """Share L and D of another, factored operator with the same M."""
@@ -204,28 +205,29 @@ cdef class Operator:
         return result
 
 
-def lower_triangle_of_dense(const double[:, ::1] a):
+def lower_triangle_of_dense(a, double max_asymmetry):
     """Return (indptr, indices, data) of the lower triangle with diagonal, and the largest asymmetry.
 
-    The asymmetry is (i, j, `relative_entry_asymmetry` of core/mass.pxd) of the pair with the largest value.
+    The asymmetry is (i, j, `relative_entry_asymmetry` of core/mass.pxd) of the pair with the largest value, (0, 0, 0) unless a
+    value is above `max_asymmetry`. None is returned unless a is a square, C-contiguous float64 array with valid numbers.
     """
-    cdef int32_t n = <int32_t>a.shape[0], i, j, nnz = n, at_i = 0, at_j = 0
+    cdef Py_ssize_t rows = 0, columns = 0, nonzeros = 0
+    cdef const double* entries = get_plain_matrix(a, &rows, &columns, &nonzeros)
+    if entries == NULL or rows != columns:
+        return None
+    cdef int32_t n = <int32_t>rows, i, j, nnz, at_i = 0, at_j = 0
     cdef double worst = 0.0, x
-    cdef const double* entries = &a[0, 0] if n else NULL
-    for i in range(n):
-        for j in range(i):
-            nnz += a[i, j] != 0.0 or a[j, i] != 0.0
-    whole = new(n + 1 + nnz + THIN_PADDING, I4)
-    values = new(nnz + THIN_PADDING)
-    cdef int32_t[::1] k = whole
-    cdef double[::1] v = values
-    compress_lower_triangle(entries, n, 1.0 / 0.0, n, &k[0], &k[n + 1], &v[0])
-    if n and not is_symmetric(entries, n, n):
+    cdef Py_ssize_t size = min(rows * (rows + 1) // 2, rows + nonzeros)
+    whole, values = new(n + 1 + size + THIN_PADDING, I4), new(size + THIN_PADDING)
+    cdef int32_t* marks = <int32_t*>(<ndarray>whole).data
+    nnz = compress_lower_triangle(entries, n, max_asymmetry, n, marks, marks + n + 1, <double*>(<ndarray>values).data)
+    if nnz < 0:
         for i in range(n):
             for j in range(i):
                 x = relative_entry_asymmetry(entries, n, i, j)
                 if x > worst:
                     worst, at_i, at_j = x, i, j
+        nnz = 0
     return (whole[:n + 1], whole[n + 1:n + 1 + nnz], values[:nnz]), (at_i, at_j, worst)
 
 

@@ -1,8 +1,8 @@
 """Rows of joints and contacts of a step, from points and axes in world coordinates; `lavender.RowBuilder` has the equations.
 
-`RowBlocks` checks each block, appends its rows and returns its key. It reports no reasons: if a check fails, the caller
-validates the arguments again in detail and writes the message. Single blocks and arrays of blocks are read into the same
-`arguments_t`, so that both give the same bits.
+`RowBlocks` checks each block, appends its rows and returns its key. If a check fails, `fault` and `argument` name the reason,
+for which the caller has a message; after NEEDS_CONVERSION the caller converts the arguments and calls again. Single blocks and
+arrays of blocks are read into the same `arguments_t`, so that both give the same bits.
 
 Bodies are numbers, -1 is the static world, and the first numbers of two dimensions are those of a plane z = 0 of three.
 """
@@ -14,22 +14,41 @@ from cpython.mem cimport PyMem_Free, PyMem_Realloc
 import numpy as np
 
 from lavender_ext.core.arrays cimport C_CONTIGUOUS, DOUBLE, as_double_pointer, as_int_pointer, has_element_type, ndarray
-from lavender_ext.core.rows cimport cross, dot3
+from lavender_ext.core.block_types cimport CONTACT as CONTACT_BLOCK, CONTACT_BOX, ROW, write_contact_bounds
+from lavender_ext.core.blocks cimport Blocks, allocate_blocks
+from lavender_ext.core.rows cimport cross, dot3, multiply_jacobian
 from lavender_ext.core.validate cimport is_valid_number, min_magnitude
 from lavender_ext.core.vectors cimport copy3, scale3, subtract3
+from lavender_ext.core.view cimport rows_t
 
-#: Types of blocks by number; the number is the highest part of a key.
-BLOCK_TYPES = ("hinge", "ball", "weld", "slider", "distance", "motor", "limit", "spring", "gear", "contact")
+#: Vectors and numbers of each type of block; those with "?" may be None. The position of a type is the highest part of a key.
+ARGUMENTS = {
+    "hinge": (("anchor", "anchor_b?", "axis?", "axis_b?"), ()),
+    "ball": (("anchor", "anchor_b?"), ()),
+    "weld": (("anchor", "anchor_b?", "angle_error"), ()),
+    "slider": (("anchor", "anchor_b?", "axis", "angle_error"), ()),
+    "distance": (("anchor_a", "anchor_b"), ("length?",)),
+    "motor": (("axis?", "anchor?"), ("speed", "max_torque?", "max_force?")),
+    "limit": (("axis?", "anchor?"), ("value", "lower", "upper")),
+    "spring": (("anchor_a", "anchor_b"), ("length", "stiffness", "damping")),
+    "gear": (("axis_a?", "axis_b?"), ("ratio", "angle_error")),
+    "contact": (("point", "normal", "tangent?"), ("gap", "mu", "restitution", "restitution_threshold")),
+}
+#: Faults of the arguments of a block by number.
+FAULTS = ("", "conversion", "axis_given", "axis_missing", "length", "anchor_given", "anchor_missing", "rod", "spring", "motor",
+          "limits", "ratio", "normal", "tangent_given", "parallel")
 
 cdef enum:
     HINGE, BALL, WELD, SLIDER, DISTANCE, MOTOR, LIMIT, SPRING, GEAR, CONTACT, N_TYPES
+    NO_FAULT = 0, NEEDS_CONVERSION, AXIS_GIVEN, AXIS_MISSING, NO_LENGTH, ANCHOR_GIVEN, ANCHOR_MISSING, ROD, NO_SPRING, NO_BOUND
+    NO_LIMITS, NO_RATIO, BAD_NORMAL, TANGENT_GIVEN, PARALLEL
     MAX_FEATURE = 65535             # Larger features do not fit into the 16 bits of a key.
     MAX_ROWS = 6                    # Rows of the largest joint.
     MAX_VECTORS = 4
     MAX_NUMBERS = 4
 
-cdef int32_t[N_TYPES] N_VECTORS = [4, 2, 3, 4, 2, 2, 2, 2, 2, 3]
-cdef int32_t[N_TYPES] N_NUMBERS = [0, 0, 0, 0, 1, 3, 3, 3, 2, 4]
+cdef int32_t[N_TYPES] N_VECTORS = [len(vectors) for vectors, _ in ARGUMENTS.values()]
+cdef int32_t[N_TYPES] N_NUMBERS = [len(numbers) for _, numbers in ARGUMENTS.values()]
 # [-] A normal is rejected if its length differs from 1 by more; float32 causes 1e-7.
 cdef double NORMAL_LENGTH_TOLERANCE = 1e-5
 
@@ -55,13 +74,6 @@ cdef struct contact_t:
     int32_t a, b
     double[3] normal, tangent, arm_a, arm_b
     double mu, target
-
-
-#: Fields of `row_t`, `joint_t` and `contact_t`.
-ROW = np.dtype([("jac", "f8", 12), ("target", "f8"), ("lower", "f8"), ("upper", "f8"), ("compliance", "f8")])
-JOINT = np.dtype([("key", "u8"), ("body", "i4", 2), ("n_rows", "i4")], align=True)
-CONTACT_FIELDS = np.dtype([("key", "u8"), ("body", "i4", 2), ("normal", "f8", 3), ("tangent", "f8", 3), ("arm_a", "f8", 3),
-                           ("arm_b", "f8", 3), ("mu", "f8"), ("target", "f8")])
 
 
 # -- vectors -----------------------------------------------------------------------------------------------------
@@ -191,6 +203,7 @@ cdef class RowBlocks:
     cdef int32_t n_rows, n_joints, n_contacts, row_capacity, joint_capacity, contact_capacity
     cdef readonly dict next_feature  # number of the next block by its key without a feature
     cdef readonly set keys
+    cdef readonly int32_t fault, argument   # fault of the last block, and the argument that it refers to
 
     def __cinit__(self, centres, velocity, int32_t dimensions, double dt, double baumgarte, double slop):
         self.n_bodies, self.dimensions = <int32_t>len(centres), dimensions
@@ -206,6 +219,15 @@ cdef class RowBlocks:
         PyMem_Free(self.contacts)
 
     # -- rows ----------------------------------------------------------------------------------------------------
+
+    cdef inline bint reject(self, int32_t fault, int32_t argument=0) noexcept:
+        """Store the fault of a block and return False."""
+        self.fault, self.argument = fault, argument
+        return False
+
+    cdef inline bint normalise_argument(self, const arguments_t* x, int32_t which, double* out) noexcept:
+        """Compute the unit vector of an argument; return whether it has a direction."""
+        return normalise(x.vector[which], out) or self.reject(NO_LENGTH, which)
 
     cdef inline row_t* append_row(self, double error) noexcept:
         """Append a rigid row (eq. 1) without its Jacobian."""
@@ -282,17 +304,25 @@ cdef class RowBlocks:
         """Compute the unit vector of an axis of rotation, z in two dimensions; return whether the arguments are valid."""
         if self.dimensions == 2:
             copy3(UNIT[2], out)
-            return not x.given[which]
-        return x.given[which] and normalise(x.vector[which], out)
+            return not x.given[which] or self.reject(AXIS_GIVEN, which)
+        if not x.given[which]:
+            return self.reject(AXIS_MISSING, which)
+        return self.normalise_argument(x, which, out)
 
     cdef row_t* append_motor_row(self, const arguments_t* x, bint is_linear) noexcept:
         """Append the row of a motor or limit, of travel at a point or of rotation; NULL for invalid arguments."""
         cdef double[3] direction
         if not is_linear:
-            if x.given[1] or not self.compute_rotation_axis(x, 0, direction):
+            if x.given[1]:
+                self.reject(ANCHOR_GIVEN)
+                return NULL
+            if not self.compute_rotation_axis(x, 0, direction):
                 return NULL
             return self.append_angular_row(x, direction, direction, 0.0)
-        if not (x.given[0] and x.given[1] and normalise(x.vector[0], direction)):
+        if not (x.given[0] and x.given[1]):
+            self.reject(AXIS_MISSING if x.given[1] else ANCHOR_MISSING)
+            return NULL
+        if not self.normalise_argument(x, 0, direction):
             return NULL
         return self.append_linear_row(x, direction, x.vector[1], x.vector[1], 0.0)
 
@@ -309,7 +339,7 @@ cdef class RowBlocks:
         cdef int32_t k
         if kind in (BALL, HINGE, WELD, SLIDER):
             if not x.given[0]:
-                return False
+                return self.reject(NEEDS_CONVERSION)
             if not x.given[1]:
                 copy3(x.vector[0], x.vector[1])
         if kind == BALL or kind == HINGE or kind == WELD:
@@ -328,10 +358,12 @@ cdef class RowBlocks:
                     self.append_angular_row(x, x.vector[k], x.vector[k], dot3(x.vector[k], error))
         elif kind == WELD:
             if not x.given[2]:
-                return False
+                return self.reject(NEEDS_CONVERSION)
             self.append_orientation_rows(x, x.vector[2])
         elif kind == SLIDER:
-            if not (x.given[2] and x.given[3] and normalise(x.vector[2], x.vector[2])):
+            if not (x.given[2] and x.given[3]):
+                return self.reject(NEEDS_CONVERSION)
+            if not self.normalise_argument(x, 2, x.vector[2]):
                 return False
             subtract3(x.vector[1], x.vector[0], error)
             if self.dimensions == 2:
@@ -345,31 +377,36 @@ cdef class RowBlocks:
             self.append_orientation_rows(x, x.vector[3])
         elif kind == DISTANCE:
             if not self.compute_line(x, first, &size) or number[0] < 0.0:
-                return False
+                return self.reject(NEEDS_CONVERSION)
             bound = size if isnan(number[0]) else number[0]
             if not bound > min_magnitude():                # A rod of length 0 has no direction.
-                return False
+                return self.reject(ROD)
             self.append_linear_row(x, first, x.vector[0], x.vector[1], size - bound)
         elif kind == SPRING:
             stiffness, damping = number[1], number[2]
             resistance = damping + self.dt * stiffness
-            if not (self.compute_line(x, first, &size) and number[0] >= 0.0 and stiffness >= 0.0 and damping >= 0.0
-                    and self.dt * resistance >= min_magnitude()):
-                return False
+            if not (self.compute_line(x, first, &size) and number[0] >= 0.0 and stiffness >= 0.0 and damping >= 0.0):
+                return self.reject(NEEDS_CONVERSION)
+            if not self.dt * resistance >= min_magnitude():
+                return self.reject(NO_SPRING)
             row = self.append_linear_row(x, first, x.vector[0], x.vector[1], 0.0)
             row.target = -stiffness * (size - number[0]) / resistance
             row.compliance = 1.0 / (self.dt * resistance)
         elif kind == MOTOR:
             bound = number[2] if isnan(number[1]) else number[1]
-            if isnan(number[0]) or isnan(number[1]) == isnan(number[2]) or not bound >= 0.0:
-                return False
+            if isnan(number[1]) == isnan(number[2]):
+                return self.reject(NO_BOUND)
+            if isnan(number[0]) or not bound >= 0.0:
+                return self.reject(NEEDS_CONVERSION)
             row = self.append_motor_row(x, isnan(number[1]))
             if row == NULL:
                 return False
             row.target, row.lower, row.upper = number[0], -(self.dt * bound), self.dt * bound
         elif kind == LIMIT:
-            if isnan(number[0]) or not number[1] <= number[2] or (isinf(number[1]) and isinf(number[2])):
-                return False
+            if isnan(number[0]) or isnan(number[1]) or isnan(number[2]) or number[1] == INFINITY or number[2] == -INFINITY:
+                return self.reject(NEEDS_CONVERSION)
+            if number[1] > number[2] or (isinf(number[1]) and isinf(number[2])):
+                return self.reject(NO_LIMITS)
             row = self.append_motor_row(x, x.given[1])
             if row == NULL:
                 return False
@@ -383,8 +420,12 @@ cdef class RowBlocks:
                     row.jac[k] = -row.jac[k]
                 row.target = self.compute_stop_velocity(number[2] - number[0])
         elif kind == GEAR:
-            if not self.compute_rotation_axis(x, 0, first) or isnan(number[0]) or number[0] == 0.0 or isnan(number[1]):
+            if not self.compute_rotation_axis(x, 0, first):
                 return False
+            if isnan(number[0]) or isnan(number[1]):
+                return self.reject(NEEDS_CONVERSION)
+            if number[0] == 0.0:
+                return self.reject(NO_RATIO)
             if not x.given[1]:
                 copy3(first, second)
             elif not self.compute_rotation_axis(x, 1, second):
@@ -402,23 +443,23 @@ cdef class RowBlocks:
         cdef const double* v
         if not (x.given[0] and x.given[1] and x.number[1] >= 0.0 and 0.0 <= restitution <= 1.0 and threshold >= 0.0
                 and not isnan(gap)):
-            return False
+            return self.reject(NEEDS_CONVERSION)
         size = norm(x.vector[1])
         if not fabs(size - 1.0) <= NORMAL_LENGTH_TOLERANCE:
-            return False
+            return self.reject(BAD_NORMAL, 1)
         scale3(1.0 / size, x.vector[1], c.normal)
         c.a, c.b, c.mu = x.a, x.b, x.number[1]
         if self.dimensions == 2:
             if x.given[2]:
-                return False
+                return self.reject(TANGENT_GIVEN)
             cross(UNIT[2], c.normal, c.tangent)
         elif x.given[2]:
-            if not normalise(x.vector[2], moment):
+            if not self.normalise_argument(x, 2, moment):
                 return False
             scale3(dot3(moment, c.normal), c.normal, other)
             subtract3(moment, other, moment)
             if not norm(moment) >= NORMAL_LENGTH_TOLERANCE:
-                return False
+                return self.reject(PARALLEL)
             normalise(moment, c.tangent)
         else:
             complete_frame(c.normal, c.tangent, other)
@@ -453,6 +494,7 @@ cdef class RowBlocks:
         """Append a block and return its key; None for invalid arguments. A negative feature: the next one."""
         cdef uint64_t base, key
         cdef int32_t n_rows = self.n_rows
+        self.reject(NEEDS_CONVERSION)
         if not (-1 <= x.a < self.n_bodies and -1 <= x.b < self.n_bodies) or x.a == x.b:
             return None
         base = <uint64_t>kind << 60 | <uint64_t>(x.a + 1) << 38 | <uint64_t>(x.b + 1) << 16
@@ -462,6 +504,7 @@ cdef class RowBlocks:
         result = key
         if feature > MAX_FEATURE or result in self.keys:
             return None
+        self.fault = NO_FAULT
         if not (self.append_contact(x) if kind == CONTACT else self.append_joint_rows(kind, x)):
             self.n_rows = n_rows
             return None
@@ -478,9 +521,10 @@ cdef class RowBlocks:
     def add(self, int32_t kind, a, b, feature, tuple values):
         """Append one block and return its key, or None for arguments that are invalid or need a conversion.
 
-        `values` has the vectors and then the numbers of the block's type; None: not given.
+        `values` has the ARGUMENTS of the block's type; None: not given.
         """
         cdef arguments_t x
+        self.reject(NEEDS_CONVERSION)
         cdef int32_t k, vectors = N_VECTORS[kind]
         cdef int64_t at = -1 if feature is None else read_body(feature, MAX_FEATURE + 1)
         x.a, x.b = <int32_t>read_body(a, self.n_bodies), <int32_t>read_body(b, self.n_bodies)
@@ -556,16 +600,89 @@ cdef class RowBlocks:
 
     # -- results -------------------------------------------------------------------------------------------------
 
-    def export(self):
-        """Return the rows of the joints, the joints, and the contacts, with the fields of ROW, JOINT and CONTACT_FIELDS."""
-        rows, joints = np.empty(self.n_rows, ROW), np.empty(self.n_joints, JOINT)
-        contacts = np.empty(self.n_contacts, CONTACT_FIELDS)
-        if self.n_joints:                                   # The pointers of empty arrays are NULL.
-            memcpy((<ndarray>rows).data, self.rows, self.n_rows * sizeof(row_t))
-            memcpy((<ndarray>joints).data, self.joints, self.n_joints * sizeof(joint_t))
-        if self.n_contacts:
-            memcpy((<ndarray>contacts).data, self.contacts, self.n_contacts * sizeof(contact_t))
-        return rows, joints, contacts
+    def export(self, bint is_box):
+        """Return the blocks of the problem, its rows, their right-hand side and compliance, and the keys of the blocks.
+
+        Parameters
+        ----------
+        is_box : bool
+            Whether two tangents have bounds of their own.
+
+        Returns
+        -------
+        blocks : Blocks
+            Joints, then contacts; contacts with mu = 0 have a normal row only. They may have a fault.
+        rows : dict
+            Arguments of `lavender.Rows`: jac, joint_ptr, joint_body, normal, tangent, arm_a, arm_b and contact_body.
+        b : ndarray (m,), m/s
+            target - J v*.
+        compliance : ndarray (m,), 1/kg
+        keys : ndarray (k,) of uint64
+        """
+        cdef int32_t kj = self.n_joints, c = self.n_contacts, mj = self.n_rows, tangents = self.dimensions - 1, m = mj, i, at = 0
+        cdef rows_t r
+        cdef double[::1] b, compliance
+        cdef uint64_t[::1] keys
+        cdef contact_t* contact
+        for i in range(c):
+            m += 1 + tangents if self.contacts[i].mu > 0.0 else 1
+        cdef Blocks blocks = allocate_blocks(kj + c, m)
+        cdef int32_t* ptr = <int32_t*>blocks.at.ptr
+        cdef int32_t* kind = <int32_t*>blocks.at.kind
+        cdef double* lower = <double*>blocks.at.lower
+        cdef double* upper = <double*>blocks.at.upper
+        rhs, softness, names = np.zeros(m), np.zeros(m), np.empty(kj + c, np.uint64)
+        b, compliance, keys = rhs, softness, names
+        frames = [np.empty((c, 3)) for _ in range(4)]
+        bodies, pairs, starts = np.empty((kj, 2), np.int32), np.empty((c, 2), np.int32), np.empty(kj + 1, np.int32)
+        jac = np.empty((mj, 12))
+        cdef double* jacobian = as_double_pointer(jac, 12 * mj)
+        cdef double* vectors[4]
+        for i in range(4):
+            vectors[i] = as_double_pointer(frames[i], 3 * c)
+        cdef int32_t* joint_body = as_int_pointer(bodies, 2 * kj)
+        cdef int32_t* contact_body = as_int_pointer(pairs, 2 * c)
+        # joints
+        memset(<void*>blocks.at.mu, 0, 3 * (kj + c) * sizeof(double))
+        ptr[0] = 0
+        for i in range(kj):
+            keys[i], kind[i], ptr[i + 1] = self.joints[i].key, ROW, ptr[i] + self.joints[i].n_rows
+            joint_body[2 * i], joint_body[2 * i + 1] = self.joints[i].a, self.joints[i].b
+        for i in range(mj):
+            memcpy(jacobian + 12 * i, self.rows[i].jac, 12 * sizeof(double))
+            b[i], compliance[i] = self.rows[i].target, self.rows[i].compliance
+            lower[i], upper[i] = self.rows[i].lower, self.rows[i].upper
+        memcpy(as_int_pointer(starts, kj + 1), ptr, (kj + 1) * sizeof(int32_t))
+        # contacts
+        at = mj
+        for i in range(c):
+            contact = self.contacts + i
+            keys[kj + i], b[at] = contact.key, contact.target
+            (<double*>blocks.at.mu)[kj + i] = contact.mu
+            is_square = is_box and tangents == 2 and contact.mu > 0.0
+            kind[kj + i] = CONTACT_BOX if is_square else CONTACT_BLOCK
+            (<double*>blocks.at.patch_radius)[kj + i] = 1.0 if is_square else 0.0
+            at += 1 + tangents if contact.mu > 0.0 else 1
+            ptr[kj + i + 1] = at
+            contact_body[2 * i], contact_body[2 * i + 1] = contact.a, contact.b
+            copy3(contact.normal, vectors[0] + 3 * i)
+            copy3(contact.tangent, vectors[1] + 3 * i)
+            copy3(contact.arm_a, vectors[2] + 3 * i)
+            copy3(contact.arm_b, vectors[3] + 3 * i)
+        write_contact_bounds(&blocks.at)
+        # right-hand side
+        r.n_joints, r.n_contacts, r.jac, r.joint_body, r.contact_body = kj, c, jacobian, joint_body, contact_body
+        r.normal, r.tangent, r.arm_a, r.arm_b = vectors[0], vectors[1], vectors[2], vectors[3]
+        velocity = np.zeros(m + 1)
+        cdef double[::1] jv = velocity
+        multiply_jacobian(&blocks.at, &r, self.velocity, &jv[0])
+        for i in range(m):
+            b[i] -= jv[i]
+        blocks.validate()
+        return blocks, dict(
+            jac=jac, joint_ptr=starts, joint_body=bodies, normal=frames[0], tangent=frames[1], arm_a=frames[2], arm_b=frames[3],
+            contact_body=pairs,
+        ), rhs, softness, names
 
     def find_rows(self, uint64_t key):
         """Return (first row, number of rows) of a block in the problem, or None if no block has the key."""
