@@ -19,7 +19,7 @@ A block is one or more bounded rows (`ROW`), or a contact: a normal row, 0 to 2 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
 
 import numpy as np
@@ -80,7 +80,7 @@ CONTACT_ROWS = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False, repr=False, init=False)
 class Cones:
     """Bounds of k blocks with m rows, built by `Cones.free`, `Cones.bounded` and `Cones.contacts`, joined by `+`.
 
@@ -127,29 +127,21 @@ class Cones:
     upper: FloatArray
     mu: FloatArray
     patch_radius: FloatArray
-    rolling: FloatArray = field(default_factory=tuple)  # type: ignore[arg-type]  # (): zeros
+    rolling: FloatArray
     _blocks: ClassVar[kernels.Blocks]  # Set on each instance: the arrays of the fields as kernels read them.
 
-    if TYPE_CHECKING:  # Declare the parameters, which accept more types than the fields have.
-
-        def __init__(
-            self, ptr: ArrayLike, kind: ArrayLike, lower: ArrayLike, upper: ArrayLike, mu: ArrayLike,
-            patch_radius: ArrayLike, rolling: ArrayLike = ...,
-        ) -> None: ...  # fmt: skip
-
-    def __post_init__(self) -> None:
-        rolling: Any = self.rolling
-        if isinstance(rolling, tuple) and not rolling:
-            self.__dict__["rolling"] = np.zeros(np.size(self.kind))
-        blocks = kernels.make_blocks_from_copied_arrays(
-            self.ptr, self.kind, self.lower, self.upper, self.mu, self.patch_radius, self.rolling
-        )
+    def __init__(
+        self, ptr: ArrayLike, kind: ArrayLike, lower: ArrayLike, upper: ArrayLike, mu: ArrayLike,
+        patch_radius: ArrayLike, rolling: ArrayLike | None = None,
+    ) -> None:  # fmt: skip
+        rolling = np.zeros(np.size(kind)) if rolling is None else rolling
+        fields: tuple[Any, ...] = (ptr, kind, lower, upper, mu, patch_radius, rolling)
+        blocks = kernels.make_blocks_from_copied_arrays(*fields)
         if blocks is None or blocks.fault:
-            fields = self._convert_fields()
+            fields = _convert_fields(*fields)
             blocks = kernels.make_blocks_from_copied_arrays(*fields)
             if blocks.fault:
                 _raise_fault(FAULT_NAMES[blocks.fault], int(blocks.index), fields)
-        self.__dict__.clear()
         self.__dict__["_blocks"] = blocks
 
     if not TYPE_CHECKING:  # Hide `__getattr__` from type checkers, so that they report unknown names.
@@ -178,32 +170,6 @@ class Cones:
                 "split the problem"
             )
         return cls._from_blocks(blocks)
-
-    def _convert_fields(self) -> tuple[np.ndarray, ...]:
-        """Convert the fields to arrays of the required types and shapes; raise InputError for invalid ones."""
-        ptr = as_array("cones.ptr", self.ptr, (None,), dtype=np.int32)
-        if not are_pointers_valid(ptr, 1):
-            raise InputError(
-                f"cones.ptr is {ptr.tolist()!s:.60}; it must start with 0 and increase: the first row of "
-                "each block, then the number of rows"
-            )
-        k, m = len(ptr) - 1, int(ptr[-1])
-        kind = as_array("cones.kind", self.kind, (k,), dtype=np.int32)
-        if k and not np.isin(kind, kernels.KINDS).all():
-            raise InputError(
-                f"cones.kind holds {sorted(set(kind.tolist()))}; the kinds are ROW=0, CONTACT=1, CONTACT_SPIN=2, "
-                f"ROUND=3, CONTACT_BOX={CONTACT_BOX}, CONTACT_ROLLING={CONTACT_ROLLING} and "
-                f"CONTACT_ELLIPSE={CONTACT_ELLIPSE}"
-            )
-        kind = _simplify_kinds(kind, np.diff(ptr))
-        lower = as_array("lower", self.lower, (m,), finite=False, unit="N s")
-        upper = as_array("upper", self.upper, (m,), finite=False, unit="N s")
-        check_not_nan("lower", lower)
-        check_not_nan("upper", upper)
-        mu = as_array("mu", self.mu, (k,), unit="-")
-        radius = as_array("patch_radius", self.patch_radius, (k,), unit="m")
-        rolling = as_array("rolling", self.rolling, (k,), unit="m")
-        return ptr, kind, lower, upper, mu, radius, rolling
 
     def __repr__(self) -> str:
         contacts = int(np.count_nonzero(self.is_contact))
@@ -537,6 +503,35 @@ class Cones:
     def __reduce__(self) -> tuple[Any, ...]:
         # Copies and pickles are built by the constructor, which marks their arrays read-only.
         return type(self), self._blocks.arrays
+
+
+def _convert_fields(
+    ptr: Any, kind: Any, lower: Any, upper: Any, mu: Any, patch_radius: Any, rolling: Any
+) -> tuple[np.ndarray, ...]:
+    """Convert the fields to arrays of the required types and shapes; raise InputError for invalid ones."""
+    ptr = as_array("cones.ptr", ptr, (None,), dtype=np.int32)
+    if not are_pointers_valid(ptr, 1):
+        raise InputError(
+            f"cones.ptr is {ptr.tolist()!s:.60}; it must start with 0 and increase: the first row of "
+            "each block, then the number of rows"
+        )
+    k, m = len(ptr) - 1, int(ptr[-1])
+    kind = as_array("cones.kind", kind, (k,), dtype=np.int32)
+    if k and not np.isin(kind, kernels.KINDS).all():
+        raise InputError(
+            f"cones.kind holds {sorted(set(kind.tolist()))}; the kinds are ROW=0, CONTACT=1, CONTACT_SPIN=2, "
+            f"ROUND=3, CONTACT_BOX={CONTACT_BOX}, CONTACT_ROLLING={CONTACT_ROLLING} and "
+            f"CONTACT_ELLIPSE={CONTACT_ELLIPSE}"
+        )
+    kind = _simplify_kinds(kind, np.diff(ptr))
+    lower = as_array("lower", lower, (m,), finite=False, unit="N s")
+    upper = as_array("upper", upper, (m,), finite=False, unit="N s")
+    check_not_nan("lower", lower)
+    check_not_nan("upper", upper)
+    mu = as_array("mu", mu, (k,), unit="-")
+    radius = as_array("patch_radius", patch_radius, (k,), unit="m")
+    rolling = as_array("rolling", rolling, (k,), unit="m")
+    return ptr, kind, lower, upper, mu, radius, rolling
 
 
 def get_block_kinds(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -34,7 +34,7 @@ UNITS = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class Rows:
     """Bodies, joints and contacts of one step: J and M^-1, from which A is not formed.
 
@@ -115,51 +115,48 @@ class Rows:
     inv_mass: FloatArray
     inv_inertia: FloatArray
     v_free: FloatArray
-    jac: FloatArray = field(default_factory=lambda: np.zeros((0, 12)))
-    joint_ptr: IntArray = field(default_factory=lambda: np.zeros(1, np.int32))
-    joint_body: IntArray = field(default_factory=lambda: np.zeros((0, 2), np.int32))
-    normal: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
-    tangent: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
-    arm_a: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
-    arm_b: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
-    contact_body: IntArray = field(default_factory=lambda: np.zeros((0, 2), np.int32))
-    copy: bool = field(default=True, repr=False)
+    jac: FloatArray
+    joint_ptr: IntArray
+    joint_body: IntArray
+    normal: FloatArray
+    tangent: FloatArray
+    arm_a: FloatArray
+    arm_b: FloatArray
+    contact_body: IntArray
+    copy: bool = field(repr=False)
     # Default, not a field; instances made from float32 arrays set an attribute of this name.
     precision = "float64"
 
-    if TYPE_CHECKING:  # Declare the parameters, which accept more types than the fields have.
-
-        def __init__(
-            self, inv_mass: ArrayLike, inv_inertia: ArrayLike, v_free: ArrayLike, jac: ArrayLike = ...,
-            joint_ptr: ArrayLike = ..., joint_body: ArrayLike = ..., normal: ArrayLike = ..., tangent: ArrayLike = ...,
-            arm_a: ArrayLike = ..., arm_b: ArrayLike = ..., contact_body: ArrayLike = ..., copy: bool = ...,
-        ) -> None: ...  # fmt: skip
-
-    def __post_init__(self) -> None:
-        masses, normals = get_shape("inv_mass", self.inv_mass), get_shape("normal", self.normal)
+    def __init__(
+        self, inv_mass: ArrayLike, inv_inertia: ArrayLike, v_free: ArrayLike, jac: ArrayLike = (),
+        joint_ptr: ArrayLike = (0,), joint_body: ArrayLike = (), normal: ArrayLike = (), tangent: ArrayLike = (),
+        arm_a: ArrayLike = (), arm_b: ArrayLike = (), contact_body: ArrayLike = (), copy: bool = True,
+    ) -> None:  # fmt: skip
+        masses, normals = get_shape("inv_mass", inv_mass), get_shape("normal", normal)
         n, c = masses[0] if len(masses) == 1 else None, normals[0] if normals else None
-        ptr = as_array("joint_ptr", self.joint_ptr, (None,), dtype=np.int32, copy=self.copy)
+        ptr = as_array("joint_ptr", joint_ptr, (None,), dtype=np.int32, copy=copy)
         if not checks.are_pointers_valid(ptr, 1):
             raise InputError(
                 f"joint_ptr is {ptr.tolist()!s:.60}; it must start with 0 and increase: the first row of "
                 "each joint, then the number of joint rows"
             )
-        shapes: dict[str, tuple[int | None, ...]] = {
-            "inv_mass": (n,), "inv_inertia": (n, 3, 3), "v_free": (n, 6), "jac": (int(ptr[-1]), 12),
-            "normal": (c, 3), "tangent": (c, 3), "arm_a": (c, 3), "arm_b": (c, 3),
+        _check_joint_counts(ptr, jac, joint_body)
+        numbers: dict[str, tuple[Any, tuple[int | None, ...]]] = {
+            "inv_mass": (inv_mass, (n,)), "inv_inertia": (inv_inertia, (n, 3, 3)), "v_free": (v_free, (n, 6)),
+            "jac": (jac, (int(ptr[-1]), 12)), "normal": (normal, (c, 3)), "tangent": (tangent, (c, 3)),
+            "arm_a": (arm_a, (c, 3)), "arm_b": (arm_b, (c, 3)),
         }  # fmt: skip
-        object.__setattr__(self, "joint_ptr", ptr)
-        self._check_joint_counts(ptr)
-        nonempty = []
-        for name, shape in shapes.items():
-            value = getattr(self, name)
-            object.__setattr__(self, name, as_array(name, value, shape, copy=self.copy, unit=UNITS[name]))
-            nonempty += [value] if getattr(self, name).size else []
-        if get_common_precision(*nonempty) == "float32":
-            object.__setattr__(self, "precision", "float32")
-        for name, shape in (("joint_body", (len(ptr) - 1, 2)), ("contact_body", (c, 2))):
-            body = as_array(name, getattr(self, name), shape, dtype=np.int32, copy=self.copy)
-            object.__setattr__(self, name, body)
+        values: dict[str, Any] = {
+            name: as_array(name, value, shape, copy=copy, unit=UNITS[name])
+            for name, (value, shape) in numbers.items()
+        }
+        if get_common_precision(*(numbers[name][0] for name, x in values.items() if x.size)) == "float32":
+            values["precision"] = "float32"
+        values["joint_ptr"] = ptr
+        for name, body, k in (("joint_body", joint_body, len(ptr) - 1), ("contact_body", contact_body, c)):
+            values[name] = as_array(name, body, (k, 2), dtype=np.int32, copy=copy)
+        # `copy=False` applies to this call only, not to later `replace` calls.
+        self.__dict__.update(values, copy=True)
         fault, index = checks.find_body_fault(
             self.inv_mass,
             self.inv_inertia,
@@ -167,24 +164,12 @@ class Rows:
             self.contact_body,
             self.normal,
             self.tangent,
-            self.copy,
+            copy,
         )
         if fault:
-            self._correct_rounding_or_raise(fault, index)
-        # `copy=False` applies to this call only, not to later `replace` calls.
-        object.__setattr__(self, "copy", True)
+            self._correct_rounding_or_raise(fault, index, copy)
 
-    def _check_joint_counts(self, ptr: IntArray) -> None:
-        """Raise InputError if `joint_ptr` describes other joints than `jac` and `joint_body`."""
-        rows, joints = get_shape("jac", self.jac), get_shape("joint_body", self.joint_body)
-        if len(rows) == 2 and len(joints) == 2 and (rows[0], joints[0]) != (ptr[-1], len(ptr) - 1):
-            raise InputError(
-                f"jac has {rows[0]} joint rows, joint_body has {joints[0]} joints, and joint_ptr is "
-                f"{ptr.tolist()!s:.60}, default [0]; the first row of each joint, then the number of rows is needed: "
-                f"joint_ptr=[0, {rows[0]}] and joint_body=[[a, b]] for one joint of {rows[0]} rows"
-            )
-
-    def _correct_rounding_or_raise(self, fault: str, index: int) -> None:
+    def _correct_rounding_or_raise(self, fault: str, index: int, copy: bool) -> None:
         """Correct inertias and frames that float32 has rounded; raise InputError for other faults."""
         name, _, kind = fault.rpartition("_")
         if kind == "body":
@@ -206,7 +191,7 @@ class Rows:
         check_nonnegative_magnitudes(
             "largest entry of inv_inertia", compute_max_abs_entries(self.inv_inertia), UNITS["inv_inertia"]
         )
-        if self.copy:
+        if copy:
             object.__setattr__(
                 self, "inv_inertia", check_and_symmetrise_inertia("inv_inertia", self.inv_inertia)
             )
@@ -324,6 +309,18 @@ class Rows:
     def __reduce__(self) -> tuple[Any, ...]:
         # Copies and pickles are built by the constructor, which marks their arrays read-only.
         return type(self), tuple(f.name != "copy" and getattr(self, f.name) for f in fields(self))
+
+
+def _check_joint_counts(ptr: IntArray, jac: Any, joint_body: Any) -> None:
+    """Raise InputError if `joint_ptr` describes other joints than `jac` and `joint_body`."""
+    rows, joints = get_shape("jac", jac), get_shape("joint_body", joint_body)
+    are_tables = all(len(shape) == 2 or shape == (0,) for shape in (rows, joints))
+    if are_tables and (rows[0], joints[0]) != (ptr[-1], len(ptr) - 1):
+        raise InputError(
+            f"jac has {rows[0]} joint rows, joint_body has {joints[0]} joints, and joint_ptr is "
+            f"{ptr.tolist()!s:.60}, default [0]; the first row of each joint, then the number of rows is needed: "
+            f"joint_ptr=[0, {rows[0]}] and joint_body=[[a, b]] for one joint of {rows[0]} rows"
+        )
 
 
 def compute_max_abs_entries(tensors: FloatArray) -> FloatArray:
