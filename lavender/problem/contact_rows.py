@@ -75,32 +75,24 @@ def make_contacts_of_rows(
 
 def make_contacts(mu: FloatArray, tangents: IntArray, patch_radius: Any, rolling: Any, shape: str) -> Cones:
     """Build contacts of 0 to 2 tangents (c,), with spin rows if a patch radius is given, rolling rows if mu_r is."""
-    has_spin, has_rolling, c = patch_radius is not None, rolling is not None, len(mu)
-    min_tangents, max_tangents = (int(tangents.min()), int(tangents.max())) if c else (2, 2)
-    if min_tangents < 0 or max_tangents > 2:
-        raise InputError(
-            f"tangents holds numbers from {min_tangents} to {max_tangents}; 0, 1 or 2 is needed for each "
-            "contact"
-        )
-    if has_rolling and min_tangents < 2:
-        raise InputError(
-            f"contact {int(np.argmin(tangents))} has {min_tangents} tangents; rolling rows rotate about two "
-            "tangents: give tangents=2"
-        )
-    if min_tangents == 0 and not has_spin:
-        bad = np.flatnonzero((mu > 0.0) & (tangents == 0))
-        if len(bad):
-            raise InputError(
-                f"contact {bad[0]} has mu {mu[bad[0]]:g} but no friction row; friction needs tangents: give "
-                "tangents=2, or mu 0"
-            )
-    if min_tangents == max_tangents:
-        return Cones.contacts(mu, max_tangents, patch_radius, rolling=rolling, shape=shape)
-    ptr = np.concatenate([[0], np.cumsum(1 + tangents + has_spin + 2 * has_rolling)]).astype(np.int32)
-    kind = get_block_kinds(np.ones(c, bool), spin=has_spin, rolling=has_rolling)
-    infinite, zeros = np.full(int(ptr[-1]), np.inf), np.zeros(c)
-    cones = Cones(
-        ptr=ptr, kind=kind, lower=-infinite, upper=infinite, mu=mu,
-        patch_radius=zeros if patch_radius is None else patch_radius, rolling=zeros if rolling is None else rolling,
-    )  # fmt: skip
-    return cones.shaped("box") if shape == "box" else cones
+    has_spin, has_rolling = patch_radius is not None, rolling is not None
+    for is_bad, requirement in (
+        ((tangents < 0) | (tangents > 2), "0, 1 or 2 is needed for each contact"),
+        ((tangents < 2) & has_rolling, "rolling rows rotate about two tangents: give tangents=2"),
+        (
+            (tangents == 0) & (mu > 0.0) & (not has_spin),
+            "mu > 0 needs a friction row: give tangents=2, or mu 0",
+        ),
+    ):
+        if is_bad.any():
+            i = int(is_bad.argmax())
+            raise InputError(f"tangents of contact {i} is {tangents[i]}, and mu {mu[i]:g}; {requirement}")
+    if not tangents.size or (tangents == tangents[0]).all():
+        count = int(tangents[0]) if tangents.size else 2
+        return Cones.contacts(mu, count, patch_radius, rolling=rolling, shape=shape)
+    ptr = np.append(0, np.cumsum(1 + tangents + has_spin + 2 * has_rolling))
+    kind = get_block_kinds(np.ones(len(mu), bool), spin=has_spin, rolling=has_rolling)
+    infinite, zeros = np.full(int(ptr[-1]), np.inf), np.zeros(len(mu))
+    radius = zeros if patch_radius is None else patch_radius
+    cones = Cones(ptr, kind, -infinite, infinite, mu, radius, rolling)
+    return cones.shaped(shape) if shape == "box" else cones

@@ -96,7 +96,7 @@ def test_mu_alone_means_two_tangents_and_a_mu_without_friction_rows_is_refused()
     assert mixed.cones.n_tangents.tolist() == [0, 2]
     assert lv.Problem.from_rows(made).m == 2
     assert lv.Problem.from_rows(made, mu=0.5, tangents=0, patch_radius=0.1).m == 4  # a spin row is a friction row
-    with pytest.raises(lv.InputError, match=r"contact 0 has mu 0\.5 but no friction row"):
+    with pytest.raises(lv.InputError, match=r"contact 0 is 0, and mu 0\.5; mu > 0 needs a friction row"):
         lv.Problem.from_rows(made, mu=0.5, tangents=0)
 
 
