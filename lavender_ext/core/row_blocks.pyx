@@ -14,7 +14,7 @@ from cpython.mem cimport PyMem_Free, PyMem_Realloc
 import numpy as np
 
 from lavender_ext.core.arrays cimport C_CONTIGUOUS, DOUBLE, as_double_pointer, as_int_pointer, has_element_type, ndarray
-from lavender_ext.core.block_types cimport CONTACT as CONTACT_BLOCK, CONTACT_BOX, ROW, write_contact_bounds
+from lavender_ext.core.block_types cimport CONTACT as CONTACT_BLOCK, CONTACT_BOX, ROW, blocks_t, write_contact_bounds
 from lavender_ext.core.blocks cimport Blocks, allocate_blocks
 from lavender_ext.core.rows cimport cross, dot3, multiply_jacobian
 from lavender_ext.core.validate cimport is_valid_number, min_magnitude
@@ -72,7 +72,7 @@ cdef struct joint_t:
 cdef struct contact_t:
     uint64_t key
     int32_t a, b
-    double[3] normal, tangent, arm_a, arm_b
+    double[4][3] frame              # normal, tangent, arm on a, arm on b
     double mu, target
 
 
@@ -440,6 +440,7 @@ cdef class RowBlocks:
         cdef contact_t* c = self.contacts + self.n_contacts
         cdef double gap = x.number[0], restitution = x.number[2], threshold = x.number[3], approach = 0.0, size, depth
         cdef double[3] moment, other
+        cdef double* normal = c.frame[0]
         cdef const double* v
         if not (x.given[0] and x.given[1] and x.number[1] >= 0.0 and 0.0 <= restitution <= 1.0 and threshold >= 0.0
                 and not isnan(gap)):
@@ -447,35 +448,35 @@ cdef class RowBlocks:
         size = norm(x.vector[1])
         if not fabs(size - 1.0) <= NORMAL_LENGTH_TOLERANCE:
             return self.reject(BAD_NORMAL, 1)
-        scale3(1.0 / size, x.vector[1], c.normal)
+        scale3(1.0 / size, x.vector[1], normal)
         c.a, c.b, c.mu = x.a, x.b, x.number[1]
         if self.dimensions == 2:
             if x.given[2]:
                 return self.reject(TANGENT_GIVEN)
-            cross(UNIT[2], c.normal, c.tangent)
+            cross(UNIT[2], normal, c.frame[1])
         elif x.given[2]:
             if not self.normalise_argument(x, 2, moment):
                 return False
-            scale3(dot3(moment, c.normal), c.normal, other)
+            scale3(dot3(moment, normal), normal, other)
             subtract3(moment, other, moment)
             if not norm(moment) >= NORMAL_LENGTH_TOLERANCE:
                 return self.reject(PARALLEL)
-            normalise(moment, c.tangent)
+            normalise(moment, c.frame[1])
         else:
-            complete_frame(c.normal, c.tangent, other)
-        self.compute_arm(c.a, x.vector[0], c.arm_a)
-        self.compute_arm(c.b, x.vector[0], c.arm_b)
+            complete_frame(normal, c.frame[1], other)
+        self.compute_arm(c.a, x.vector[0], c.frame[2])
+        self.compute_arm(c.b, x.vector[0], c.frame[3])
         depth = -gap - self.slop
         c.target = (-gap if gap > 0.0 else self.baumgarte * (depth if depth > 0.0 else 0.0)) / self.dt
         if restitution > 0.0:
             if c.a >= 0:
                 v = self.velocity + 6 * c.a
-                cross(c.arm_a, c.normal, moment)
-                approach -= dot3(v, c.normal) + dot3(v + 3, moment)
+                cross(c.frame[2], normal, moment)
+                approach -= dot3(v, normal) + dot3(v + 3, moment)
             if c.b >= 0:
                 v = self.velocity + 6 * c.b
-                cross(c.arm_b, c.normal, moment)
-                approach += dot3(v, c.normal) + dot3(v + 3, moment)
+                cross(c.frame[3], normal, moment)
+                approach += dot3(v, normal) + dot3(v + 3, moment)
         # The contact bounces only if the bodies touch within the step.
         if approach < -threshold and (c.target >= 0.0 or approach < c.target) and -restitution * approach > c.target:
             c.target = -restitution * approach
@@ -601,88 +602,66 @@ cdef class RowBlocks:
     # -- results -------------------------------------------------------------------------------------------------
 
     def export(self, bint is_box):
-        """Return the blocks of the problem, its rows, their right-hand side and compliance, and the keys of the blocks.
+        """Return blocks, rows, b (m,) [m/s], compliance (m,) [1/kg] and keys (k,) of the problem, joints before contacts.
 
-        Parameters
-        ----------
-        is_box : bool
-            Whether two tangents have bounds of their own.
-
-        Returns
-        -------
-        blocks : Blocks
-            Joints, then contacts; contacts with mu = 0 have a normal row only. They may have a fault.
-        rows : dict
-            Arguments of `lavender.Rows`: jac, joint_ptr, joint_body, normal, tangent, arm_a, arm_b and contact_body.
-        b : ndarray (m,), m/s
-            target - J v*.
-        compliance : ndarray (m,), 1/kg
-        keys : ndarray (k,) of uint64
+        The blocks may have a fault; `rows` are the arguments of `lavender.Rows` that describe joints and contacts. Contacts with
+        mu = 0 have a normal row only. `is_box`: two tangents have bounds of their own.
         """
-        cdef int32_t kj = self.n_joints, c = self.n_contacts, mj = self.n_rows, tangents = self.dimensions - 1, m = mj, i, at = 0
-        cdef rows_t r
-        cdef double[::1] b, compliance
-        cdef uint64_t[::1] keys
+        cdef int32_t kj = self.n_joints, c = self.n_contacts, mj = self.n_rows, tangents = self.dimensions - 1, m = mj, i, k, at
+        cdef bint is_square
         cdef contact_t* contact
         for i in range(c):
             m += 1 + tangents if self.contacts[i].mu > 0.0 else 1
         cdef Blocks blocks = allocate_blocks(kj + c, m)
-        cdef int32_t* ptr = <int32_t*>blocks.at.ptr
-        cdef int32_t* kind = <int32_t*>blocks.at.kind
-        cdef double* lower = <double*>blocks.at.lower
-        cdef double* upper = <double*>blocks.at.upper
-        rhs, softness, names = np.zeros(m), np.zeros(m), np.empty(kj + c, np.uint64)
-        b, compliance, keys = rhs, softness, names
-        frames = [np.empty((c, 3)) for _ in range(4)]
-        bodies, pairs, starts = np.empty((kj, 2), np.int32), np.empty((c, 2), np.int32), np.empty(kj + 1, np.int32)
-        jac = np.empty((mj, 12))
-        cdef double* jacobian = as_double_pointer(jac, 12 * mj)
-        cdef double* vectors[4]
-        for i in range(4):
-            vectors[i] = as_double_pointer(frames[i], 3 * c)
+        cdef blocks_t* p = &blocks.at
+        names, frames = ("jac", "normal", "tangent", "arm_a", "arm_b"), [np.empty((mj, 12)), *[np.empty((c, 3)) for _ in range(4)]]
+        rhs, softness, velocity, identity = np.empty(m), np.zeros(m), np.zeros(m + 1), np.empty(kj + c, np.uint64)
+        starts, bodies, pairs = np.empty(kj + 1, np.int32), np.empty((kj, 2), np.int32), np.empty((c, 2), np.int32)
+        cdef double[::1] b = rhs, compliance = softness, jv = velocity
+        cdef uint64_t[::1] keys = identity
+        cdef int32_t[::1] joint_ptr = starts
         cdef int32_t* joint_body = as_int_pointer(bodies, 2 * kj)
         cdef int32_t* contact_body = as_int_pointer(pairs, 2 * c)
+        cdef double* jac = as_double_pointer(frames[0], 12 * mj)
+        cdef double* vectors[4]
+        for k in range(4):
+            vectors[k] = as_double_pointer(frames[k + 1], 3 * c)
         # joints
-        memset(<void*>blocks.at.mu, 0, 3 * (kj + c) * sizeof(double))
-        ptr[0] = 0
+        memset(<void*>p.mu, 0, 3 * (kj + c) * sizeof(double))
+        (<int32_t*>p.ptr)[0] = joint_ptr[0] = 0
         for i in range(kj):
-            keys[i], kind[i], ptr[i + 1] = self.joints[i].key, ROW, ptr[i] + self.joints[i].n_rows
-            joint_body[2 * i], joint_body[2 * i + 1] = self.joints[i].a, self.joints[i].b
+            keys[i], joint_body[2 * i], joint_body[2 * i + 1] = self.joints[i].key, self.joints[i].a, self.joints[i].b
+            (<int32_t*>p.kind)[i] = ROW
+            (<int32_t*>p.ptr)[i + 1] = joint_ptr[i + 1] = joint_ptr[i] + self.joints[i].n_rows
         for i in range(mj):
-            memcpy(jacobian + 12 * i, self.rows[i].jac, 12 * sizeof(double))
+            memcpy(jac + 12 * i, self.rows[i].jac, 12 * sizeof(double))
             b[i], compliance[i] = self.rows[i].target, self.rows[i].compliance
-            lower[i], upper[i] = self.rows[i].lower, self.rows[i].upper
-        memcpy(as_int_pointer(starts, kj + 1), ptr, (kj + 1) * sizeof(int32_t))
+            (<double*>p.lower)[i], (<double*>p.upper)[i] = self.rows[i].lower, self.rows[i].upper
         # contacts
         at = mj
         for i in range(c):
             contact = self.contacts + i
-            keys[kj + i], b[at] = contact.key, contact.target
-            (<double*>blocks.at.mu)[kj + i] = contact.mu
+            keys[kj + i], contact_body[2 * i], contact_body[2 * i + 1] = contact.key, contact.a, contact.b
+            for k in range(4):
+                copy3(contact.frame[k], vectors[k] + 3 * i)
             is_square = is_box and tangents == 2 and contact.mu > 0.0
-            kind[kj + i] = CONTACT_BOX if is_square else CONTACT_BLOCK
-            (<double*>blocks.at.patch_radius)[kj + i] = 1.0 if is_square else 0.0
+            (<int32_t*>p.kind)[kj + i] = CONTACT_BOX if is_square else CONTACT_BLOCK
+            (<double*>p.mu)[kj + i], (<double*>p.patch_radius)[kj + i] = contact.mu, 1.0 if is_square else 0.0
+            b[at] = contact.target
+            for k in range(tangents if contact.mu > 0.0 else 0):
+                b[at + 1 + k] = 0.0
             at += 1 + tangents if contact.mu > 0.0 else 1
-            ptr[kj + i + 1] = at
-            contact_body[2 * i], contact_body[2 * i + 1] = contact.a, contact.b
-            copy3(contact.normal, vectors[0] + 3 * i)
-            copy3(contact.tangent, vectors[1] + 3 * i)
-            copy3(contact.arm_a, vectors[2] + 3 * i)
-            copy3(contact.arm_b, vectors[3] + 3 * i)
-        write_contact_bounds(&blocks.at)
-        # right-hand side
-        r.n_joints, r.n_contacts, r.jac, r.joint_body, r.contact_body = kj, c, jacobian, joint_body, contact_body
-        r.normal, r.tangent, r.arm_a, r.arm_b = vectors[0], vectors[1], vectors[2], vectors[3]
-        velocity = np.zeros(m + 1)
-        cdef double[::1] jv = velocity
-        multiply_jacobian(&blocks.at, &r, self.velocity, &jv[0])
+            (<int32_t*>p.ptr)[kj + i + 1] = at
+        write_contact_bounds(p)
+        blocks.validate()
+        # b = target - J v*
+        cdef rows_t r = rows_t(n_bodies=self.n_bodies, n_joints=kj, n_contacts=c, jac=jac, joint_body=joint_body, normal=vectors[0],
+                               tangent=vectors[1], arm_a=vectors[2], arm_b=vectors[3], contact_body=contact_body)
+        multiply_jacobian(p, &r, self.velocity, &jv[0])
         for i in range(m):
             b[i] -= jv[i]
-        blocks.validate()
-        return blocks, dict(
-            jac=jac, joint_ptr=starts, joint_body=bodies, normal=frames[0], tangent=frames[1], arm_a=frames[2], arm_b=frames[3],
-            contact_body=pairs,
-        ), rhs, softness, names
+        rows = dict(zip(names, frames), joint_ptr=starts, joint_body=bodies, contact_body=pairs)
+        return blocks, rows, rhs, softness, identity
 
     def find_rows(self, uint64_t key):
         """Return (first row, number of rows) of a block in the problem, or None if no block has the key."""
