@@ -7,8 +7,7 @@ coordinates (`lavender/problem/generalized.py`), or a matrix. Other quantities a
 
 Each of these files builds on the files before it: `data.py` (fields and their checks), `operators.py` (A, J and the
 metric), `program.py` (quadratic programs), `builders.py` (class methods that build problems), `problem.py` (`Problem`
-and its conversions), `row_builder.py` (`RowBuilder`: joints and contacts in world coordinates; `row_assembly.py` checks
-its arguments).
+and its conversions), `row_builder.py` (`RowBuilder`: joints and contacts in world coordinates).
 """
 
 from lavender.problem.data import FRICTION_LAWS, LAWS, OPERATORS, PRECISIONS, Names, check_problem
