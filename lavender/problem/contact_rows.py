@@ -94,5 +94,5 @@ def make_contacts(mu: FloatArray, tangents: IntArray, patch_radius: Any, rolling
     kind = get_block_kinds(np.ones(len(mu), bool), spin=has_spin, rolling=has_rolling)
     infinite, zeros = np.full(int(ptr[-1]), np.inf), np.zeros(len(mu))
     radius = zeros if patch_radius is None else patch_radius
-    cones = Cones(ptr, kind, -infinite, infinite, mu, radius, rolling)
+    cones = Cones(ptr, kind, -infinite, infinite, mu=mu, patch_radius=radius, rolling=rolling)
     return cones.shaped(shape) if shape == "box" else cones
