@@ -136,11 +136,11 @@ class ProblemData:
             )
         # `copy` applies to this call only: problems derived from this one copy by default.
         fields = self.__dict__
-        fields.update(
-            b=rhs, cones=cones, matrix=matrix, rows=rows, friction=friction, compliance=None, guess=None, key=None,
-            names=names, name=str(name), copy=True, generalized=generalized, precision=precision, qp=qp,
-            derived=Derived(), law=_find_law(cones, friction),
-        )  # fmt: skip
+        fields.update({
+            "b": rhs, "cones": cones, "matrix": matrix, "rows": rows, "friction": friction, "compliance": None,
+            "guess": None, "key": None, "names": names, "name": str(name), "copy": True, "generalized": generalized,
+            "precision": precision, "qp": qp, "derived": Derived(), "law": _find_law(cones, friction),
+        })  # fmt: skip
         if matrix is None:
             fields["compliance"] = _convert_compliance(compliance, m, copy)
         elif compliance is not None:

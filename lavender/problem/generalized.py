@@ -86,9 +86,9 @@ class Generalized:
     operator: kernels.Operator
 
     def __init__(self, jac: Any, mass: Any, v_free: Any, names: Sequence[str] | None = None) -> None:
-        m_lower, n = _convert_mass(mass, names)
-        j = _convert_jacobian(jac, n)
-        self._initialize(j, m_lower, as_array("v_free", v_free, (n,), unit="m/s, rad/s"), names)
+        lower, n = _convert_mass(mass, names)
+        free = as_array("v_free", v_free, (n,), unit="m/s, rad/s")
+        self._initialize(_convert_jacobian(jac, n), lower, free, names)
 
     @classmethod
     def from_compressed_rows(
@@ -385,27 +385,26 @@ def _restore_unfactored(jac: sp.csr_array, mass: sp.csr_array) -> Generalized:
 
 def _convert_jacobian(jac: Any, n: int) -> Compressed:
     """Convert J to checked compressed rows."""
-    compressed = dense_to_csr(jac)
-    sparse = issparse(jac)
-    array = jac if compressed is not None or sparse else as_array_view("J", jac, (None, None))
+    array, compressed = jac, dense_to_csr(jac)
+    if compressed is None:
+        array = jac if issparse(jac) else as_array_view("J", jac, (None, None))
     if len(array.shape) != 2 or array.shape[1] != n:
         raise InputError(f"J has shape {array.shape}; (any, {n}) is needed, as M has {n} velocities")
-    if compressed is not None:
-        return compressed
-    return convert_to_compressed_rows("J", array) if sparse else dense_to_csr(array)
+    if compressed is None:
+        compressed = convert_to_compressed_rows("J", array) if issparse(jac) else dense_to_csr(array)
+    return compressed
 
 
 def _convert_mass(mass: Any, names: Sequence[str] | None) -> tuple[Compressed, int]:
     """Return the checked lower triangle of M and the number of velocities."""
-    blocks = mass if isinstance(mass, (list, tuple)) else [mass]
+    blocks: Sequence[Any] = mass if isinstance(mass, (list, tuple)) else (mass,)
     max_asymmetry = MAX_ASYMMETRY_FLOAT32 if get_common_precision(*blocks) == "float32" else MAX_ASYMMETRY
-    if isinstance(mass, (list, tuple)) and all(np.ndim(block) == 2 for block in mass) and mass:
-        arrays = [as_array(f"block {i} of M", block, (None, None)) for i, block in enumerate(mass)]
+    if blocks is mass and blocks and all(np.ndim(block) == 2 for block in blocks):
+        arrays = [as_array(f"block {i} of M", block, (None, None)) for i, block in enumerate(blocks)]
         # Convert the blocks to sparse arrays, because SciPy 1.18 warns about dense blocks.
         mass = sp.block_diag([sp.coo_array(block) for block in arrays], format="csr")
-    lower = extract_lower_triangle(
-        "M", mass, "give both triangles (Pinocchio's crba fills the upper one)", max_asymmetry, names
-    )
+    hint = "give both triangles (Pinocchio's crba fills the upper one)"
+    lower = extract_lower_triangle("M", mass, hint, max_asymmetry, names)
     return lower, len(lower[0]) - 1
 
 
