@@ -7,7 +7,8 @@ Other units bring any practical problem into this range without changing its sol
 numbers, and their squares, do not overflow float64. A row of A counts as empty if its largest entry is below 1e-60.
 """
 from libc.math cimport fabs
-from libc.stdint cimport int32_t, int64_t
+from libc.stdint cimport int32_t, int64_t, uint64_t
+from libc.string cimport memcpy
 
 
 cdef inline double max_magnitude() noexcept nogil:
@@ -49,22 +50,23 @@ cdef inline int64_t find_invalid_magnitude(const double* x, int64_t n) noexcept 
 
 
 cdef inline bint any_magnitude_above(const double* x, int64_t n, double bound) noexcept nogil:
-    """Return whether any |x_i| is above `bound` or NaN. The loop has no branch, so that compilers vectorise it."""
+    """Return whether any |x_i| is above `bound` or NaN.
+
+    The bits of |x_i| as an integer grow with |x_i|, and NaN is above infinity. The loop has no branch and never ends early, so
+    that compilers vectorise it: almost all arrays are valid.
+    """
     cdef int64_t i
-    cdef int exceeds = 0
+    cdef uint64_t limit, bits, exceeds = 0
+    memcpy(&limit, &bound, sizeof(double))
     for i in range(n):
-        exceeds |= not fabs(x[i]) <= bound
-    return exceeds
+        memcpy(&bits, x + i, sizeof(double))
+        exceeds |= limit - (bits & <uint64_t>0x7FFFFFFFFFFFFFFF)
+    return exceeds >> 63
 
 
 cdef inline bint has_invalid_number(const double* x, int64_t n) noexcept nogil:
-    """Return whether any number violates (1). The loop never ends early, because almost all arrays are valid."""
-    cdef int64_t i
-    cdef double limit = max_magnitude()
-    cdef int32_t invalid = 0
-    for i in range(n):
-        invalid |= not fabs(x[i]) <= limit
-    return invalid
+    """Return whether any number violates (1)."""
+    return any_magnitude_above(x, n, max_magnitude())
 
 
 cdef inline double update_max_abs(double maximum, double x) noexcept nogil:
