@@ -28,7 +28,7 @@ LINES = {
     "lavender/gradient": 1452,
     "lavender/io": 5605,
     "lavender/judge": 1651,
-    "lavender/problem": 5407,
+    "lavender/problem": 5264,
     "lavender/programs": 389,
     "lavender/report": 5790,
     "lavender/solvers": 4999,
