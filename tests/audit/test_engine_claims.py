@@ -6,7 +6,9 @@ import pytest
 import lavender as lv
 from lavender.audit.audit import audit_steps
 from lavender.audit.engine_scenes import NEWTON_STATE, read_engine_states, step_scene
+from lavender.audit.pieces import N_WORST_WORLDS, Judging, judge_steps
 from lavender.audit.result import OUTCOMES
+from lavender.audit.simulated_worlds import Frame
 
 CONES = lv.Cones.contacts(0.5, tangents=1)
 
@@ -42,6 +44,27 @@ def test_audit_steps_counts_each_outcome_of_claims(tmp_path):
     text = result.page.write(tmp_path / "page").read_text()
     assert all(name in text for name in OUTCOMES)
     assert (np.load(tmp_path / "records.npz")["converged"] == result.converged).all()
+
+
+def test_audit_steps_at_their_floor_are_below_every_limit():
+    step = step_of([2.0**-52, 0.0], [1, 1])
+    result = audit_steps([step], threshold=0.0, max_velocity_error=1e-17)
+    assert result.numbers[0, 0, 0] > 1e-17 and (result.verdict[:, 0] == 0).all()
+    assert (result.n_above_limit, result.max_velocity_error) == (0, 0.0)
+
+
+def test_judge_steps_without_keep_keeps_the_worst_step_of_each_world():
+    """Two worlds have all of the largest errors; without `keep`, other worlds are kept, too."""
+    world, step = np.repeat(np.arange(8), 6), np.tile(np.arange(6), 8)
+    errors = np.where(world < 2, 0.4, 0.1) + 1e-3 * step + 1e-4 * world
+    answer = step_of(errors, np.ones(48))
+    ones = np.ones(48, int)
+    frame = Frame(answer.batch, answer.impulse, {}, rows=2 * ones, contacts=ones)
+    piece = judge_steps(frame, Judging("float64", 1e-6, None), world, step, lambda i: {})
+    expected = sorted(range(8), key=lambda w: (w >= 2, -w))[:N_WORST_WORLDS]
+    assert [w.world for w in piece.worst] == expected and {w.step for w in piece.worst} == {5}
+    kept = judge_steps(frame, Judging("float64", 1e-6, 4), world, step, lambda i: {})
+    assert [(w.world, w.step) for w in kept.worst] == [(1, 5), (0, 5), (1, 4), (0, 4)]
 
 
 def test_audit_steps_of_float32_rounding_counts_no_error():

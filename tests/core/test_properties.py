@@ -227,6 +227,28 @@ def test_program_rows_below_the_infinite_size_are_kept_and_their_multipliers_ret
         np.testing.assert_array_equal(found, expected)
 
 
+@pytest.mark.parametrize("name", ["pgs", "newton", "direct", "lemke", "nncg", "auto"])
+def test_solve_qp_of_unequally_scaled_variables_meets_tol_in_its_own_terms(name):
+    for seed in range(6):
+        rng, n = np.random.default_rng(seed), 6
+        scale, half = 10.0 ** rng.uniform(-3.0, 3.0, n), rng.normal(size=(n, n))
+        P = (half @ half.T / n + 0.1 * np.eye(n)) * np.outer(scale, scale)
+        q, G, h = rng.normal(size=n) * scale, rng.normal(size=(4, n)) * scale, rng.uniform(-1.0, 1.0, 4)
+        for tol in (1e-4, 1e-7):
+            answer = lv.solve_qp(P, q, G, h, solver=name, tol=tol)
+            assert answer.found and answer.error <= tol, f"{name}, {seed}, {tol}: {answer}"
+            assert (G @ answer.x - h <= 10.0 * tol * (np.abs(G) @ np.abs(answer.x) + np.abs(h))).all()
+            assert (answer.z >= -10.0 * tol * np.abs(answer.z).max(initial=0.0)).all()
+
+
+@pytest.mark.parametrize("h", [[-2.0, -1.0], [-0.5, 3.0]])
+def test_solve_qp_of_an_unbounded_program_returns_a_feasible_point_and_a_ray(h):
+    G = -np.eye(2)
+    answer = lv.solve_qp(np.zeros((2, 2)), [-1.0, 0.0], G, h)
+    assert answer.solution.status is lv.Status.UNBOUNDED
+    assert (G @ answer.x <= np.array(h) + 1e-9).all() and (G @ answer.ray <= 1e-12).all() and answer.ray[0] > 0.0
+
+
 # -- the best answer ---------------------------------------------------------------------------------------------------
 
 
@@ -420,6 +442,27 @@ def test_island_cut_out_has_its_block_of_the_matrix_and_its_answer(kind):
         assert lv.residual(part, whole.impulse[rows]).relative <= 1e-9
 
 
+@pytest.mark.parametrize("kind", range(3))
+def test_references_of_a_problem_are_those_of_its_islands_together(kind):
+    problem = list_problems_with_islands()[kind]
+    found = lv.residual(problem, problem.start())
+    energy, velocity = (np.maximum(x, 0.0) for x in (found.islands.energy_at_zero, found.islands.velocity_at_zero))
+    assert len(energy) > 1 and velocity.argmax() < len(velocity) - 1
+    assert found.energy_at_zero == pytest.approx(np.linalg.norm(energy))
+    assert found.velocity_at_zero == velocity.max() and found.relative == found.islands.relative.max()
+    solution = lv.solve(problem, "newton", velocity_tol=1e-4)
+    assert solution.success and solution.residual.velocity <= 1e-4
+
+
+@pytest.mark.parametrize("kind", range(3))
+def test_solution_message_of_an_unfinished_solve_names_its_worst_island(kind):
+    problem = list_problems_with_islands()[kind]
+    solution = lv.solve(problem, "pgs", tol=1e-14, max_iter=2)
+    label, worst = solution.residual.islands[0], solution.residual.worst_island
+    name = problem.block_name(int(np.flatnonzero(label == worst)[0]))
+    assert not solution.success and f"island {worst} ({name}" in solution.message
+
+
 @pytest.mark.parametrize("order", ["colored", "bottom_up", "top_down", "given"])
 def test_pinned_body_that_turns_is_moving_in_every_order(order):
     """Two bodies on a wheel whose centre is fixed: a colour must not contain both of its contacts."""
@@ -490,6 +533,15 @@ def test_sweeps_without_tolerance_make_exactly_the_requested_iterations(name):
         assert found.iterations == n
         stopped = lv.solve(problem, name, tol=0.0, max_iter=n, callback=lambda k, x, r: calls.append(k) or k >= 1)  # noqa: B023
         assert stopped.status is lv.Status.INTERRUPTED and calls == [0, 1]
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_solution_that_meets_tol_at_its_iteration_limit_is_converged(seed):
+    problem = random_contact_problem(seed)
+    for name in lv.available(problem, history=True):
+        for n in (*range(1, 30), 45, 77, 130):
+            solution = lv.solve(problem, name, tol=1e-2, max_iter=n)
+            assert solution.success == (solution.status is lv.Status.CONVERGED), f"{name}, {n}: {solution}"
 
 
 @pytest.mark.parametrize("name", ["auto", "newton", "pgs", "sequential_impulses", "nncg"])
