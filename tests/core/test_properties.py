@@ -12,8 +12,8 @@ from random_problems import random_bodies_and_contacts, random_contact_problem, 
 
 import lavender as lv
 from lavender.base import deadline
-from lavender.external.forms import get_program
-from lavender.external.running import classify_status
+from lavender.external.forms import choose_program_form, get_program
+from lavender.external.running import Answer, call_backend_until_accepted, classify_status
 from lavender.judge.certificates import check_certificate
 from lavender.problem.cones import project_impulse
 from lavender.solvers import direct
@@ -199,6 +199,92 @@ def test_backend_form_with_nonzero_limits_agrees_with_newton(name, form):
         np.testing.assert_allclose(found.dual, -found.slack, atol=1e-4)
 
 
+@pytest.mark.parametrize("form", ["J and M", "matrix"])
+def test_every_solver_with_rows_of_every_kind_agrees_with_newton(form):
+    problem = build_rows_of_every_kind()
+    expected = lv.solve(problem, "newton", tol=1e-13)
+    if form == "matrix":
+        problem = lv.Problem(problem.b, problem.cones, problem.csr)
+    names = [name for name in lv.available(problem) if not lv.get(name).external]
+    assert {"auto", "direct", "lemke", "newton", "pgs"} <= set(names)
+    for name in names:
+        found = lv.solve(problem, name, tol=1e-9, max_iter=100_000)
+        assert found.success, f"{name}: {found}"
+        np.testing.assert_allclose(found.impulse, expected.impulse, atol=1e-6, err_msg=name)
+
+
+@pytest.mark.parametrize("change", ["signs", "units", "origin"])
+@pytest.mark.parametrize("name", ["lemke", "direct", "pgs", "auto"])
+def test_equivalent_rows_take_the_same_work_and_have_equivalent_answers(name, change):
+    """lambda = sign size lambda' + shift; A is not symmetric, so that lemke follows paths, then exchanges."""
+    paths = 0
+    for seed in range(8):
+        rng, m = np.random.default_rng(seed), 8
+        half, skew = rng.normal(size=(m, m)), rng.normal(size=(m, m))
+        a, b = half @ half.T / m + 0.3 * np.eye(m) + 0.7 * (skew - skew.T), 3.0 * rng.normal(size=m)
+        low = np.where(rng.random(m) < 0.8, rng.uniform(-1.0, 0.5, m), -np.inf)
+        high = np.where((rng.random(m) < 0.5) & np.isfinite(low), low + 1.0, np.inf)
+        sign, size, shift = np.ones(m), np.ones(m), np.zeros(m)
+        if change == "signs":
+            sign, high = rng.choice([-1.0, 1.0], m), np.full(m, np.inf)  # lower limits become upper ones
+        elif change == "units":
+            size = 2.0 ** rng.integers(-6, 7, m)
+        else:
+            shift = np.where(np.isfinite(low), low, 0.0)
+        factor, new_b = sign * size, sign * size * (b - a @ shift)
+        ends = (low - shift) / factor, (high - shift) / factor
+        more = {"tol": 1e-8, "max_iter": 2000}
+        one = lv.solve(lv.Problem.lcp(a, b, low, high), name, **more)
+        changed = lv.Problem.lcp(a * np.outer(factor, factor), new_b, np.minimum(*ends), np.maximum(*ends))
+        other = lv.solve(changed, name, **more)
+        assert one.success == other.success and (one.success or name == "pgs"), f"{seed}: {one} {other}"
+        if one.success:
+            np.testing.assert_allclose(factor * other.impulse + shift, one.impulse, atol=1e-5)
+        if name == "lemke":
+            assert one.work == other.work, f"{seed}: {one.work} {other.work}"
+        paths += other.work.get("paths", 0)
+    assert paths > 0 or name != "lemke"
+
+
+class Steps:
+    """A backend and its judge that return and accept given points, one after the other."""
+
+    def __init__(self, statuses, accepted):
+        self.statuses, self.accepted, self.calls = statuses, iter(accepted), 0
+
+    def accepts(self, x, lam):
+        return next(self.accepted)
+
+    def __call__(self, scaled, start, limits, settings):
+        self.calls += 1
+        x = np.full(scaled.n, float(self.calls))
+        return Answer(lv.Status[self.statuses[self.calls - 1]], f"call {self.calls}", x, np.zeros(len(scaled.t)))
+
+
+@pytest.mark.parametrize(
+    ("statuses", "accepted", "best"),
+    [
+        (["STALLED", "CONVERGED"], [False, True], 2), (["STALLED", "NUMERICAL_ERROR"], [False, False], 1),
+        (["CONVERGED"], [True], 1), (["NUMERICAL_ERROR", "STALLED"], [False, False], 2),
+    ],
+)  # fmt: skip
+def test_call_backend_until_accepted_returns_the_claim_of_the_best_call(statuses, accepted, best):
+    program, steps = get_program(lv.Problem.from_qp(np.eye(2), np.ones(2), G=[[1.0, 1.0]], h=[1.0]).qp), None
+    steps = Steps(statuses, accepted)
+    more = {"max_iter": 100, "tol": 1e-6, "deadline": deadline.NEVER, "settings": {}}
+    found = call_backend_until_accepted(program, steps, steps, **more)
+    assert (steps.calls, found.message, found.status.name) == (len(accepted), f"call {best}", statuses[best - 1])
+    np.testing.assert_array_equal(found.point[0], program.restore_point(np.full(2, float(best)), np.zeros(1))[0])
+    assert found.work["backend_calls"] == steps.calls
+
+
+def test_program_form_of_more_rows_than_velocities_is_the_velocity_form():
+    for m in (3, 1200):  # 1200 rows are above the limit up to which A is factored
+        cones = lv.Cones.bounded(np.zeros(m), np.inf)
+        problem = lv.Problem.from_jacobian(np.ones((m, 1)), [[1.0]], [-1.0], cones=cones)
+        assert choose_program_form(problem, "auto") == "velocity"
+
+
 @pytest.mark.parametrize(
     ("text", "status"),
     [
@@ -277,6 +363,23 @@ def test_direct_of_an_ill_conditioned_asymmetric_matrix_ends_at_its_floor(seed):
     a = u @ np.diag(np.logspace(0, -9, 30)) @ v
     solution = lv.solve(lv.Problem.linear(a, rng.normal(size=30)), "direct", tol=1e-15)
     assert solution.residual.at_floor, str(solution)
+
+
+def test_registered_solver_that_worsens_its_start_returns_the_start(register):
+    class Worsens:
+        def prepare(self, problem):
+            return problem
+
+        def run(self, state, impulse, max_iter, tol, time_limit=None):
+            impulse += 10.0
+            return lv.Claim(lv.Status.CONVERGED, 1)
+
+    register(lv.SolverSpec("worsens", Worsens, {"lcp", "coulomb", "cone"}, summary="of a test"))
+    problem = random_contact_problem(3)
+    start = project_impulse(problem.cones, 0.99 * lv.solve(problem, tol=1e-12).impulse)
+    found = lv.solve(problem, "worsens", impulse=start, tol=1e-9)
+    np.testing.assert_array_equal(found.impulse, start)
+    assert found.is_contradicted and found.status is not lv.Status.MAX_ITERATIONS
 
 
 def test_direct_with_a_factor_that_fails_at_last_returns_its_best_iterate(monkeypatch):
@@ -440,6 +543,14 @@ def test_island_cut_out_has_its_block_of_the_matrix_and_its_answer(kind):
         others = np.delete(a[rows], rows, axis=1)
         assert not others.any()
         assert lv.residual(part, whole.impulse[rows]).relative <= 1e-9
+
+
+@pytest.mark.parametrize(("row", "column"), [(0, 3), (1, 4), (2, 3), (5, 0)])
+def test_islands_of_a_matrix_are_connected_by_any_of_their_rows(row, column):
+    a = np.eye(6)
+    assert find_islands(lv.Problem.contact(a, np.ones(6), mu=0.5))[0] == 2
+    a[row, column] = a[column, row] = 0.3
+    assert find_islands(lv.Problem.contact(a, np.ones(6), mu=0.5))[0] == 1
 
 
 @pytest.mark.parametrize("kind", range(3))

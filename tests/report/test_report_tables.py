@@ -395,3 +395,8 @@ def test_tables_of_200_cases_of_which_few_are_solved_are_complete():
     assert len(report.sections["runs"].frames[0]) == 400
     assert report.sections["runs"].frames[0]["to 1e-3 [s]"].notna().sum() == 6
     assert len(report.sections["failures"].frames[0]) == 394
+
+
+def test_select_failures_lists_a_false_claim_of_a_run_that_reached_its_tolerance():
+    made = [record("a", "liar", 1e-3, 1e-9, **FALSE_CLAIM), record("a", "auto", 1e-3, 1e-9)]
+    assert tables.select_failures(report_of(*made))["solver"].tolist() == ["liar"]
