@@ -231,3 +231,40 @@ def test_audit_resumed_after_ctrl_c_equals_an_uninterrupted_one(boxes, tmp_path,
     # Another parameter, or --no-reuse, judges everything again.
     for change in ({"seed": 1}, {"reuse": False}, {"threshold": 1e-3}, {"control": "zero"}):
         assert not any("reused" in note for note in audit(path, **same | {"worlds": n} | change).notes)
+
+
+@pytest.mark.parametrize("source", [3, None, {"qpos": 1}])
+def test_audit_of_another_object_raises(source):
+    with pytest.raises(lv.InputError, match=r"the path of a model \(MJCF, .mjb\) or a mujoco.MjModel"):
+        audit(source, worlds=1, steps=2)
+
+
+def test_audit_of_an_environment_without_mujoco_raises():
+    env = SimpleNamespace(reset=None, step=None, unwrapped=SimpleNamespace())
+    with pytest.raises(lv.InputError, match=r"no model and data of MuJoCo as env.unwrapped.model"):
+        audit(env)
+    with pytest.raises(lv.InputError, match="policy needs a gymnasium environment"):
+        audit("m.xml", policy=lambda observation: None)
+    with pytest.raises(lv.InputError, match="control has no effect with an environment"):
+        audit(Environment(), control="zero")
+
+
+def test_audit_against_a_model_with_another_state_raises(boxes, tmp_path):
+    (tmp_path / "small.xml").write_text("<mujoco><worldbody/></mujoco>")
+    with pytest.raises(lv.InputError, match="a model with the same state is needed"):
+        audit(boxes(), worlds=1, steps=2, workers=1, against=tmp_path / "small.xml")
+    with pytest.raises(lv.InputError, match="'mujoco' is needed"):
+        audit(boxes(), worlds=1, steps=2, engine="mjx", against=boxes())
+
+
+def test_audit_writes_complete_worlds_while_it_runs(boxes, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "STEPS_PER_TASK", 20)
+    monkeypatch.setattr(module, "SAVE_INTERVAL", 0.0)
+    seen = []
+
+    def watch(event):
+        if (tmp_path / "records.npz").is_file():
+            seen.append(int((np.load(tmp_path / "records.npz")["verdict"] >= 0).sum()))
+
+    audit(boxes(EARLY), worlds=3, steps=20, workers=1, folder=tmp_path, watch=watch)
+    assert seen == sorted(seen) and seen[-1] >= 40

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import lavender as lv
-from lavender.audit.slip import REMEDY_STEPS, explain_slip
+from lavender.audit.slip import REMEDY_STEPS, Remedy, SlipExplanation, explain_slip
 from lavender.audit.slip_states import explain_slip_of_states
 
 mujoco = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[peers]'")
@@ -269,3 +269,38 @@ def test_explain_slip_of_states_remedy_has_the_slip_that_the_typed_setting_gives
     best = min(explanation.remedies, key=lambda remedy: remedy.later)
     assert best.setting in explanation.advice[1]
     assert best.later < 0.3 * explanation.remedies[0].later
+
+
+def test_explain_slip_without_contacts_or_velocities_raises():
+    with pytest.raises(lv.InputError, match="no contact with tangents"):
+        explain_slip(lv.Problem.lcp(np.eye(2), np.ones(2)), np.zeros(2))
+    matrix = lv.Problem.contact(np.eye(3), np.array([1.0, 1.0, 0.0]), mu=0.5)
+    with pytest.raises(lv.LavenderError):
+        explain_slip(matrix, np.zeros(3))
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_slip_remedies_after_a_reset_by_mujoco_are_not_recommended():
+    model, states = make_diverging_states([1.0])
+    data, step = mujoco.MjData(model), 0
+    data.qpos[:], data.qvel[:] = states["qpos"][0], states["qvel"][0]
+    while not data.warning[int(mujoco.mjtWarning.mjWARN_BADQACC)].number:
+        mujoco.mj_step(model, data)
+        step += 1
+    (explanation,) = explain_slip_of_states(model, states).explanations
+    assert explanation.remedies[0].diverged_step == step - 1 > 0
+    assert explanation.remedies_table.iloc[0, 2] == f"diverges in step {step - 1}"
+    assert len(explanation.advice) == 1 and "No setting is recommended" in explanation.advice[0]
+
+
+def test_slip_below_the_threshold_gives_no_advice():
+    remedies = (Remedy("as it is", 1e-3, 1e-9), Remedy("<option/>", 1e-3, 1e-12))
+    explanation = SlipExplanation((), (), remedies=remedies)
+    (line,) = explanation.advice
+    assert "is 1.0e-9 m/s as it is; up to 1e-06 m/s count as no slip" in line
+
+
+def test_slip_of_round_cones_names_the_undefined_law():
+    explanations = explain_slip_of_states(block(0.3, option='cone="elliptic"', condim=4), steps=100).explanations
+    assert "Variant 'coulomb': Coulomb's law is not defined for its round cones." in explanations[0].sentences
+    assert explanations[0].parts["convex relaxation"] == pytest.approx([0.0] * len(explanations[0].contacts))

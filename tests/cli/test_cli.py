@@ -347,3 +347,15 @@ def test_command_in_a_narrow_terminal_prints_whole_names(lavender, monkeypatch, 
     assert code == 0
     names = re.findall(r"^\w+", wide, re.MULTILINE)
     assert names and set(names) <= set(re.findall(r"^\w+", narrow, re.MULTILINE))
+
+
+@pytest.mark.skipif(sys.version_info[:3] == (3, 13, 0), reason="CPython 3.13.0 imports nothing in such a folder")
+@pytest.mark.parametrize("words", ["--workers 2", "--workers 1", "--solvers pgs --budgets 2 --no-figures"])
+def test_command_in_a_deleted_directory_names_it(lavender, path, tmp_path, words):
+    os.rmdir(os.getcwd())
+    words = words if "--solvers" in words else f"--solvers pgs --no-figures {words}"
+    code, _, err = lavender("report", path, *words.split(), "--out", tmp_path / "out")
+    assert code == 0 or (code == cli.EXIT_BAD_INPUT and "the working directory no longer exists" in err)
+    for words in ("run stack --steps 2 --record r", "export c c", "solve toy_stack --output x.npz", "report toy_stack"):
+        code, _, err = lavender(*words.split())
+        assert code == cli.EXIT_BAD_INPUT and "the working directory no longer exists" in err

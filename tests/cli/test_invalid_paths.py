@@ -25,6 +25,7 @@ from lavender import io, report
 from lavender.io.stored import FOLDER_LOCK, lock_output, lock_step_folder, write_text
 from lavender.report.findings import Report, print_report, render_report, summarise
 from lavender.report.store import KINDS, Store, to_jsonable
+from lavender.report.text import make_file_name
 from lavender.report.timing import format_call
 from lavender.sim.engine import run
 from lavender.sim.engine.picture import Film
@@ -528,3 +529,10 @@ def test_a_record_of_an_undescribed_case_is_rejected(tmp_path, entries):
     write_entries(tmp_path / "records.jsonl", [e for e in entries if e["kind"] != "case"])
     with pytest.raises(lv.InputError, match="a record belongs to a case that no line describes"):
         report.read(tmp_path)
+
+
+def test_file_names_of_long_names_differ():
+    names = ["n" * 300 + str(i) for i in range(3)]
+    assert len({make_file_name(name) for name in names}) == 3
+    items = report.resolve_sources([stack(name=n) for n in [*names, names[0], "x", "x", "x #2"]])
+    assert len({make_file_name(item.name).lower() for item in items}) == len(items)

@@ -314,3 +314,14 @@ def test_diagnose_light_body_thrown_away_is_reported():
     solution = lv.solve(problem, tol=1e-9)
     found = [d for d in lv.diagnose(problem, solution.impulse) if d.kind == "impulses"]
     assert solution.success and len(found) == 1 and found[0].data["change"] == pytest.approx(1e5, rel=1e-3)
+
+
+def test_diagnose_of_planar_velocities_in_space_names_the_conversion():
+    problem = SCENES["stack"]
+    velocity = np.arange(3.0 * problem.rows.n_bodies).reshape(-1, 3)
+    with pytest.raises(lv.InputError, match=r"not in the xy plane: .*insert\(v, \[2, 2, 2\], 0\.0, axis=1\)"):
+        lv.diagnose(problem, velocity=velocity)
+    converted = np.insert(velocity, [2, 2, 2], 0.0, axis=1)
+    np.testing.assert_array_equal(converted[:, [0, 1, 5]], velocity)
+    assert not converted[:, 2:5].any()
+    lv.diagnose(problem, velocity=converted)

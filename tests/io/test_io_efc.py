@@ -259,3 +259,12 @@ def test_from_mujoco_many_of_a_model_with_sleep_is_rejected_and_agrees_with_from
             one = lv.residual(lv.io.from_mujoco(model, data), lv.io.mujoco.impulse(model, data))
             assert batch.row_counts[0] == data.nefc > 0
             assert lv.residual_many(batch, impulse).velocity_error[0] == pytest.approx(one.velocity)
+
+
+def test_from_efc_of_coulomb_law_on_unsupported_contacts_raises():
+    model = mj.MjModel.from_xml_string(scene(cone="elliptic", condim=4))
+    given = stacked(model, states_of(model, 2), np.float64)
+    with pytest.raises(lv.CapabilityError, match="torsional or rolling"):
+        lv.io.from_efc(**given, friction="coulomb")
+    with pytest.raises(lv.InputError, match="friction"):
+        lv.io.from_efc(**given, friction="ccp")

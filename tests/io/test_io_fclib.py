@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import sys
 
 import numpy as np
 import pytest
@@ -353,3 +354,25 @@ def test_load_of_an_inconsistent_fclib_file_names_the_entry(tmp_path, changes, s
     with pytest.raises(lv.InputError, match=sign) as error:
         lavender.io.load(path)
     assert "bad.h5" in str(error.value)
+
+
+def test_load_of_other_hdf5_files_raises(tmp_path):
+    with h5py.File(tmp_path / "foreign.h5", "w") as file:
+        file["weights"] = np.zeros(3)
+    with pytest.raises(lv.InputError, match="holds weights; an FCLIB file"):
+        lavender.io.load(tmp_path / "foreign.h5")
+    with h5py.File(tmp_path / "group.h5", "w") as file:
+        file["fclib_local"] = np.zeros(3)
+    with pytest.raises(lv.InputError, match="spacedim is missing"):
+        lavender.io.load(tmp_path / "group.h5")
+
+
+def test_fclib_without_h5py_names_the_extra(tmp_path, monkeypatch):
+    lavender.io.save(local_problem(), tmp_path / "p.hdf5")
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    for act in (
+        lambda: lavender.io.load(tmp_path / "p.hdf5"),
+        lambda: lavender.io.save(local_problem(), tmp_path / "q.h5"),
+    ):
+        with pytest.raises(lv.InputError, match=r"lavender-contact\[fclib\]"):
+            act()

@@ -437,3 +437,11 @@ def test_data_without_a_forward_pass_are_rejected_by_name():
     )
     with pytest.raises(lv.InputError, match="mj_forward"):
         adapter.from_mujoco(model, mj.MjData(model))
+
+
+def test_from_mujoco_of_other_objects_raises():
+    model, data = state(steps=1)
+    with pytest.raises(lv.InputError, match=r"MjModel.*needed"):
+        lv.io.from_mujoco(data, model)
+    with pytest.raises(lv.InputError, match=r"impulse \[N s\] has shape"):
+        adapter.acceleration(model, data, np.zeros(int(data.nefc) + 1))

@@ -312,3 +312,56 @@ def test_load_of_an_inconsistent_npz_names_the_entry(tmp_path, changes, sign):
     with pytest.raises(lv.InputError, match=sign) as error:
         lavender.io.load(own(tmp_path, problem, **changes))
     assert "own.npz" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("entry", "sign"),
+    [
+        (npy("<f8", (2**60,)), "declares"),
+        (npy("<f8", (2**40, 2**40)), "declares"),
+        (npy("<f8", (12,), bytes(95)), "declares"),
+        (npy("<f8", (12,), bytes(97)), "declares"),
+        (npy("<f8", (-12,), b""), "shape"),
+        (npy("<f8", (True, 12), bytes(96)), "integer|shape"),
+        (npy("<f8", 12, bytes(96)), "shape"),
+        (npy([("x", "<f8")], (12,), bytes(96)), "plain numbers are needed"),
+        (npy("<c16", (6,), bytes(96)), "numbers are needed"),
+        (npy("<M8[s]", (12,), bytes(96)), "numbers are needed"),
+        (npy("nonsense", (12,), bytes(96)), "cannot be read"),
+        (npy("<f8", (12,), bytes(96), version=4), "version 1.0"),
+        (b"\x93NUMPY\x01\x00\xff\xff" + b" " * 65535, "header"),
+        (b"\x93NUMPY\x01\x00\x10\x00" + b"(" * 16, "cannot be read"),
+        (b"\x93NUMPY\x02\x00\xff\xff\xff\xff", "version 1.0"),
+        (b"", "magic"),
+        (b"\x93NUM", "magic"),
+    ],
+)
+def test_load_of_npz_entries_with_false_headers_raises(tmp_path, entry, sign):
+    with pytest.raises(lv.InputError, match=sign):
+        lavender.io.load(own(tmp_path, b=entry))
+
+
+@pytest.mark.parametrize(
+    ("changes", "sign"),
+    [
+        ({"A": None}, "no entry 'A_shape'"),
+        ({"lo": np.zeros(6)}, "'lo'"),
+        ({"lo": np.full(7, 1.0), "hi": np.zeros(7)}, "lower <= upper"),
+        ({"b": np.zeros((7, 1))}, "one dimension"),
+        ({"cone_start": [5], "cone_dim": [3], "cone_mu": [0.5]}, "within rows 0 to 6"),
+        ({"cone_start": [-1], "cone_dim": [3], "cone_mu": [0.5]}, "within rows 0 to 6"),
+        ({"cone_start": [0, 2], "cone_dim": [3, 3], "cone_mu": [0.5, 0.5]}, "overlap"),
+        ({"cone_start": [0], "cone_dim": [5], "cone_mu": [0.5]}, "1 to 3 rows"),
+        ({"cone_start": [0], "cone_dim": [3], "cone_mu": [-0.5]}, "mu"),
+        ({"cone_start": [0], "cone_dim": [3, 3], "cone_mu": [0.5]}, "'cone_dim'"),
+        ({"cone_start": [0], "cone_mu": [0.5]}, "'cone_dim'"),
+        ({"cone_start": [0.5], "cone_dim": [3], "cone_mu": [0.5]}, "'cone_start' holds"),
+        ({"cone_start": [0], "cone_dim": [2.5], "cone_mu": [0.5]}, "'cone_dim' holds"),
+        ({"cone_start": [np.nan], "cone_dim": [3], "cone_mu": [0.5]}, "'cone_start' holds"),
+        ({"l_ref": np.zeros(3)}, "l_ref"),
+        ({"A": np.full((7, 7), np.inf)}, "finite"),
+    ],
+)
+def test_load_of_a_wrong_box_file_names_the_entry(tmp_path, changes, sign):
+    with pytest.raises(lv.InputError, match=sign):
+        lavender.io.load(box(tmp_path, **changes))

@@ -160,3 +160,20 @@ def test_recorder_writes_json_without_nan(tmp_path):
     assert len(entries) == 2 and all(entry["seconds"] is None for entry in entries)
     (answers,) = read_engine_answers([str(tmp_path / "all")], lv.report.run([], ["pgs"]))
     assert answers.lines["seconds"].isna().all() and len(answers.lines) == 2
+
+
+def test_recorder_with_wrong_arguments_or_folders_raises(tmp_path):
+    with pytest.raises(lv.InputError, match="nothing would be recorded"):
+        lv.io.Recorder(tmp_path / "a")
+    with pytest.raises(lv.InputError, match="when is 3"):
+        lv.io.Recorder(tmp_path / "a", when=3)
+    with lv.io.Recorder(tmp_path / "a", every=1) as recorder:
+        with pytest.raises(lv.InputError, match="another"):  # the folder is locked
+            lv.io.Recorder(tmp_path / "a", every=1)
+        recorder.add(step_of([0.1]))
+        with pytest.raises(lv.InputError, match=r"state 'q' has shape \(3,\); a first dimension of 1 worlds"):
+            recorder.add(step_of([0.1]), state={"q": np.zeros(3)})
+    with pytest.raises(lv.InputError, match="holds 1 problem files"):
+        lv.io.Recorder(tmp_path / "a", every=1)
+    with lv.io.Recorder(tmp_path / "a", every=1, replace=True) as recorder:
+        assert not list((tmp_path / "a").glob("*.npz"))

@@ -471,3 +471,10 @@ def test_coincident_spheres_touch_or_are_rejected():
 
 
 # -- numbers at the edge of float64 --------------------------------------------------------------------
+
+
+def test_buffers_beyond_memory_raise():
+    sim = lv.Simulation(lv.Scene("stack", n=2))
+    sim.state.head[HEAD["need_contacts"]] = 2**28
+    with pytest.raises(lv.InputError, match="GiB"):
+        sim.state.with_larger_buffers()

@@ -314,3 +314,28 @@ def test_impulse_of_an_infeasible_problem_is_within_its_bounds(name, seed, m, de
         # Sums over the rows in another order round differently.
         assert solution.residual.energy <= solution.residual.energy_at_zero * (1.0 + 1e-14)
         assert solution.claim_check == "confirmed" and solution.certificate is not None
+
+
+@pytest.mark.parametrize("error", [FloatingPointError("underflow"), MemoryError()])
+@pytest.mark.parametrize("where", ["prepare", "run"])
+@pytest.mark.parametrize("limit", [None, 10.0])
+def test_arithmetic_error_of_a_plug_in_is_a_numerical_error(error, where, limit, register):
+    class Breaks:
+        def prepare(self, problem):
+            if where == "prepare":
+                raise error
+
+        def update(self, state, problem):
+            return self.prepare(problem)
+
+        def run(self, state, impulse, n, tol, time_limit=None):
+            impulse[0] = np.nan
+            raise error
+
+    register(lv.SolverSpec(name="breaks", factory=Breaks, laws={"lcp"}, summary="", resumable=False))
+    solver = lv.prepare(random_lcp(4), "breaks")
+    for _ in range(2):
+        solution = solver.solve(time_limit=limit)
+        assert solution.status is lv.Status.NUMERICAL_ERROR
+        assert type(error).__name__ in solution.message
+        assert np.isfinite(solution.impulse).all()

@@ -356,3 +356,14 @@ def test_arrays_of_blocks_have_the_bits_of_single_calls(dimensions, seed):
     first, second = single.problem(), arrays.problem()
     assert first == second and first.b.tobytes() == second.b.tobytes()
     assert [first.names[0], *first.names] == [second.names[0], *second.names]
+
+
+@pytest.mark.parametrize(("length", "cause"), [(None, "coincide and length is None"), (0.0, "length is 0")])
+def test_distance_of_length_zero_raises_and_recommends_ball(length, cause):
+    builder = spatial(np.zeros((1, 6)), np.zeros((1, 3)))
+    point = (0.0, 0.0, 1.0)
+    lengths = {} if length is None else {"length": [1.0, length]}
+    with pytest.raises(lv.InputError, match=f"{cause}.*use ball"):
+        builder.distance(-1, 0, point, point, length)
+    with pytest.raises(lv.InputError, match=f"distance 1: .*{cause}"):
+        builder.joints("distance", [(-1, 0)] * 2, anchor_a=[(1.0, 0.0, 0.0), point], anchor_b=[point] * 2, **lengths)
