@@ -154,6 +154,30 @@ def test_verdict_of_a_diverged_impulse_in_a_scene_at_rest_is_wrong():
     assert given.rounds and given.verdict == "wrong"
 
 
+@pytest.mark.parametrize("form", ["bodies", "J and M", "matrix"])
+def test_floor_energy_of_free_rows_is_that_of_numpy(form):
+    """F = 2^-53 (|J| |M^-1| |J|^T |lambda| + c |lambda| + |b|), or with |A|; its energy is sqrt(sum F^2 / d)."""
+    rng = np.random.default_rng(4)
+    rows = random_bodies_and_contacts(rng, bodies=5, joints=4, contacts=0)
+    compliance = rng.uniform(0.0, 0.1, rows.joint_ptr[-1])
+    problem = lv.Problem.from_rows(rows, compliance=compliance)
+    impulse, b, d = rng.normal(size=problem.m), problem.b, problem.d
+    mass = [np.diag(np.full(3, x)) for x in rows.inv_mass]
+    inverse = sp.block_diag([x for pair in zip(mass, np.abs(rows.inv_inertia), strict=True) for x in pair]).toarray()
+    jac = np.abs(problem.jacobian.toarray())
+    terms = jac @ (inverse @ (jac.T @ np.abs(impulse))) + compliance * np.abs(impulse)
+    if form == "J and M":  # with a diagonal M, which has a diagonal root
+        jac, mass = rng.normal(size=(problem.m, 12)), rng.uniform(0.5, 2.0, 12)
+        problem = lv.Problem.from_jacobian(jac, np.diag(mass), np.ones(12), cones=problem.cones, compliance=compliance)
+        b, d, jac = problem.b, problem.d, np.abs(jac)
+        terms = jac @ (jac.T @ np.abs(impulse) / mass) + compliance * np.abs(impulse)
+    elif form == "matrix":
+        problem = lv.Problem(b, problem.cones, problem.csr)
+        terms = np.abs(problem.dense()) @ np.abs(impulse)
+    expected = 2.0**-53 * np.linalg.norm((terms + np.abs(b)) / np.sqrt(d))
+    assert lv.residual(problem, impulse).floor_energy == pytest.approx(expected, rel=1e-10, abs=0.0)
+
+
 @pytest.mark.parametrize("gap", [1e-3, 1e-6])
 def test_proof_of_two_contradicting_rows_holds_below_their_residual_only(gap):
     problem = lv.Problem.lcp(np.ones((2, 2)), [1.0, 1.0 + gap], -np.inf, np.inf)
