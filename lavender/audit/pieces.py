@@ -131,11 +131,7 @@ class Piece(NamedTuple):
 
 
 def judge_steps(
-    frame: Frame,
-    judging: Judging,
-    world: Any,
-    step: Any,
-    state_of: Callable[[int], dict[str, FloatArray]],
+    frame: Frame, judging: Judging, world: Any, step: Any, state_of: Callable[[int], dict[str, FloatArray]]
 ) -> Piece:
     """Judge the engine's answers to the problems of a frame, one for each step.
 

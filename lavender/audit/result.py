@@ -473,10 +473,12 @@ class Audit:
         width = -(-self.runs.steps // MAX_CURVE_POINTS)
         parts = [self.numbers[0][:, k : k + width] for k in range(0, self.runs.steps, width)]
         known = [(k * width, p[np.isfinite(p)]) for k, p in enumerate(parts) if np.isfinite(p).any()]
-        curves = tuple(
-            Curve.from_points(name, name, [(k, float(np.quantile(p, q, method="higher")) or np.nan) for k, p in known])
-            for name, q in (("median", 0.5), ("99 %", 0.99), ("worst", 1.0)) if known
-        )  # fmt: skip
+        places = [k for k, _ in known]
+        curves = [
+            Curve(name, name, places, [float(np.quantile(p, q, method="higher")) or np.nan for _, p in known])
+            for name, q in (("median", 0.5), ("99 %", 0.99), ("worst", 1.0))
+            if known
+        ]
         return Figure(
             "over-time", "Errors of all worlds", "step", "velocity error [m/s]", curves, x_log=False
         )

@@ -13,14 +13,18 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
+from lavender.base.arrays import FloatArray
 from lavender.base.errors import require_packages
 from lavender.io.stored import make_folder, write_text
 from lavender.report.text import format_count, format_tolerance, make_file_name
 from lavender.solvers import registry
+
+Points: TypeAlias = Sequence[float] | FloatArray
+Style: TypeAlias = dict[str, Any]  # Colour, dash and mark of a solver, as arguments of matplotlib.
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -50,33 +54,27 @@ FIRST_SOLVERS = (
 )
 FLAT_LINES_NOTE = (
     "A curve is flat after the last run of its solver, which ended at a tolerance (grey lines) or after a fixed "
-    "number of iterations."
+    "number of iterations. A curve below an equal one is drawn wider."
 )
+EQUAL_RATIO = 1.1  # Points of two curves whose values differ by a smaller factor cover each other.
+EQUAL_SHARE = 0.25  # A curve covers another if this fraction of their common points do.
+COVERED_WIDTH = 2.6  # [points] A curve is drawn wider by this width for each later curve that covers it.
 
 
 @dataclass(frozen=True)
 class Curve:
-    """A line of a figure."""
+    """A line of a figure. A residual of zero is drawn at `MIN_RESIDUAL`; nan and inf are gaps."""
 
     solver: str
     label: str
-    x: tuple[float, ...]
-    y: tuple[float, ...]
+    x: Points
+    y: Points
     thin: bool = False  # Drawn thin and dashed: a cold start, or a fit.
     steps: bool = False  # A step function.
     points: bool = False  # Points without a line.
     unmarked: bool = False  # No marks at the points of the line.
-    low: tuple[float, ...] = ()  # Edges of a band about the line, as `y`; empty without a band.
-    high: tuple[float, ...] = ()
-
-    @classmethod
-    def from_points(
-        cls, solver: str, label: str, places: Iterable[tuple[float, float]], **more: Any
-    ) -> Curve:
-        """Create a line through points. A residual of zero is drawn at `MIN_RESIDUAL`; nan and inf are gaps."""
-        x, y = zip(*places, strict=True)
-        drawn = tuple(max(v, MIN_RESIDUAL) if math.isfinite(v) else math.nan for v in y)
-        return cls(solver, label, tuple(map(float, x)), drawn, **more)
+    low: Points = ()  # Edges of a band about the line, as `y`; empty without a band.
+    high: Points = ()
 
 
 @dataclass(frozen=True)
@@ -87,10 +85,10 @@ class Figure:
     title: str
     x_title: str
     y_title: str
-    curves: tuple[Curve, ...]
+    curves: Sequence[Curve]
     x_log: bool = True
     y_log: bool = True
-    tolerances: tuple[float, ...] = ()  # Horizontal lines.
+    tolerances: Sequence[float] = ()  # Horizontal lines.
     note: str = ""  # A sentence that explains the curves.
 
     @property
@@ -134,41 +132,32 @@ def build_overall_figure(report: Contents, name: str = "error-against-time", law
     runs = runs[np.isfinite(runs["relative"]) & (runs["time"] > 0.0)]
     if not len(runs):
         return Figure(name, "", "", "", ())
-    cases = list(frame["case"].unique())
+    cases, curves = list(frame["case"].unique()), list[Curve]()
     grid = np.geomspace(runs["time"].min(), runs["time"].max(), GRID_SIZE)
-    number = {case: i for i, case in enumerate(cases)}
-    solvers = [str(s) for s in runs["solver"].unique()] if law else select_drawn_solvers(report, frame)
-    curves: list[Curve] = []
-    for solver in sorted(solvers) if law else solvers:
-        own = runs[runs["solver"] == solver]
-        if not len(own):
-            continue
-        reached = np.ones((len(cases), GRID_SIZE))
-        places = np.minimum(np.searchsorted(grid * (1.0 + 1e-9), own["time"]), GRID_SIZE - 1)
-        np.minimum.at(
-            reached, (own["case"].map(number).to_numpy(int), places), own["relative"].clip(MIN_RESIDUAL)
-        )
-        bands = np.quantile(
-            np.minimum.accumulate(reached, axis=1), (0.25, 0.5, 0.75), axis=0, method="inverted_cdf"
-        )
-        # From here on, half of the cases have a result.
-        first = int(np.searchsorted(-bands[1], -1.0, side="right"))
-        if first == GRID_SIZE:
-            continue
-        across, low, middle, high = (tuple(x[first:].tolist()) for x in (grid, *bands))
-        n = own["case"].nunique()
-        label = solver if n == len(cases) else f"{solver} ({n} of {len(cases)} cases)"
-        band: dict[str, Any] = {"low": low, "high": high} if not curves and not law and len(cases) > 1 else {}
-        curves.append(Curve(solver, label, across, middle, steps=len(cases) == 1, unmarked=True, **band))
-    over = (
-        f", median over {format_count(len(cases), 'case' if single.any() else 'step')}"
-        if len(cases) > 1
-        else ""
+    place = np.minimum(np.searchsorted(grid * (1.0 + 1e-9), runs["time"]), GRID_SIZE - 1)
+    runs = runs.assign(
+        place=place, number=runs["case"].map({case: i for i, case in enumerate(cases)}).astype(int)
     )
-    note = FLAT_LINES_NOTE
+    for solver in sorted(runs["solver"].unique()) if law else select_drawn_solvers(report, frame):
+        own, reached = runs[runs["solver"] == solver], np.ones((len(cases), GRID_SIZE))
+        np.minimum.at(reached, (own["number"], own["place"]), own["relative"].clip(MIN_RESIDUAL))
+        reached = np.minimum.accumulate(reached, axis=1)
+        low, middle, high = np.quantile(reached, (0.25, 0.5, 0.75), axis=0, method="inverted_cdf")
+        first = int(np.argmax(middle < 1.0))  # From here on, half of the cases have a result.
+        if middle[first] >= 1.0:
+            continue
+        n = own["case"].nunique()
+        label = str(solver) if n == len(cases) else f"{solver} ({n} of {len(cases)} cases)"
+        band = {"low": low[first:], "high": high[first:]} if not curves and not law and len(cases) > 1 else {}
+        line = Curve(
+            str(solver), label, grid[first:], middle[first:], steps=len(cases) == 1, unmarked=True, **band
+        )
+        curves.append(line)
+    over, note = "", FLAT_LINES_NOTE
     if len(cases) > 1:
+        over = f", median over {format_count(len(cases), 'case' if single.any() else 'step')}"
         note = f"The band holds the middle half of the cases. A case without a result counts as 1. {note}"
-    return Figure(name, f"Error against time{over}", "time of a call [s]", "relative residual [-]", tuple(curves),
+    return Figure(name, f"Error against time{over}", "time of a call [s]", "relative residual [-]", curves,
                   tolerances=report.tolerances, note=note)  # fmt: skip
 
 
@@ -176,21 +165,19 @@ def build_cost_figure(report: Contents) -> Figure:
     """Plot the time to the middle tolerance against the number of rows, with the fitted power of each solver."""
     from lavender.report.tables import get_times, tabulate_costs
 
-    fits, target = tabulate_costs(report), format_tolerance(report.tolerance)
-    times, curves = get_times(report.frame, report.tolerance), []
+    times, curves = get_times(report.frame, report.tolerance), list[Curve]()
     drawn = select_drawn_solvers(report, report.frame)
-    for fit in fits.to_dict("records"):
-        if fit["solver"] in drawn:
-            own = times.loc[fit["solver"]].dropna()
-            rows = np.array([report.cases.loc[c, "rows"] for c in own.index], float)
-            solver, ends = fit["solver"], np.array([rows[rows > 0].min(), rows.max()])
-            line = fit["fit at 1000 rows [s]"] * (ends / 1000.0) ** fit["exponent of rows"]
-            label = f"{solver}, rows^{fit['exponent of rows']:.2f}"
-            curves.append(Curve.from_points(solver, label, zip(ends, line, strict=True), unmarked=True))
-            curves.append(Curve.from_points(solver, "", zip(rows, own, strict=True), points=True))
+    for fit in tabulate_costs(report).to_dict("records"):
+        if (solver := fit["solver"]) in drawn:
+            own = times.loc[solver].dropna()
+            rows, exponent = report.cases.loc[own.index, "rows"].to_numpy(float), fit["exponent of rows"]
+            ends = np.array([rows[rows > 0].min(), rows.max()])
+            line = fit["fit at 1000 rows [s]"] * (ends / 1000.0) ** exponent
+            curves.append(Curve(solver, f"{solver}, rows^{exponent:.2f}", ends, line, unmarked=True))
+            curves.append(Curve(solver, "", rows, own.to_numpy(), points=True))
+    title = f"Time to {format_tolerance(report.tolerance)} against the number of rows"
     note = "Each point is a case; a line is the power of the number of rows that fits a solver's points best."
-    return Figure("cost-against-rows", f"Time to {target} against the number of rows", "rows", "time of a call [s]",
-                  tuple(curves), note=note)  # fmt: skip
+    return Figure("cost-against-rows", title, "rows", "time of a call [s]", curves, note=note)
 
 
 def build_sequence_figure(report: Contents, name: str) -> Figure:
@@ -199,47 +186,32 @@ def build_sequence_figure(report: Contents, name: str) -> Figure:
     curves: list[Curve] = []
     for solver in select_drawn_solvers(report, runs) if len(runs) else ():
         own = runs[(runs["solver"] == solver) & (runs["tol"] <= report.tolerance)]
-        own = own[own["tol"] == own["tol"].max()]
+        own = own[own["tol"] == own["tol"].max()].sort_values("step")
         for start in ("carried", "cold"):
-            some = own[own["start"] == start].sort_values("step")
+            some = own[own["start"] == start]
             if len(some):
-                cold = start == "cold" and (own["start"] == "carried").any()
-                points = zip(some["step"], some["time"].cumsum(), strict=True)
-                label = f"{solver} (cold)" if cold else solver
-                curves.append(Curve.from_points(solver, label, points, thin=bool(cold), unmarked=True))
+                cold = start == "cold" and bool((own["start"] == "carried").any())
+                times, label = some["time"].cumsum().to_numpy(), f"{solver} (cold)" if cold else solver
+                curves.append(Curve(solver, label, some["step"].to_numpy(), times, thin=cold, unmarked=True))
     title = f"{name}: time of all steps so far, to {format_tolerance(report.tolerance)}"
-    return Figure(f"sequence-{name}", title, "step", "time of all steps so far [s]", tuple(curves), x_log=False,
-                  note="Solid: impulses carried from step to step. Dashed: cold.")  # fmt: skip
-
-
-def list_solvers(figures: Sequence[Figure]) -> list[str]:
-    """Return the names of the curves of all figures, in their order."""
-    return list(dict.fromkeys(c.solver for figure in figures for c in figure.curves))
+    note = "Solid: impulses carried from step to step. Dashed: cold."
+    y_title = "time of all steps so far [s]"
+    return Figure(f"sequence-{name}", title, "step", y_title, curves, x_log=False, note=note)
 
 
 # -- drawing -----------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class CurveStyle:
-    """Colour, dash and mark of a solver, as matplotlib names them."""
-
-    color: str
-    dash: str
-    marker: str
-
-
-def number_styles(names: Sequence[str], colors: Sequence[str] = SOLVER_COLORS) -> dict[str, CurveStyle]:
+def number_styles(names: Sequence[str], colors: Sequence[str] = SOLVER_COLORS) -> dict[str, Style]:
     """Return a style for each name, in their order; names of different colours come first, then other dashes."""
     return {
-        name: CurveStyle(
-            colors[i % len(colors)], DASHES[i // len(colors) % len(DASHES)], MARKERS[i % len(MARKERS)]
-        )
+        name: {"color": colors[i % len(colors)], "linestyle": DASHES[i // len(colors) % len(DASHES)],
+               "marker": MARKERS[i % len(MARKERS)]}
         for i, name in enumerate(names)
-    }
+    }  # fmt: skip
 
 
-def assign_styles(solvers: Iterable[str]) -> dict[str, CurveStyle]:
+def assign_styles(solvers: Iterable[str]) -> dict[str, Style]:
     """Return a style for each solver.
 
     The style of a built-in solver is fixed by its place in `FIRST_SOLVERS`, followed by the other names in
@@ -252,7 +224,16 @@ def assign_styles(solvers: Iterable[str]) -> dict[str, CurveStyle]:
     return {name: style for name, style in styles.items() if name in names}
 
 
-def plot_figure(figure: Figure, styles: Mapping[str, CurveStyle]) -> Any:
+def count_covering_curves(curves: Sequence[Curve], i: int) -> int:
+    """Return the number of later curves that cover curve i, so that it would not be seen."""
+    own, n = dict(zip(curves[i].x, curves[i].y, strict=True)), 0
+    for other in () if curves[i].points else curves[i + 1 :]:
+        pairs = [(own[x], y) for x, y in zip(other.x, other.y, strict=True) if x in own and not other.points]
+        n += sum(a <= EQUAL_RATIO * b and b <= EQUAL_RATIO * a for a, b in pairs) > EQUAL_SHARE * len(pairs)
+    return n
+
+
+def plot_figure(figure: Figure, styles: Mapping[str, Style]) -> Any:
     """Draw a figure with its legend below the axes.
 
     Points that the axes cannot show are gaps: not finite, or not positive on a logarithmic axis. Lines have the id
@@ -273,7 +254,8 @@ def plot_figure(figure: Figure, styles: Mapping[str, CurveStyle]) -> Any:
         facecolor="none", xscale="log" if figure.x_log else "linear", yscale="log" if figure.y_log else "linear",
     )  # fmt: skip
     for i, c in enumerate(figure.curves):
-        _draw_curve(axes, figure, c, styles[c.solver], f"{c.solver}--{i}")
+        wider = COVERED_WIDTH * count_covering_curves(figure.curves, i)
+        _draw_curve(axes, figure, c, styles[c.solver], wider, f"{c.solver}--{i}")
     low, high = axes.get_ylim()
     for tolerance in figure.tolerances:
         if low <= tolerance <= high:
@@ -298,22 +280,23 @@ def plot_figure(figure: Figure, styles: Mapping[str, CurveStyle]) -> Any:
     return canvas
 
 
-def _draw_curve(axes: Any, figure: Figure, c: Curve, style: CurveStyle, gid: str) -> None:
+def _draw_curve(axes: Any, figure: Figure, c: Curve, style: Style, wider: float, gid: str) -> None:
     """Draw one curve with its band."""
-    logs, points = (figure.x_log, figure.y_log), []
-    for point in zip(c.x, c.y, strict=True):
-        shown = all(math.isfinite(v) and (v > 0.0 or not log) for v, log in zip(point, logs, strict=True))
-        points.append(point if shown else (math.nan, math.nan))
-    x, y = zip(*points, strict=True) if points else ((), ())
+    x, y = np.array(c.x, float), np.array(c.y, float)
+    y = np.where(y == 0.0, MIN_RESIDUAL, y)
+    shown = (
+        np.isfinite(x) & np.isfinite(y) & ((x > 0.0) | (not figure.x_log)) & ((y > 0.0) | (not figure.y_log))
+    )
     has_marks = c.points or len(x) == 1 or not (c.unmarked or c.steps)
-    (line,) = axes.plot(
-        x, y, label=_shorten(c.label, MAX_NAME_LENGTH) if c.label else "_", color=style.color,
-        linestyle="none" if c.points else "--" if c.thin else style.dash, linewidth=1.0 if c.thin else 1.7,
-        marker=style.marker if has_marks else "", markersize=4.5, drawstyle="steps-post" if c.steps else "default",
+    style = style | ({} if has_marks else {"marker": ""})
+    style |= {"linestyle": "none"} if c.points else {"linestyle": "--"} if c.thin else {}
+    axes.plot(
+        np.where(shown, x, math.nan), np.where(shown, y, math.nan), markersize=4.5, gid=gid, **style,
+        linewidth=(1.0 if c.thin else 1.7) + wider, drawstyle="steps-post" if c.steps else "default",
+        label=_shorten(c.label, MAX_NAME_LENGTH) if c.label else "_",
     )  # fmt: skip
-    line.set_gid(gid)
-    if c.low:
-        axes.fill_between(c.x, c.low, c.high, color=style.color, alpha=0.15, linewidth=0.0)
+    if len(c.low):
+        axes.fill_between(c.x, c.low, c.high, color=style["color"], alpha=0.15, linewidth=0.0)
 
 
 def _shorten(text: str, longest: int) -> str:
@@ -322,7 +305,7 @@ def _shorten(text: str, longest: int) -> str:
     return "\u2009" + text if text.startswith("_") else text
 
 
-def render_svg(figure: Figure, styles: Mapping[str, CurveStyle]) -> str:
+def render_svg(figure: Figure, styles: Mapping[str, Style]) -> str:
     """Return a figure as the text of an SVG file, with texts as texts."""
     canvas, text = plot_figure(figure, styles), io.StringIO()
     from matplotlib import rc_context
@@ -332,21 +315,11 @@ def render_svg(figure: Figure, styles: Mapping[str, CurveStyle]) -> str:
     return text.getvalue()
 
 
-def embed_svg(figure: Figure, svg: str) -> str:
-    """Return a figure of a page: the SVG as matplotlib wrote it, with its alternative text."""
-    alt = escape(figure.description)
+def draw_figure(figure: Figure, styles: Mapping[str, Style], folder: Path | None = None) -> str:
+    """Return a figure for a page, with its alternative text; with `folder`, also write it as NAME.svg."""
+    svg = render_svg(figure, styles)
+    if folder is not None:
+        write_text(make_folder(folder) / f"{make_file_name(figure.name)}.svg", svg)
+    alt, svg = escape(figure.description), svg[svg.index("<svg") :]
     note = f'<figcaption class="quiet">{escape(figure.note)}</figcaption>' if figure.note else ""
-    return f'<figure class="chart"><div role="img" aria-label="{alt}">{svg[svg.index("<svg") :]}</div>{note}</figure>'
-
-
-def draw_figures(
-    figures: Sequence[Figure], styles: Mapping[str, CurveStyle], folder: Path | None = None
-) -> list[str]:
-    """Return the figures for a page; with `folder`, also write each as NAME.svg."""
-    drawn = []
-    for figure in figures:
-        svg = render_svg(figure, styles)
-        if folder is not None:
-            write_text(make_folder(folder) / f"{make_file_name(figure.name)}.svg", svg)
-        drawn.append(embed_svg(figure, svg))
-    return drawn
+    return f'<figure class="chart"><div role="img" aria-label="{alt}">{svg}</div>{note}</figure>'

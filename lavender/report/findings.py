@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -20,23 +18,9 @@ from lavender.report import tables
 from lavender.report.figures import build_figures
 from lavender.report.render import Section, Statement, format_markdown, print_table, render_page, write_files
 from lavender.report.runner import Event
-from lavender.report.tables import (
-    INSIDE,
-    PLAIN_SWEEPS,
-    STRUCTURE_ORDER,
-    Contents,
-    is_plug_in,
-    rank_solvers,
-    select_ranked_runs,
-    tabulate_sweeps,
-)
-from lavender.report.text import (
-    escape_markdown,
-    escape_unprintable,
-    format_count,
-    format_residual,
-    format_tolerance,
-)
+from lavender.report.tables import INSIDE, PLAIN_SWEEPS, STRUCTURE_ORDER, Contents, is_plug_in, rank_solvers
+from lavender.report.text import escape_markdown, escape_unprintable, format_count, format_residual
+from lavender.report.text import format_tolerance as format_tol
 from lavender.report.timing import format_call
 from lavender.suite import FAMILIES
 
@@ -45,25 +29,22 @@ if TYPE_CHECKING:
 
 LONG_TABLES = ("cases", "failures", "runs", "skipped")  # Tables that are not written as LaTeX and Markdown.
 GROUPED_TABLES = ("runs", "sequences", "times")  # Tables that show equal first cells once on a terminal.
-MAX_LINES = 25  # Largest number of lines of a short report, including the lines that the command adds.
-# Number of lines that the command adds: a blank line, page, reused runs, cases that did not load.
-COMMAND_LINES = 5
-MAX_LEFT_OUT = 3  # Largest number of warnings about cases that did not load.
+# Largest number of lines of a short report, of which the command adds some: a blank line, page, reused runs, cases that
+# did not load.
+MAX_LINES, COMMAND_LINES = 25, 5
+# Largest number of warnings about cases that did not load, and of notes about crashed solvers.
+MAX_LEFT_OUT = 3
 MAX_NOTES = 20  # Largest number of notes of one kind in a complete report.
 MAX_NAMED = 2  # A sentence names up to this many ties, misses or plug-ins.
 MAX_SWEEP_ERROR = 1e-3  # [m/s] A number of sweeps is recommended if no velocity error is larger.
 PLURALS = {"mesh": "meshes"}
 LIMITATIONS = """\
-Times are wall-clock times, the minimum of the repetitions (the median is in records.csv). Differences below a few \
-tens of per cent are not significant without more repetitions. Ratios are computed within one run only.
-A time is the time of one call of lv.solve, including the judge and Python; below about 0.2 ms the share of Python is \
-as large as that of the solver. A simulation that reuses a factorisation between steps needs the set-up less often. \
-BLAS and OpenMP have one thread; threads that a backend starts in other ways are not limited.
-Means of times count the solved cases only: compare them only between solvers that solve the same cases.
-Recommendations hold for these cases: by cases solved, then by time; solvers within noise of the best are in a fixed \
-order, auto first.
+Times are wall-clock times of one call of lv.solve, with the judge and Python, whose share below about 0.2 ms is as \
+large as the solver's. A simulation that reuses a factorisation between steps needs the set-up less often. BLAS and \
+OpenMP have one thread; threads that a backend starts in other ways are not limited.
+Means of times count the solved cases only: compare them only between solvers of the same cases.
 The residual is zero exactly at a solution; the distance of an impulse from the solution also depends on the \
-conditioning. Structures are derived from the numbers."""
+conditioning."""
 
 #: Title, meaning of the numbers, and function of each table, in their order.
 SECTIONS: dict[str, tuple[str, str, Callable[[tables.Contents], pd.DataFrame]]] = {
@@ -79,12 +60,8 @@ SECTIONS: dict[str, tuple[str, str, Callable[[tables.Contents], pd.DataFrame]]] 
         "Time to the middle tolerance as a power of the number of rows, fitted to the cases that a solver solves; "
         "scatter: typical factor between a case and the fit."
     ), tables.tabulate_costs),
-    "times": (
-        "By law", "Number of cases that each solver solves, and their mean time.", tables.tabulate_times
-    ),
-    "budgets": (
-        "By iterations", "Residual after a fixed number of iterations, over the cases.", tables.tabulate_budgets
-    ),
+    "times": ("By law", "Number of cases that each solver solves, and their mean time.", tables.tabulate_times),
+    "budgets": ("By iterations", "Residual after fixed numbers of iterations.", tables.tabulate_budgets),
     "claims": ("Claims and verdicts", (
         "A claim is correct if the judge confirms it. The judge computes the residual from the problem's data."
     ), tables.tabulate_claims),
@@ -105,6 +82,9 @@ SECTIONS: dict[str, tuple[str, str, Callable[[tables.Contents], pd.DataFrame]]] 
     "cases": ("Cases", "", tables.tabulate_cases),
     "runs": ("Every case", "Time to each tolerance and smallest residual.", tables.tabulate_runs),
 }  # fmt: skip
+CAMPAIGN_SECTIONS = ("times", "budgets", "claims", "failures")  # Tables of a campaign, which has no times.
+# Tables of a run with unfinished passes only.
+PASS_SECTIONS = ("budgets", "claims", "failures", "sweeps", "sequences")
 
 
 class Report(tables.Contents):
@@ -128,54 +108,49 @@ class Report(tables.Contents):
     @cached_property
     def overview(self) -> pd.DataFrame:
         """The table of the first screen: the fastest solver by structure, or each solver if there is one structure."""
-        target, name = f"to {format_tolerance(self.tolerance)}", "times"
+        target = f"to {format_tol(self.tolerance)}"
         if not len(self.frame):
             return self.frame.iloc[:, :0]
-        wanted = ["solver", "cases", f"solved {target}", f"time {target} [s]"]
         if self.has_passes_only:
             name, wanted = "sequences", ["target", "steps, cold", "time, cold [s]", "residual, cold [-]"]
         elif "sweeps" in self.sections and (self.frame["mode"] == "budget").all():
-            name, starts = (
-                "sweeps",
-                [start for start in ("carried", "cold") if (self.frame["start"] == start).any()],
-            )
-            wanted = ["solver", "sweeps", *(f"velocity error, {start} [m/s]" for start in starts),
-                      *(f"motion error, {start} [m/s]" for start in starts)]  # fmt: skip
-            wanted = ["sequence"] * (self.frame["sequence"].nunique() > 1) + wanted
+            starts = ("carried", "cold")
+            errors = [f"{kind} error, {start} [m/s]" for kind in ("velocity", "motion") for start in starts]
+            name, wanted = "sweeps", ["sequence", "solver", "sweeps", *errors]
         elif len(self.structures) > 1 and not self.is_campaign:
             name, wanted = "structures", ["structure", target, f"time {target} [s]"]
-        frame = self.sections[name].frames[0]
-        return frame[[c for c in wanted if c in frame]].rename(columns={f"time {target} [s]": "time [s]"})
+        else:
+            name, wanted = "times", ["law", "solver", "cases", f"solved {target}", f"time {target} [s]"]
+        table = self.sections[name].frames[0].rename(columns={f"time {target} [s]": "time [s]"})
+        single = [c for c in ("law", "sequence") if c in table and table[c].nunique() == 1]
+        return table[[c for c in (*wanted, "time [s]") if c in table and c not in single]]
 
     @cached_property
     def sections(self) -> dict[str, Section]:
         """The tables by name, in their order; tables without rows are left out."""
-        made: list[Section] = []
+        names = PASS_SECTIONS if self.has_passes_only else tuple(SECTIONS)
+        names = CAMPAIGN_SECTIONS if self.is_campaign else names
+        made = [
+            Section(title, [make(self)], note, name=name)
+            for name, (title, note, make) in SECTIONS.items()
+            if name in names and len(self.frame)
+        ]
         if len(self.newest):
-            wanted = ("times", "budgets", "claims", "failures") if self.is_campaign else tuple(SECTIONS)
-            wanted = (
-                ("sequences", "budgets", "sweeps", "claims", "failures") if self.has_passes_only else wanted
-            )
-            for name, (title, note, make) in SECTIONS.items():
-                if name in wanted and len(self.frame):
-                    made.append(Section(title, [make(self)], note, name=name))
-            if self.earlier is not None:
-                made.append(self._compare_with_earlier_run())
+            made += [self._compare_with_earlier_run()] if self.earlier is not None else []
             note = "The zero impulse solves these cases. They are left out of all rankings."
             made.append(
                 Section("Solved by the zero impulse", [tables.tabulate_idle(self)], note, name="idle")
             )
         diagnostics = pd.DataFrame(list_diagnostics(self), columns=["case", "possible mistake"])
         made.append(Section("Diagnostics about the data", [diagnostics], name="diagnostics"))
-        made.append(Section("Not run", [tables.tabulate_skips(self)], name="skipped"))
+        made.append(Section("Not run", [self.skips[["case", "solver", "reason"]]], name="skipped"))
         return {section.name: section for section in made if len(section.frames[0])}
 
     def _compare_with_earlier_run(self) -> Section:
         """Return the table of changes since the earlier run; its note has the number of compared times."""
         assert self.earlier is not None
         changes = tables.tabulate_changes(self)
-        compared = int(changes["compared"].iloc[0])
-        changes = changes.drop(columns="compared")
+        compared = int(changes.pop("compared").iloc[0])
         note = f"{compared} times compared, on cases with the same numbers in both (no steps of sequences)"
         if changes.empty:
             changes = pd.DataFrame(
@@ -188,16 +163,14 @@ class Report(tables.Contents):
         """Return the machine, versions and plan of the newest run."""
         run, facts = self.machine, {}
         if run:
+            lists = {"versions": {"lavender": run["lavender"], "Python": run["python"], **run["versions"]},
+                     "build": run["build"] | {"load": run["load"]}, "plan": run["plan"]}  # fmt: skip
             counts = format_count(self.frame["case"].nunique(), "case"), format_count(len(self.newest), "run")
-            load = "" if math.isnan(run["load"]) else f"; load {run['load']:.2g}"
-            versions = {"lavender": run["lavender"], "Python": run["python"], **run["versions"]}
             facts = {
                 "run": f"{run['run']}, started {run['started']}; {', '.join(counts)}",
                 "machine": f"{run['cpu']}, {run['cores']} cores; {run['platform']}",
                 "threads": f"{run['threads']} for BLAS and OpenMP while timing; runs are serial",
-                "versions": ", ".join(f"{name} {v}" for name, v in versions.items()),
-                "build": "; ".join(f"{name} {v}" for name, v in run["build"].items()) + load,
-                "plan": "; ".join(f"{name} {v}" for name, v in run["plan"].items()),
+                **{name: "; ".join(f"{key} {x}" for key, x in some.items()) for name, some in lists.items()},
             }
         return pd.DataFrame(facts.items(), columns=["fact", "value"], dtype=object)
 
@@ -212,7 +185,7 @@ def render_report(report: Report, figures: bool = True, folder: Path | None = No
         Section("Machine, versions, options", [report.describe_run()], files, name="machine"),
         Section("Limitations", note=LIMITATIONS, name="limits"),
     ]
-    if len(report.frame) and not len(tables.select_failures(report)):
+    if len(report.frame) and "failures" not in report.sections:
         note = "Every run reached its target or the round-off floor, and every claim holds."
         sections.insert(1, Section("No failures", note=note, name="failures"))
     return render_page(
@@ -229,8 +202,6 @@ def write(
     watch: Callable[[Event], None] = lambda event: None,
 ) -> Path:
     """Write `records.csv`, `tables/*.csv`, `tables/*.tex`, `figures/*.svg`, `summary.md` and `index.html`.
-
-    If pyarrow is installed, `records.parquet` is written, too.
 
     Parameters
     ----------
@@ -258,20 +229,14 @@ def write(
         raise InputError(
             f"source is a {type(source).__name__}; the DataFrame of lavender.report.run or a Report is needed"
         )
-    folder, frame = Path(folder), report.runs
-    files: dict[str, Any] = {"records.csv": frame}
-    if importlib.util.find_spec("pyarrow") is not None:
-        files["records.parquet"] = frame
+    folder, files = Path(folder), dict[str, Any]({"records.csv": report.runs})
     for name, section in report.sections.items():
-        files[f"tables/{name}.csv"] = section.frames[0]
-        if name not in LONG_TABLES:
-            files[f"tables/{name}.tex"] = section.frames[0]
+        for kind in ("csv",) if name in LONG_TABLES else ("csv", "tex"):
+            files[f"tables/{name}.{kind}"] = section.frames[0]
     files["summary.md"] = lambda: summarise(report)
     files["index.html"] = lambda: render_report(report, figures, folder / "figures")
-    names = list(files)
-    write_files(
-        folder, files, lambda name: watch(Event(names.index(name), len(names), name, "", phase="writing"))
-    )
+    order = {name: i for i, name in enumerate(files)}
+    write_files(folder, files, lambda name: watch(Event(order[name], len(files), name, "", phase="writing")))
     return folder / "index.html"
 
 
@@ -310,8 +275,7 @@ def print_report(report: Report, console: Console, complete: bool = False) -> No
         is_cut = len(statement.code) > 1 and not complete
         code = [statement.call_line, "# all lines: --tables"] if is_cut else statement.code
         lines += [Text(f"    {line}") for line in code]
-    if report.busy_warning:
-        lines.append(Text(report.busy_warning, style="yellow"))
+    lines += [Text(report.busy_warning, style="yellow")] if report.busy_warning else []
     for text in lines:
         console.print(text, highlight=False)
     notes = [Text(text, style=style) for text, style in _list_notes(report, MAX_NOTES if complete else 1)]
@@ -321,12 +285,8 @@ def print_report(report: Report, console: Console, complete: bool = False) -> No
             console.print(Text.assemble("\n", (section.title, "bold"), note))
             print_table(console, section.frames[0], grouped=name in GROUPED_TABLES)
     elif n := len(report.overview):
-        height = (
-            MAX_LINES
-            - COMMAND_LINES
-            - len(notes)
-            - sum(len(text.wrap(console, console.width)) for text in lines)
-        )
+        above = sum(len(text.wrap(console, console.width)) for text in lines)
+        height = MAX_LINES - COMMAND_LINES - len(notes) - above
         shown = n if n <= height - 2 else max(1, height - 3)
         console.print()
         print_table(console, report.overview.head(shown), cut=True)
@@ -341,36 +301,34 @@ def print_report(report: Report, console: Console, complete: bool = False) -> No
 def _list_notes(report: Report, longest: int) -> Iterator[tuple[str, str]]:
     """Yield (note, style): at most `longest` notes of each kind; if there are more, a note has their number."""
     failures = tables.select_failures(report) if len(report.frame) else report.frame
-    false = failures[failures["status_conflict"].astype(str) != ""]
+    failures = failures.astype(dict.fromkeys(("solver", "case", "status", "message", "status_conflict"), str))
+    false = failures[failures["status_conflict"] != ""]
+    # Each solver that died is named once, plug-ins first.
+    died = failures[failures["status"].str.startswith(tables.DEATHS)].drop_duplicates("solver")
+    died = died.sort_values("solver", key=lambda names: ~names.map(is_plug_in).astype(bool), kind="stable")
     kinds = {
-        "false claim": (
-            "red",
-            [
-                f"{c}, {s}: {x}"
-                for c, s, x in zip(false["case"], false["solver"], false["status_conflict"], strict=True)
-            ],
-        ),
+        "crashed": ("red", [f"{r.solver} on {r.case}: {r.status}: {r.message}" for r in died.itertuples()]),
+        "false claim": ("red", [f"{r.case}, {r.solver}: {r.status_conflict}" for r in false.itertuples()]),
         "suspicious": ("yellow", [f"{case}: {reason}" for case, reason in list_diagnostics(report)]),
         "left out": ("yellow", [f"{cases}: {reason}" for cases, reason in list_cases_not_loaded(report)]),
     }
     for kind, (style, texts) in kinds.items():
-        for i, text in enumerate(texts[:longest], 1):
-            place = f" ({i} of {len(texts)})" if longest > 1 else f", the first of {len(texts)}"
+        shown = max(longest, MAX_LEFT_OUT) if kind == "crashed" else longest
+        for i, text in enumerate(texts[:shown], 1):
+            place = f" ({i} of {len(texts)})" if shown > 1 else f", the first of {len(texts)}"
             yield f"{kind}{place if len(texts) > 1 else ''}: {text}", style
-    skipped = [
-        reason.partition(":")[0] for reason in report.skips.loc[report.skips["solver"] != "", "reason"]
-    ]
+    reasons = report.skips.loc[report.skips["solver"] != "", "reason"]
+    skipped = [reason.partition(":")[0] for reason in reasons]
     replacements = Counter(pair for pair in skipped if " → " in pair)
     for pair, n in replacements.items():
         cases = format_count(n, "case")
         yield f"{pair} on {cases} with bounds: the same method; the first accepts only free rows", ""
-    refused = len(skipped) - replacements.total()
-    if refused:
+    if refused := len(skipped) - replacements.total():
         pairs = format_count(refused, "pair")
         yield f"{pairs} of case and solver not run, or not to the end: the page has the reasons", "dim"
     if "changes" in report.sections:
         section = report.sections["changes"]
-        counts = sorted(Counter(section.frames[0]["change"].astype(str)).items())
+        counts = sorted(Counter(section.frames[0]["change"]).items())
         text = ", ".join(f"{n} {kind}" if "target" in section.frames[0] else kind for kind, n in counts)
         yield f"{section.title}: {text} ({section.note})", ""
     if "idle" in report.sections:
@@ -385,42 +343,46 @@ def list_diagnostics(report: Report) -> list[tuple[str, str]]:
 
     Equal diagnostics of a sequence are one entry, with its first step and the number of further steps.
     """
-    seen: dict[tuple[str, str], list[tuple[str, str]]] = {}
-    for name, sequence, diagnostics in report.cases[["sequence", "diagnostics"]].itertuples():
-        for diagnostic in map(escape_unprintable, map(str, diagnostics)):
-            seen.setdefault((sequence or name, diagnostic.partition(":")[0]), []).append((name, diagnostic))
-    found = []
-    for (name, diagnostic), *more in seen.values():
-        found.append((f"{name} and {format_count(len(more), 'more step')}" if more else name, diagnostic))
+    table = report.cases[["case", "sequence", "diagnostics"]].explode("diagnostics").dropna()
+    table["diagnostics"] = table["diagnostics"].map(lambda text: escape_unprintable(str(text)))
+    place = table["sequence"].where(table["sequence"] != "", table["case"])
+    found, kind = [], table["diagnostics"].map(lambda text: text.partition(":")[0])
+    for _, same in table.groupby([place, kind], sort=False):
+        more = f" and {format_count(len(same) - 1, 'more step')}" if len(same) > 1 else ""
+        found.append((f"{same['case'].iloc[0]}{more}", str(same["diagnostics"].iloc[0])))
     return found
 
 
-def _group_by_reason(skips: pd.DataFrame) -> dict[str, list[Any]]:
+def _group_by_reason(skips: pd.DataFrame) -> dict[str, pd.DataFrame]:
     """Group skips by their reason without the name of the case."""
-    same: dict[str, list[Any]] = {}
-    for skip in skips.itertuples():
-        reason = skip.reason.removeprefix("did not load: ").removeprefix(f"{skip.case}: ")
-        same.setdefault(reason, []).append(skip)
-    return same
+    reasons = [
+        reason.removeprefix("did not load: ").removeprefix(f"{case}: ")
+        for case, reason in zip(skips["case"], skips["reason"], strict=True)
+    ]
+    return {str(reason): same for reason, same in skips.groupby(reasons, sort=False)}
 
 
 def list_skip_reasons(skips: pd.DataFrame) -> list[str]:
     """Return each different reason of some skips; if it holds for several cases, with their number."""
-    same = _group_by_reason(skips)
-    cases = {reason: len({skip.case for skip in some}) for reason, some in same.items()}
-    return [same[r][0].reason if n == 1 else f"{r} ({n} cases)" for r, n in cases.items()]
+    counts = {
+        reason: (same["case"].nunique(), same["reason"].iloc[0])
+        for reason, same in _group_by_reason(skips).items()
+    }
+    return [first if n == 1 else f"{reason} ({n} cases)" for reason, (n, first) in counts.items()]
 
 
 def list_cases_not_loaded(report: Report) -> list[tuple[str, str]]:
     """Return (cases that did not load, reason), grouped by reason, and the number of steps of each sequence."""
     cases = []
     for name, some in report.left_out.items():
-        if name:
-            cases.append((f"{format_count(len(some), 'step')} of {name}", some["reason"].iloc[0]))
-            continue
-        for reason, same in _group_by_reason(some).items():
-            more = f" and {format_count(len(same) - 1, 'more case')}" if len(same) > 1 else ""
-            cases.append((same[0].case + more, reason if more else same[0].reason))
+        for reason, same in ({some["reason"].iloc[0]: some} if name else _group_by_reason(some)).items():
+            first, more = same.iloc[0], len(same) - 1
+            if name:
+                cases.append((f"{format_count(len(same), 'step')} of {name}", reason))
+            elif more:
+                cases.append((f"{first['case']} and {format_count(more, 'more case')}", reason))
+            else:
+                cases.append((first["case"], first["reason"]))
     return cases
 
 
@@ -438,50 +400,38 @@ def recommend(report: Contents) -> tuple[Statement, ...]:
         stopped = report.is_stopped and len(report.runs)
         return (Statement("Stopped: no problem was measured with every solver."),) if stopped else ()
     if report.has_passes_only:
-        return (
-            Statement(f"Stopped: the tables have the finished passes of {report.frame['solver'].iloc[0]}."),
-        )
-    single = report.frame["step"] < 0
+        solver = report.frame["solver"].iloc[0]
+        return (Statement(f"Stopped: the tables have the finished passes of {solver}."),)
+    single, sweeps = report.frame["step"] < 0, _recommend_sweeps(report)
+    if sweeps and (report.frame["mode"] == "budget").all():
+        return sweeps
     parts = [some for some in (report.frame[single], report.frame[~single]) if len(some)]
-    sweeps = _recommend_sweeps(report)
-    if (report.frame["mode"] == "budget").all():
-        return sweeps or tuple(_recommend_for(report, some) for some in parts)
     return (*(_recommend_for(report, some) for some in parts), *sweeps)
 
 
 def _recommend_sweeps(report: Contents) -> tuple[Statement, ...]:
     """State for each sequence the smallest number of sweeps that keeps every velocity error below the limit."""
-    table, statements = tabulate_sweeps(report), []
+    table, statements = tables.tabulate_sweeps(report), []
     limit = f"{1e3 * MAX_SWEEP_ERROR:g} mm/s"
     for name, own in table.groupby("sequence", sort=False) if len(table) else ():
-        steps, counts = own["steps"].max(), {}
-        for start in ("carried", "cold"):
-            errors = own.get(f"velocity error, {start} [m/s]")
-            good = (
-                own[(errors <= MAX_SWEEP_ERROR) & (own["steps"] == steps)]
-                if errors is not None
-                else own.iloc[:0]
-            )
-            good = (
-                good[good["solver"].isin(PLAIN_SWEEPS)] if good["solver"].isin(PLAIN_SWEEPS).any() else good
-            )
-            counts[start] = good.sort_values("sweeps", kind="stable").iloc[:1].to_dict("records")
-        if counts["carried"]:
-            (best,) = counts["carried"]
-            sweeps, error = format_count(best["sweeps"], "sweep"), best["velocity error, carried [m/s]"]
-            cold = [f"cold: {x['sweeps']} of {x['solver']}" for x in counts["cold"]] or ["cold: not reached"]
+        columns = [c for start in ("carried", "cold") if (c := f"velocity error, {start} [m/s]") in own]
+        smallest = {}
+        for column in columns:
+            good = own[(own[column] <= MAX_SWEEP_ERROR) & (own["steps"] == own["steps"].max())]
+            plain = good[good["solver"].isin(PLAIN_SWEEPS)]
+            smallest[column] = (plain if len(plain) else good).nsmallest(1, "sweeps").to_dict("records")
+        if "carried" in columns[0] and smallest[columns[0]]:
+            best, *cold = (x for column in columns for x in smallest[column])
+            cold = [f"cold: {x['sweeps']} of {x['solver']}" for x in cold] or ["cold: not reached"]
             text = (
-                f"{name}: {sweeps} of {best['solver']} with warm starts keep every velocity error below {limit} "
-                f"({format_residual(error)} m/s; {cold[0]})"
+                f"{name}: {format_count(best['sweeps'], 'sweep')} of {best['solver']} with warm starts keep every "
+                f"velocity error below {limit} ({format_residual(best[columns[0]])} m/s; {cold[0]})"
             )
         else:
-            column = next(
-                c for c in ("velocity error, carried [m/s]", "velocity error, cold [m/s]") if c in own
-            )
-            best = own.loc[own[column].idxmin()].to_dict()
+            best = own.loc[own[columns[0]].idxmin()].to_dict()
             text = (
                 f"{name}: no measured number of sweeps keeps every velocity error below {limit}; the smallest is "
-                f"{format_residual(best[column])} m/s, after {best['sweeps']} sweeps of {best['solver']}"
+                f"{format_residual(best[columns[0]])} m/s, after {best['sweeps']} sweeps of {best['solver']}"
             )
         statements.append(Statement(f"{text}{_describe_own_sweeps(report, str(name))}."))
     return tuple(statements)
@@ -490,59 +440,66 @@ def _recommend_sweeps(report: Contents) -> tuple[Statement, ...]:
 def _describe_own_sweeps(report: Contents, sequence: str) -> str:
     """Return the largest velocity error of the engine's own answers to a sequence, if it was recorded."""
     sources = report.cases.loc[report.cases["sequence"] == sequence, "source"]
-    for engine in report.engines:
-        files = [Path(source).name for source in sources if engine.contains(source)]
-        lines = engine.lines[engine.lines["file"].isin(files)]
-        error, counts = lines["velocity"].max(), lines["iterations"].dropna()
-        if len(lines) and math.isfinite(error):
-            own = f" {counts.max():.0f} iterations" if len(counts) else " answers"
-            return f"; the engine's own{own} ({engine.solver}): {format_residual(error)} m/s"
-    return ""
+    answers = report.engines.reindex([str(Path(s)) for s in sources]).dropna(subset="velocity")
+    if not len(answers):
+        return ""
+    counts = answers["iterations"].dropna()
+    own = f" {counts.max():.0f} iterations" if len(counts) else " answers"
+    error = format_residual(answers["velocity"].max())
+    return f"; the engine's own{own} ({tables.get_engine_name(answers)}): {error} m/s"
 
 
 def _recommend_for(report: Contents, frame: pd.DataFrame) -> Statement:
-    """Recommend the first solver of the ranking on some cases, and name ties, misses, engine and plug-ins."""
-    ranking = rank_solvers(frame, report.tolerance)
-    cases = list(frame["case"].unique())
+    """Recommend the first solver of the ranking on some cases, and name misses, ties, plug-ins and the engine."""
+    ranking, cases = rank_solvers(frame, report.tolerance), list(frame["case"].unique())
     named = _describe_cases(report, cases)
-    reached = f"down to {format_tolerance(report.tolerance)} of the error of the zero impulse"
-    engine = next(
-        (
-            rank
-            for e in report.engines
-            if (rank := e.rank(report.cases.loc[cases], report.tolerance)) is not None
-        ),
-        None,
-    )
+    reached = f"down to {format_tol(report.tolerance)} of the error of the zero impulse"
+    engine = tables.rank_engine(report, report.cases.loc[cases], report.tolerance)
     if not len(ranking) or not ranking["solved"].iloc[0]:
         stopped = "Stopped: no" if report.is_stopped else "No"
         return Statement(_add_engine(f"{stopped} solver brings {named} {reached}.", engine, None))
-    solver, first = str(ranking.index[0]), ranking.iloc[0]
-    runs = select_ranked_runs(frame)
+    solver, first, runs = str(ranking.index[0]), ranking.iloc[0], tables.select_ranked_runs(frame)
     own = runs[(runs["solver"] == solver) & (runs[["tol", "relative"]].max(axis=1) <= report.tolerance)]
     missed, unreached = _list_unsolved_cases(report, runs, cases, solver)
-    solved = f"{first['solved']} of " if missed or unreached else ""
-    time = format_seconds(first["mean"]) + (" on average" if first["solved"] > 1 else "")
+    time = _describe_solved(first, named)
     if first["worst"] > 3.0 * first["mean"]:
         time += f" ({format_seconds(first['worst'])} at worst, {first['hardest']})"
     loosest = own[own["tol"] == own["tol"].max()]
-    use = f"Stopped: {solver} solves" if report.is_stopped else f"Use {solver}: it solves"
-    sentences = [f"{use} {solved}{named} in {time}, {_describe_start(frame, loosest)}, {reached}."]
-    if report.unfinished:
-        sentences.append(f"Not measured to the end: {_shorten_list(report.unfinished)}.")
-    ties = ranking.loc[ranking["tie"], "mean"].iloc[1:]
-    if len(ties):
-        names = _shorten_list([f"{name} ({format_seconds(t)})" for name, t in ties.items()])
-        sentences.append(f"As fast within the noise of the repetitions: {names}.")
+    use = f"Stopped: {solver}" if report.is_stopped else f"Use {solver}: it"
+    sentences = [f"{use} {time}, {_describe_start(frame, loosest)}, {reached}."]
     if missed:
-        sentences.append(f"It misses {_shorten_list(missed)}.")
+        sentences.append(f"Missed: {_shorten_list(missed)}.")
     if unreached:
         steps = format_count(unreached, "step")
         sentences.append(f"Not reached within the time of a pass (--sequence-time-limit): {steps}.")
-    sentences += _describe_plug_ins(ranking, solver)
+    if report.unfinished:
+        sentences.append(f"Not measured to the end: {_shorten_list(report.unfinished)}.")
+    ties = [
+        f"{name} ({format_seconds(t)})" for name, t in ranking.loc[ranking["tie"], "mean"].iloc[1:].items()
+    ]
+    if ties:
+        sentences.append(f"As fast within the noise of the repetitions: {_shorten_list(ties)}.")
+    plug_ins = [
+        f"{name}: place {row['place']} of {len(ranking)}, {_describe_solved(row, format_count(row['cases'], 'case'))}"
+        for name, row in ranking.iterrows()
+        if is_plug_in(str(name)) and name != solver
+    ]
+    if plug_ins:
+        sentences.append(f"Plug-in {_shorten_list(plug_ins, '; ')}.")
     call = SimpleNamespace(**loosest.loc[loosest["iterations"].idxmax()].to_dict())
     guessed = bool((report.cases.loc[cases, "guess"] != "").any())
     return Statement(_add_engine(" ".join(sentences), engine, first), format_call(call, guessed))
+
+
+def _describe_solved(result: Any, named: str) -> str:
+    """Return the number of missed cases of a ranked result, then the mean time of the solved ones."""
+    misses, solved = int(result["cases"] - result["solved"]), int(result["solved"])
+    time = format_seconds(result["mean"]) + (" on average" if solved > 1 else "")
+    if not misses:
+        return f"solves {named} in {time}"
+    if not solved:
+        return f"misses all of {named}" if misses > 1 else f"misses {named}"
+    return f"misses {misses} of {named} and solves the other{'s' if solved > 1 else ''} in {time}"
 
 
 def _describe_start(frame: pd.DataFrame, runs: pd.DataFrame) -> str:
@@ -567,25 +524,15 @@ def _list_unsolved_cases(
     own = runs[runs["solver"] == solver]
     is_run = (own["tol"] <= report.tolerance) | (own["relative"] > own["tol"])
     left = own[is_run].groupby("case", observed=True)["relative"].min().reindex(list(cases))
-    sequences = set(own["sequence"].astype(str)) - {""}
-    missed, unreached = [], 0
-    for case, x in left[~(left <= report.tolerance)].items():
-        if x != x and report.cases.loc[str(case), "sequence"] in sequences:
-            unreached += 1
-        else:
-            missed.append(f"{case} ({'not accepted' if x != x else f'residual {format_residual(x)}'})")
-    return missed, unreached
-
-
-def _describe_plug_ins(ranking: pd.DataFrame, first: str) -> list[str]:
-    """Return the sentence on place and time of plug-ins other than the recommended solver."""
+    left = left[~(left <= report.tolerance)]
+    is_lost = left.isna() & report.cases.loc[left.index, "sequence"].isin(
+        set(own["sequence"].astype(str)) - {""}
+    )
+    missed = left[~is_lost].items()
     texts = [
-        f"{name}: place {place} of {len(ranking)}, {row['solved']} of {row['cases']} solved"
-        + (f" in {format_seconds(row['mean'])}" if row["solved"] else "")
-        for place, (name, row) in enumerate(ranking.iterrows(), 1)
-        if is_plug_in(str(name)) and name != first
+        f"{case} ({'not accepted' if x != x else f'residual {format_residual(x)}'})" for case, x in missed
     ]
-    return [f"Plug-in {_shorten_list(texts, '; ')}."] if texts else []
+    return texts, int(is_lost.sum())
 
 
 def _shorten_list(texts: Sequence[str], separator: str = ", ") -> str:
@@ -596,13 +543,13 @@ def _shorten_list(texts: Sequence[str], separator: str = ", ") -> str:
 
 def _describe_cases(report: Contents, names: Sequence[str]) -> str:
     """Return words for cases: steps of sequences, built-in problems, or the structure that all of them have."""
-    infos, lost, n = report.cases.loc[list(names)], report.left_out, len(names)
+    infos, n = report.cases.loc[list(names)], len(names)
     sequences = [name for name in infos["sequence"].unique() if name]
+    lost = sum(len(report.left_out.get(name, ())) for name in sequences or [""])
+    left_out = f" ({lost} left out)" if lost else ""
     if sequences:
         of = sequences[0] if len(sequences) == 1 else f"your {format_count(len(sequences), 'sequence')}"
-        n_lost = sum(len(lost.get(name, ())) for name in sequences)
-        return f"the {format_count(n, 'step')} of {of}{_format_left_out_count(n_lost)}"
-    left_out = _format_left_out_count(len(lost.get("", ())))
+        return f"the {format_count(n, 'step')} of {of}{left_out}"
     if report.is_stopped:
         return f"the {format_count(n, 'problem')} measured so far{left_out}"
     is_file = infos["source"].astype(str).str.endswith(SUFFIXES)
@@ -617,16 +564,12 @@ def _add_engine(text: str, engine: Any, first: Any) -> str:
     """Add the engine's own solver to the sentence: at its beginning if it ranks first, else at its end."""
     if engine is None:
         return text
-    if not engine["solved"]:
-        return f"{text} The engine's own {engine['solver']} solves none of them to that tolerance."
-    missed = f" (misses {engine['cases'] - engine['solved']})" if engine["solved"] < engine["cases"] else ""
-    time = format_seconds(engine["mean"]) + (" on average" if engine["solved"] > 1 else "")
-    solves = f"solves {engine['solved']} of {engine['cases']}{missed} in {time}, {INSIDE}"
-    if first is None or (-engine["solved"], engine["mean"]) < (-first["solved"], first["mean"]):
-        return f"First is the engine's own {engine['solver']}: it {solves}. {text}"
-    return f"{text} The engine's own {engine['solver']} {solves}."
-
-
-def _format_left_out_count(lost: int) -> str:
-    """Return a remark in parentheses that `lost` cases are left out of a number; empty if none is left out."""
-    return f" ({lost} left out)" if lost else ""
+    own = f"the engine's own {engine['solver']}"
+    solves = f"{_describe_solved(engine, format_count(engine['cases'], 'case'))}, {INSIDE}"
+    if engine["solved"] and first is not None and tables.is_tie(first, engine):
+        return f"{text} As fast within the noise of the repetitions is {own}: it {solves}."
+    if engine["solved"] and (
+        first is None or (-engine["solved"], engine["mean"]) < (-first["solved"], first["mean"])
+    ):
+        return f"First is {own}: it {solves}. {text}"
+    return f"{text} T{own[1:]} {solves}."

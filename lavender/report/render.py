@@ -275,20 +275,22 @@ def render_page(
 
     Every text is escaped.
     """
-    from lavender.report.figures import assign_styles, draw_figures, list_solvers, number_styles
+    from lavender.report.figures import assign_styles, draw_figure, number_styles
 
     shown = [section for section in sections if section.is_shown]
-    every = [f for section in shown for f in section.figures if f.curves]
-    every = [first_figure, *every] if first_figure is not None else every
-    styles = (assign_styles if folded else number_styles)(list_solvers(every))
-    drawn = dict(zip((id(f) for f in every), draw_figures(every, styles, folder), strict=True))
+    first = [] if first_figure is None else [first_figure]
+    every = [*first, *(f for section in shown for f in section.figures if f.curves)]
+    solvers = list(dict.fromkeys(curve.solver for figure in every for curve in figure.curves))
+    styles = (assign_styles if folded else number_styles)(solvers)
+    drawn = [draw_figure(figure, styles, folder) for figure in first]
     parts = [
-        (s, list(map(render_table, s.frames)), [drawn[id(f)] for f in s.figures if f.curves]) for s in shown
+        (s, map(render_table, s.frames), [draw_figure(f, styles, folder) for f in s.figures if f.curves])
+        for s in shown
     ]
     return str(
         _get_template().render(
             title=title, statements=statements, warnings=warnings, parts=parts, folded=folded,
-            first=None if first_figure is None else drawn[id(first_figure)],
+            first="".join(drawn),
         )
     )  # fmt: skip
 
@@ -349,7 +351,7 @@ def write_files(
 ) -> Path:
     """Write each entry of `files` to its path in a folder: texts as they are, frames and data by the path's suffix.
 
-    A frame becomes .csv, .tex or .parquet, other data .json. A file is replaced only when the new one is complete.
+    A frame becomes .csv or .tex, other data .json. A file is replaced only when the new one is complete.
 
     Parameters
     ----------
@@ -367,7 +369,7 @@ def write_files(
     InputError
         The folder cannot be written.
     """
-    from lavender.io.stored import make_folder, write_atomically, write_text
+    from lavender.io.stored import make_folder, write_text
 
     folder = make_folder(folder)
     for name, content in files.items():
@@ -378,8 +380,6 @@ def write_files(
             write_text(path, content.to_csv(index=False))
         elif path.suffix == ".tex":
             write_text(path, content.to_latex(index=False, escape=True, float_format="%.3g"))
-        elif path.suffix == ".parquet":
-            write_atomically(path, functools.partial(content.to_parquet, index=False))
         else:
             write_text(path, content if isinstance(content, str) else json.dumps(content, indent=1) + "\n")
     return folder

@@ -10,8 +10,8 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -22,7 +22,7 @@ from lavender import io
 from lavender.base.deadline import format_seconds
 from lavender.base.errors import LavenderError
 from lavender.io.stored import ENGINE, SUFFIXES, read_whole_file
-from lavender.judge.residuals import AT_FLOOR, UNCONVERGED, WRONG, at_floor, residual
+from lavender.judge.residuals import AT_FLOOR, DEFAULT_THRESHOLD, UNCONVERGED, WRONG, at_floor
 from lavender.judge.solution import CONFIRMED, CONTRADICTED, NOT_PROVEN
 from lavender.problem.derived import cached_property
 from lavender.report import machine
@@ -34,7 +34,7 @@ from lavender.report.store import (
     select_runs,
     select_skips,
 )
-from lavender.report.text import escape_unprintable, format_count, format_residual, format_tolerance
+from lavender.report.text import escape_unprintable, format_count, format_tolerance
 from lavender.solvers import registry
 
 Frame: TypeAlias = pd.DataFrame
@@ -53,14 +53,13 @@ MEAN_TIME_SHIFT = 1e-5
 # Times within noise count as equal. Noise is twice the difference of median and minimum of the repetitions, relative to
 # the minimum, and within these bounds.
 MIN_NOISE, MAX_NOISE = 0.05, 0.25
-ANSWER_NUMBERS = (
-    "relative",
-    "seconds",
-    "velocity",
-    "iterations",
-)  # Numbers of an engine's answer; nan if missing.
+# Entries of an engine's answer: texts, and numbers, which are nan if they are missing.
+ANSWER_TEXTS = ("file", "verdict", "solver", "worst")
+ANSWER_NUMBERS = ("rows", "relative", "seconds", "velocity", "iterations")
+LEFT_OUT = "left out"  # The verdict on a step that could not be recorded.
 # Methods with the sweeps of most engines: they are listed first, and recommended if one of them is enough.
 PLAIN_SWEEPS = ("sequential_impulses", "pgs", "block_gauss_seidel", "gauss_seidel", "sor", "jacobi")
+MAX_TIES = 3  # A cell names up to this many solvers.
 PREFERRED_SOLVER = "auto"  # Listed first among equally good solvers, as its users need not choose a method.
 STRUCTURE_ORDER = (
     *("separate", "chain", "mesh", "stack", "pile", "dense"),
@@ -114,16 +113,16 @@ def compute_mean(times: Any, axis: int = 0) -> Any:
 
 def get_times(frame: Frame, tolerance: float) -> Frame:
     """Return the time [s] of each solver (row) on each case (column) to a tolerance: nan if it did not reach it."""
-    return _get_times_of_runs(select_ranked_runs(frame), tolerance)
-
-
-def _get_times_of_runs(runs: Frame, tolerance: float) -> Frame:
-    """Compute `get_times` from ranked runs."""
-    reached = runs[(runs["tol"] <= tolerance) & (runs["relative"] <= tolerance)].assign(
-        time=lambda x: x["time"].fillna(0.0)
-    )
+    runs = select_ranked_runs(frame)
+    reached = runs[(runs["tol"] <= tolerance) & (runs["relative"] <= tolerance)].fillna({"time": 0.0})
     times = reached.groupby(["solver", "case"], observed=True)["time"].min().unstack()
     return times.reindex(index=sorted(map(str, runs["solver"].unique())), columns=list(runs["case"].unique()))
+
+
+def compute_noise(frame: Frame) -> pd.Series[float]:
+    """Return the noise of each solver's times, relative to its times, from the spread of its repetitions."""
+    ratio = (frame["time_median"] / frame["time"] - 1.0).groupby(frame["solver"].astype(str)).median()
+    return (2.0 * ratio).clip(MIN_NOISE, MAX_NOISE).fillna(MIN_NOISE)
 
 
 def rank_solvers(frame: Frame, tolerance: float) -> Frame:
@@ -134,27 +133,32 @@ def rank_solvers(frame: Frame, tolerance: float) -> Frame:
     Returns
     -------
     DataFrame
-        By solver: `solved`, `cases`, `mean` [s] and `worst` [s] of the solved cases, `hardest` (case), `tie`.
+        By solver: `solved`, `cases`, `mean` [s] and `worst` [s] of the solved cases, `hardest` (case), `tie`, `place`.
     """
-    runs = select_ranked_runs(frame)
-    times = _get_times_of_runs(runs, tolerance)
-    ratio = (runs["time_median"] / runs["time"] - 1.0).groupby(runs["solver"], observed=True).median()
+    times, runs = get_times(frame, tolerance), select_ranked_runs(frame)
     false = frame.loc[frame["claim_check"] == CONTRADICTED, "solver"].unique()
     ranking = pd.DataFrame({
         "solved": times.notna().sum(axis=1), "cases": times.shape[1], "worst": times.max(axis=1),
         "mean": compute_mean(times, axis=1),
         "hardest": times.fillna(-1.0).idxmax(axis=1) if len(times.columns) else "",
-        "false": times.index.isin(false), "noise": (2.0 * ratio).reindex(times.index).clip(MIN_NOISE, MAX_NOISE),
+        "false": times.index.isin(false), "noise": compute_noise(runs).reindex(times.index),
     }, index=times.index)  # fmt: skip
     ranking = ranking.sort_values(["false", "solved", "mean"], ascending=[True, False, True], kind="stable")
-    first = ranking.iloc[:1]
-    equal = [ranking[name] == value for name in ("false", "solved") for value in first[name]]
-    noise = ranking["noise"].fillna(MIN_NOISE)
-    near = ranking["mean"] <= first["mean"].max() * (1.0 + np.maximum(noise, noise.iloc[:1].max()))
-    tie = np.logical_and.reduce([*equal, near, ranking["solved"] > 0]) if len(ranking) else []
-    preferred = ranking.index == PREFERRED_SOLVER
-    ranking = ranking.assign(tie=tie, later=~(preferred & tie))
-    return ranking.sort_values(["tie", "later"], ascending=[False, True], kind="stable").drop(columns="later")
+    tie = [
+        is_tie(ranking.iloc[0], row) and not row["false"] > ranking["false"].iloc[0]
+        for _, row in ranking.iterrows()
+    ]
+    ranking["tie"] = np.array(tie, bool)
+    ranking["place"] = np.where(tie, 1, np.arange(1, len(ranking) + 1))
+    later = ~(ranking["tie"] & (ranking.index == PREFERRED_SOLVER))
+    return ranking.assign(later=later).sort_values(["place", "later"], kind="stable").drop(columns="later")
+
+
+def is_tie(first: Any, other: Any) -> bool:
+    """Return whether two ranked results solve the same number of cases, in mean times that differ within noise."""
+    noise = 1.0 + max(first["noise"], other["noise"])
+    is_near = first["mean"] / noise <= other["mean"] <= first["mean"] * noise
+    return bool(is_near and first["solved"] == other["solved"] > 0)
 
 
 def is_plug_in(solver: str) -> bool:
@@ -171,9 +175,9 @@ def choose_time_budgets(times: Frame) -> tuple[float, ...]:
     return tuple(10.0**k for k in (middle - 1, middle, middle + 1))
 
 
-def count_solved(solved: int, cases: int) -> str:
-    """Return the number of solved cases of all cases as " (7/8)"; empty if all are solved."""
-    return "" if solved == cases else f" ({solved}/{cases})"
+def put_preferred_first(names: Iterable[Any]) -> list[str]:
+    """Return equally good solvers in their order, with `PREFERRED_SOLVER` first."""
+    return sorted(map(str, names), key=lambda name: name != PREFERRED_SOLVER)
 
 
 def compute_quantiles(groups: Any, q: float | list[float]) -> Any:
@@ -184,88 +188,45 @@ def compute_quantiles(groups: Any, q: float | list[float]) -> Any:
 # -- answers of engines ------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class EngineAnswers:
-    """Answers of an engine to one folder of recorded steps.
-
-    Parameters
-    ----------
-    folder : str
-        Path of the folder, as in the records.
-    left_out : int
-        Number of steps that could not be recorded.
-    lines : DataFrame
-        One row for each answer: file, rows, seconds [s], relative, velocity [m/s], iterations and worst (nan and "" if
-        they were not recorded), verdict and solver.
-    """
-
-    folder: str
-    left_out: int
-    lines: pd.DataFrame
-
-    @property
-    def solver(self) -> str:
-        """Name of the engine's solver, the most frequent one."""
-        return str(self.lines["solver"].mode()[0]).replace("NEWTON", "Newton")
-
-    @property
-    def above_floor(self) -> int:
-        """Number of answers above the round-off floor."""
-        return int((self.lines["verdict"] != AT_FLOOR).sum())
-
-    @property
-    def unconverged(self) -> int:
-        """Number of answers with an error above the recording's threshold that rounding does not explain."""
-        return int(self.lines["verdict"].isin([UNCONVERGED, WRONG]).sum())
-
-    def contains(self, source: str) -> bool:
-        """Return whether the source of a case is a file of the engine's folder."""
-        return str(Path(source).parent) == self.folder
-
-    def rank(self, cases: Frame, tolerance: float) -> dict[str, Any] | None:
-        """Return the engine's result on cases as solvers are ranked; None if it did not answer every case."""
-        timed = (
-            self.lines[self.lines["seconds"] >= 0.0].drop_duplicates("file", keep="last").set_index("file")
-        )
-        answers = timed.reindex([Path(s).name for s in cases["source"] if self.contains(s)])
-        if not len(cases) or answers["seconds"].isna().any() or len(answers) < len(cases):
-            return None
-        is_solved = answers["relative"] <= tolerance
-        mean = float(compute_mean(answers["seconds"][is_solved]))
-        return {"solver": self.solver, "solved": int(is_solved.sum()), "cases": len(cases), "mean": mean}
-
-
-def read_engine_answers(sources: Sequence[str], lines: Frame) -> list[EngineAnswers]:
+def read_engine_answers(sources: Sequence[str], lines: Frame) -> Frame:
     """Read the engine's answers in the folders among `sources`, and in the folders of the cases of `lines`.
 
-    Each line of `engine.jsonl` is one answer; if it has no residual, the impulse in the file of the step is judged. A
-    folder without such a file has the answers that are stored with the steps of sequences.
+    The impulse in the file of a step is judged; without one, the residual in its line of `engine.jsonl` counts. A
+    folder without such lines has the answers that are stored with the steps of sequences.
+
+    Returns
+    -------
+    DataFrame
+        A row for each answer, by the path of its file: folder, file, rows, seconds [s], relative, velocity [m/s],
+        iterations, worst, verdict and solver; numbers that were not recorded are nan. Steps that could not be recorded
+        have the verdict "left out".
     """
     cases = select_cases(lines)
     files = cases[cases["source"].astype(str).str.endswith(SUFFIXES)]
     stored = files[files["stored"].notna() & (files["sequence"] != "")]
-    parents = [Path(source).parent for source in files["source"].astype(str)]
-    engines = []
-    for folder in dict.fromkeys([*map(Path, sources), *parents]):
+    answers = []
+    for folder in dict.fromkeys([*map(Path, sources), *(Path(str(s)).parent for s in files["source"])]):
         own = [Path(s).name for s in stored["source"].astype(str) if Path(s).parent == folder]
-        answers = _read_lines(folder) or [{"file": name, "solver": "engine"} for name in own]
-        entries = [entry for answer in answers if (entry := _complete_answer(folder, answer)) is not None]
-        if entries:
-            left_out = sum("left_out" in answer for answer in answers)
-            engines.append(EngineAnswers(escape_unprintable(str(folder)), left_out, pd.DataFrame(entries)))
-    return engines
+        entries = _read_lines(folder) or [{"file": name, "solver": "engine"} for name in own]
+        answers += [row for entry in entries if (row := _complete_answer(folder, entry)) is not None]
+    return _make_answers(answers)
 
 
-def _read_lines(folder: Path) -> list[Any]:
+def _make_answers(rows: Sequence[Row] = ()) -> Frame:
+    """Return the DataFrame of an engine's answers."""
+    table = pd.DataFrame(rows, columns=["folder", *ANSWER_TEXTS, *ANSWER_NUMBERS])
+    return table.set_index(table["folder"] + "/" + table["file"])
+
+
+def _read_lines(folder: Path) -> list[Row]:
     """Return the last line for each file of a folder's `engine.jsonl`, without those that are not JSON.
 
     A C engine that runs again into the same folder replaces the files and appends further lines.
     """
-    answers = []
+    answers: list[Any] = []
     if (folder / ENGINE).is_file():
-        for line in (
-            read_whole_file(folder / ENGINE, "the engine's answers").decode(errors="replace").splitlines()
-        ):
+        text = read_whole_file(folder / ENGINE, "the engine's answers").decode(errors="replace")
+        for line in text.splitlines():
             with contextlib.suppress(ValueError, RecursionError):
                 answers.append(json.loads(line))
     answers = [answer for answer in answers if isinstance(answer, dict)]
@@ -273,26 +234,45 @@ def _read_lines(folder: Path) -> list[Any]:
 
 
 def _complete_answer(folder: Path, answer: Row) -> Row | None:
-    """Return an answer with the judge's numbers on its impulse; None if it has neither these nor a readable file."""
+    """Return an answer with the judge's numbers on its impulse; None without a residual or a readable impulse."""
+    from lavender.io.recorder import describe_answer
+
+    path, judged = folder / Path(str(answer.get("file"))).name, Row()
+    with contextlib.suppress(ValueError, KeyError, TypeError, LavenderError, OSError):
+        impulse = io.load_solution(path) if path.is_file() else None
+        if impulse is not None:
+            judged = describe_answer(
+                io.load(path), impulse, float(answer.get("threshold", DEFAULT_THRESHOLD))
+            )
     try:
-        if "left_out" in answer:
-            return None
-        if "relative" not in answer:
-            path = folder / Path(str(answer["file"])).name
-            problem, impulse = io.load(path), io.load_solution(path)
-            if impulse is None:
-                return None
-            judged = residual(problem, impulse)
-            answer = {"rows": problem.m, "relative": judged.relative, "velocity": judged.velocity,
-                      "verdict": judged.verdict, "worst": judged.worst_name, **answer}  # fmt: skip
-        texts = {name: str(answer.get(name, "")) for name in ("verdict", "solver", "file", "worst")}
-        numbers = {"rows": answer["rows"], **{name: answer.get(name) for name in ANSWER_NUMBERS}}
+        if "left_out" not in answer:
+            answer = answer | judged
+            answer["relative"], answer["rows"] = float(answer["relative"]), float(answer["rows"])
+        else:
+            answer = {"file": f"{answer.get('file', answer['left_out'])}", "verdict": LEFT_OUT}
+        numbers = {name: answer.get(name) for name in ANSWER_NUMBERS}
         numbers = {
             name: math.nan if x is None else float(x) for name, x in numbers.items()
         }  # JSON has no NaN.
-        return numbers | {name: escape_unprintable(text) for name, text in texts.items()}
-    except (ValueError, KeyError, TypeError, LavenderError, OSError):
+    except (ValueError, KeyError, TypeError):
         return None
+    texts = {"folder": str(folder), **{name: str(answer.get(name, "")) for name in ANSWER_TEXTS}}
+    return {name: escape_unprintable(text) for name, text in texts.items()} | numbers
+
+
+def rank_engine(report: Contents, cases: Frame, tolerance: float) -> Row | None:
+    """Return an engine's result on cases as solvers are ranked; None if it did not answer every case in a time."""
+    answers = report.engines.reindex([str(Path(source)) for source in cases["source"]])
+    if not len(cases) or not (answers["seconds"] >= 0.0).all():
+        return None
+    times = answers.loc[answers["relative"] <= tolerance, "seconds"]
+    return {"solver": get_engine_name(answers), "solved": len(times), "cases": len(cases),
+            "mean": float(compute_mean(times)), "worst": times.max(), "noise": MIN_NOISE}  # fmt: skip
+
+
+def get_engine_name(answers: Frame) -> str:
+    """Return the name of the solver that gave the largest number of an engine's answers."""
+    return str(answers["solver"].mode()[0]).replace("NEWTON", "Newton")
 
 
 # -- contents ----------------------------------------------------------------------------------------------
@@ -310,14 +290,14 @@ class Contents:
         Lines of an earlier run to compare with.
     times : s, optional
         Time budgets for which a solver is recommended; default: three decades about the fastest times.
-    engines : sequence of EngineAnswers
+    engines : DataFrame
         Answers of the engines that recorded the steps: `lavender.report.tables.read_engine_answers`.
     """
 
     lines: Frame
     earlier: Frame | None = None
     times: Sequence[float] = ()
-    engines: Sequence[EngineAnswers] = ()
+    engines: Frame = field(default_factory=_make_answers)
 
     @cached_property
     def runs(self) -> Frame:
@@ -459,61 +439,52 @@ def tabulate_fastest(report: Contents) -> Frame:
     rows = []
     for name, cases in report.structures.items():
         some = report.frame[report.frame["case"].isin(cases)]
-        row: dict[str, Any] = {"structure": name, "cases": len(cases)}
+        row: Row = {"structure": name, "cases": len(cases)}
         for tolerance in report.tolerances:
-            ranking = rank_solvers(some, tolerance)
-            best = ranking.iloc[0] if len(ranking) else None
-            target = f"to {format_tolerance(tolerance)}"
-            row[target], row[f"time {target} [s]"] = "none", math.nan
-            if best is not None and best["solved"]:
-                ties = [str(s) for s in ranking.index[ranking["tie"]]][1:3]
-                solved = count_solved(int(best["solved"]), len(cases))
-                row[target] = " ≈ ".join([f"{ranking.index[0]}{solved}", *ties])
-                row[f"time {target} [s]"] = best["mean"]
+            ranking, target = rank_solvers(some, tolerance), f"to {format_tolerance(tolerance)}"
+            ties, first = list(map(str, ranking.index[ranking["tie"]]))[:MAX_TIES], ranking.head(1)
+            row[target] = " ≈ ".join(ties) or "none"
+            if ties and (solved := first["solved"].iloc[0]) < len(cases):
+                row[target] = row[target].replace(ties[0], f"{ties[0]} ({solved}/{len(cases)})", 1)
+            row[f"time {target} [s]"] = first["mean"].iloc[0] if ties else math.nan
         rows.append(row)
     return pd.DataFrame(rows)
 
 
 def tabulate_times(report: Contents) -> Frame:
-    """Tabulate the mean time of each solver to each tolerance by law, and the number of cases that reach it."""
+    """Tabulate the mean time of each solver to each tolerance by law, and the number of cases that reach it.
+
+    Solvers are in the order of their ranking to the middle tolerance.
+    """
     tables = []
     for law, some in report.frame.groupby("law", observed=True):
-        table = pd.DataFrame()
+        order = rank_solvers(some, report.tolerance).index
+        parts: Row = {"law": law, "solver": order, "cases": some["case"].nunique()}
         for tolerance in report.tolerances:
-            ranking = rank_solvers(some, tolerance)
-            target = f"to {format_tolerance(tolerance)}"
-            part = ranking[["solved", "mean"]].set_axis([f"solved {target}", f"time {target} [s]"], axis=1)
-            table = pd.concat([table, part], axis=1)
-        table.insert(0, "cases", some["case"].nunique())
-        table.insert(0, "law", law)
-        middle = f"to {format_tolerance(report.tolerance)}"
-        order = [f"solved {middle}", f"time {middle} [s]"]
-        tables.append(table.sort_values(order, ascending=[False, True], kind="stable").rename_axis("solver"))
-    table = pd.concat(tables).reset_index() if tables else pd.DataFrame()
+            ranking, target = rank_solvers(some, tolerance).loc[order], f"to {format_tolerance(tolerance)}"
+            parts |= {
+                f"solved {target}": ranking["solved"].array,
+                f"time {target} [s]": ranking["mean"].array,
+            }
+        tables.append(pd.DataFrame(parts))
+    table = pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
     return table.drop(columns=[c for c in table if c.startswith("time")]) if report.is_campaign else table
 
 
 def tabulate_cases(report: Contents) -> Frame:
-    """Tabulate each case: size, fastest solver to the middle tolerance, and residual of its stored answer."""
-    times = get_times(report.frame, report.tolerance)
-    false = report.frame[report.frame["claim_check"] == CONTRADICTED]
-    for case, solver in zip(false["case"], false["solver"], strict=True):
-        times.loc[times.index == solver, times.columns == case] = math.nan
-    target, rows = f"fastest to {format_tolerance(report.tolerance)}", []
-    for name in times.columns:
-        case, own = report.cases.loc[name], times[name].dropna()
-        stored = (
-            ""
-            if math.isnan(case["stored"])
-            else f"{format_residual(case['stored'])} {case['stored_verdict']}"
-        )
-        rows.append({
-            "case": name, "law": case["law"], "rows": case["rows"], "contacts": case["contacts"],
-            "islands": case["islands"], "structure": case["structure"], target: own.idxmin() if len(own) else "none",
-            "time [s]": own.min() if len(own) else math.nan, "stored answer [-]": stored,
-        })  # fmt: skip
-    table = pd.DataFrame(rows)
-    return table if any(row["stored answer [-]"] for row in rows) else table.iloc[:, :-1]
+    """Tabulate each case: size, fastest solvers to the middle tolerance, and residual of its stored answer."""
+    false = report.frame["claim_check"] == CONTRADICTED
+    times = get_times(report.frame[~false], report.tolerance)
+    noise, fastest = compute_noise(report.frame).reindex(times.index), times.min()
+    near = times.div(1.0 + np.maximum(noise, MIN_NOISE), axis=0) <= fastest
+    table = report.cases.loc[times.columns, ["case", "law", "rows", "contacts", "islands", "structure"]]
+    table[f"fastest to {format_tolerance(report.tolerance)}"] = [
+        " ≈ ".join(put_preferred_first(times[case][near[case]].sort_values().index)[:MAX_TIES]) or "none"
+        for case in times.columns
+    ]
+    return table.assign(**{"time [s]": fastest, "stored answer [-]": report.cases["stored"]}).dropna(
+        axis=1, how="all"
+    )
 
 
 def tabulate_runs(report: Contents) -> Frame:
@@ -626,9 +597,8 @@ def tabulate_in_time(report: Contents) -> Frame:
             groups = left.stack().groupby("solver", observed=True)
             score = compute_quantiles(groups, SERVED_QUANTILE).sort_values(kind="stable")
             score = score[(left <= SERVED_RESIDUAL).mean(axis=1).reindex(score.index) >= SERVED_QUANTILE]
-            near = [str(s) for s in score.index[score <= RESIDUAL_NOISE_FACTOR * score.min()]]
-            near.sort(key=lambda s: s != PREFERRED_SOLVER)
-            row[f"in {format_seconds(t)}"] = " ≈ ".join(near[:3]) or "none"
+            near = put_preferred_first(score.index[score <= RESIDUAL_NOISE_FACTOR * score.min()])
+            row[f"in {format_seconds(t)}"] = " ≈ ".join(near[:MAX_TIES]) or "none"
             row[f"residual in {format_seconds(t)} [-]"] = score[near[0]] if near else math.nan
         rows.append(row)
     return pd.DataFrame(rows)
@@ -690,23 +660,28 @@ def tabulate_sweeps(report: Contents) -> Frame:
 def tabulate_engines(report: Contents) -> Frame:
     """Tabulate engines' own answers, and the fastest solver here on the same cases, to the middle tolerance."""
     target, rows = f"to {format_tolerance(report.tolerance)}", []
-    for e in report.engines:
-        cases = report.cases[[e.contains(source) for source in report.cases["source"]]]
-        ranking = rank_solvers(report.frame[report.frame["case"].isin(list(cases.index))], report.tolerance)
-        engine = e.rank(cases, report.tolerance)
-        first = ranking.iloc[0] if len(ranking) and ranking["solved"].iloc[0] else None
-        relative = e.lines["relative"]
-        worst = e.lines.sort_values("velocity", na_position="first").iloc[-1]
+    folders = report.cases["source"].astype(str).map(lambda source: str(Path(source).parent))
+    for folder, every in report.engines.groupby("folder", sort=False):
+        own, cases = every[every["verdict"] != LEFT_OUT], report.cases[folders == folder]
+        if not len(own):
+            continue
+        ranking = rank_solvers(report.frame[report.frame["case"].isin(cases.index)], report.tolerance)
+        first = {"solver": "none"} | next(
+            iter(ranking[ranking["solved"] > 0].reset_index().to_dict("records")), {}
+        )
+        engine = rank_engine(report, cases, report.tolerance) or {"solver": get_engine_name(own)}
+        shown = [x["solver"] + (f" ({x['solved']}/{x['cases']})" if x.get("solved") != x.get("cases") else "")
+                 for x in (engine, first)]  # fmt: skip
+        worst = own.sort_values("velocity", na_position="first").iloc[-1]
         rows.append({
-            "recorded": Path(e.folder).name, "steps": len(e.lines), "not recorded": e.left_out,
-            "rows": e.lines["rows"].median(),
-            "engine's own": f"{e.solver}{'' if engine is None else count_solved(engine['solved'], len(cases))}",
-            f"own {target} [s]": math.nan if engine is None else engine["mean"],
-            "residual, median [-]": relative.median(), "worst [-]": relative.max(),
-            "above floor": e.above_floor, "stopped early": e.unconverged,
+            "recorded": Path(folder).name, "steps": len(own), "not recorded": len(every) - len(own),
+            "rows": own["rows"].median(), "engine's own": shown[0], f"own {target} [s]": engine.get("mean", math.nan),
+            "residual, median [-]": own["relative"].median(), "worst [-]": own["relative"].max(),
+            "above floor": int((own["verdict"] != AT_FLOOR).sum()),
+            "stopped early": int(own["verdict"].isin([UNCONVERGED, WRONG]).sum()),
             "velocity error [m/s]": worst["velocity"], "worst row": worst["worst"],
-            "first here": "none" if first is None else f"{ranking.index[0]}{count_solved(first['solved'], len(cases))}",
-            f"first {target} [s]": math.nan if first is None else first["mean"],
+            "first here": ("≈ " if "mean" in engine and "mean" in first and is_tie(engine, first) else "") + shown[1],
+            f"first {target} [s]": first.get("mean", math.nan),
         })  # fmt: skip
     return pd.DataFrame(rows)
 
@@ -744,8 +719,3 @@ def tabulate_idle(report: Contents) -> Frame:
     idle = idle.drop_duplicates("case", keep="last")
     columns = {"velocity": "velocity error [m/s]", "energy": "energy [√J]"}
     return idle[["case", "rows", "solver", "velocity", "energy"]].rename(columns=columns)
-
-
-def tabulate_skips(report: Contents) -> Frame:
-    """Tabulate pairs of case and solver that did not run, or not to the end, with the reason."""
-    return report.skips[["case", "solver", "reason"]]

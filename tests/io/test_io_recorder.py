@@ -158,8 +158,8 @@ def test_recorder_writes_json_without_nan(tmp_path):
     lines = (tmp_path / "all" / "engine.jsonl").read_text().splitlines()
     entries = [json.loads(line, parse_constant=reject) for line in lines]
     assert len(entries) == 2 and all(entry["seconds"] is None for entry in entries)
-    (answers,) = read_engine_answers([str(tmp_path / "all")], lv.report.run([], ["pgs"]))
-    assert answers.lines["seconds"].isna().all() and len(answers.lines) == 2
+    answers = read_engine_answers([str(tmp_path / "all")], lv.report.run([], ["pgs"]))
+    assert answers["seconds"].isna().all() and len(answers) == 2
 
 
 def test_recorder_with_wrong_arguments_or_folders_raises(tmp_path):

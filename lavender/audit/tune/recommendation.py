@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -112,11 +112,7 @@ class Tuning:
         ]
         return min(
             self._list_ties(good),
-            key=lambda m: (
-                max(float(m.error.max()), threshold),
-                -m.setting.iterations,
-                m.mean_step_time,
-            ),
+            key=lambda m: (max(float(m.error.max()), threshold), -m.setting.iterations, m.mean_step_time),
             default=None,
         )
 
@@ -332,7 +328,7 @@ class Tuning:
 
         def curve(name: str, settings: list[Measured], **more: Any) -> Curve:
             places = [(m.mean_step_time, m.worst_error) for m in settings]
-            return replace(Curve.from_points(name, name, places), **more)
+            return Curve(name, name, [x for x, _ in places], [y for _, y in places], **more)
 
         solvers = dict.fromkeys(m.solver for m in self.measured)
         by = {s: [m for m in self._same_problem if m.solver == s] for s in solvers}
