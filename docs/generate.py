@@ -256,7 +256,7 @@ def _times(ratio):
 
 def standing(report, solver):
     """Where a solver is the fastest, and where it does not arrive, in this build's measurements."""
-    times = {tolerance: tables.get_times(report.frame, tolerance) for tolerance in TOLERANCES}
+    times = {tolerance: report.get_times(tolerance) for tolerance in TOLERANCES}
     best_residuals = tables.tabulate_runs(report).set_index(["solver", "case"])["smallest residual [-]"]
     rows, best = [], {tolerance: [] for tolerance in TOLERANCES}
     for case in times[TOLERANCES[0]]:

@@ -76,29 +76,14 @@ AUDIT_BUSY_CONSEQUENCE = (
 
 
 def audit(
-    model: Any,
-    *,
-    policy: Callable[[Any], Any] | None = None,
-    worlds: int | None = None,
-    steps: int = 200,
-    engine: str = "mujoco",
-    control: Control = "random",
-    seed: int = 0,
-    spread: float | None = None,
-    states: Any = None,
-    against: Any = None,
-    keep: int | None = None,
-    keep_contact_states: bool = False,
-    precision: str | None = None,
-    threshold: float = DEFAULT_THRESHOLD,
-    max_velocity_error: float | None = None,
-    njmax: int | None = None,
-    workers: int = -1,
-    backend: str = "loky",
-    folder: str | os.PathLike[str] | None = None,
-    reuse: bool = True,
+    model: Any, *, policy: Callable[[Any], Any] | None = None, worlds: int | None = None, steps: int = 200,
+    engine: str = "mujoco", control: Control = "random", seed: int = 0, spread: float | None = None,
+    states: Any = None, against: Any = None, keep: int | None = None, keep_contact_states: bool = False,
+    precision: str | None = None, threshold: float = DEFAULT_THRESHOLD, max_velocity_error: float | None = None,
+    njmax: int | None = None, workers: int = -1, backend: str = "loky",
+    folder: str | os.PathLike[str] | None = None, reuse: bool = True,
     watch: Callable[[Event], None] | None = None,
-) -> Audit:
+) -> Audit:  # fmt: skip
     """Simulate worlds of a model and judge the engine's answer to every step.
 
     Parameters
@@ -216,17 +201,10 @@ def audit(
 
 
 def audit_steps(
-    steps: Iterable[EngineStep],
-    *,
-    engine: str = "engine",
-    name: str = "steps",
-    threshold: float = DEFAULT_THRESHOLD,
-    max_velocity_error: float | None = None,
-    keep: int | None = None,
-    total: int = 0,
-    seed: int = 0,
-    watch: Callable[[Event], None] | None = None,
-) -> Audit:
+    steps: Iterable[EngineStep], *, engine: str = "engine", name: str = "steps",
+    threshold: float = DEFAULT_THRESHOLD, max_velocity_error: float | None = None, keep: int | None = None,
+    total: int = 0, seed: int = 0, watch: Callable[[Event], None] | None = None,
+) -> Audit:  # fmt: skip
     """Judge the steps of an engine and compare its claims with the verdicts.
 
     Parameters
@@ -266,18 +244,10 @@ def audit_steps(
 
 
 def _audit_model(
-    one: Runs,
-    judging: Judging,
-    worlds: int | None,
-    spread: float | None,
-    keep_contact_states: bool,
-    workers: int,
-    backend: str,
-    folder: Any,
-    reuse: bool,
-    watch: Callable[[Event], None] | None,
+    one: Runs, judging: Judging, worlds: int | None, spread: float | None, keep_contact_states: bool,
+    workers: int, backend: str, folder: Any, reuse: bool, watch: Callable[[Event], None] | None,
     common: dict[str, Any],
-) -> Audit:
+) -> Audit:  # fmt: skip
     """Audit a model of MuJoCo: time its first world, choose the spread, and judge all worlds in worker processes."""
     processes = count_processes(workers)
     loads: list[float | None] = []
@@ -332,14 +302,9 @@ def _audit_model(
 
 
 def _collect(
-    result: Audit,
-    pieces: Iterable[Piece],
-    judging: Judging,
-    watch: Callable[[Event], None] | None,
-    *,
-    loads: list[float | None] | None = None,
-    folder: Any = None,
-) -> Audit:
+    result: Audit, pieces: Iterable[Piece], judging: Judging, watch: Callable[[Event], None] | None, *,
+    loads: list[float | None] | None = None, folder: Any = None,
+) -> Audit:  # fmt: skip
     """Add pieces to a result until their end or Ctrl-C, show the progress, and write complete worlds to `folder`."""
     saved = monotonic()
     if watch is not None:

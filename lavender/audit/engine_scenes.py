@@ -67,15 +67,9 @@ def step_scene(scene: Any, engine: str, *, steps: int = 50, **start: Any) -> Ite
 
 
 def start_scene(
-    scene: str | os.PathLike[str] | Callable[..., Any],
-    engine: str,
-    *,
-    worlds: int = 8,
-    dt: float = DEFAULT_TIME_STEP,
-    states: Any = None,
-    spread: float = 0.0,
-    seed: int = 0,
-) -> NewtonScene | GenesisScene:
+    scene: str | os.PathLike[str] | Callable[..., Any], engine: str, *, worlds: int = 8,
+    dt: float = DEFAULT_TIME_STEP, states: Any = None, spread: float = 0.0, seed: int = 0,
+) -> NewtonScene | GenesisScene:  # fmt: skip
     """Build a scene and set the start states of its worlds.
 
     Parameters

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lavender.audit.page import ResultPage
+from lavender.audit.page import ResultPage, StepSizes, describe_exceedance
 from lavender.audit.pieces import (
     AUDIT_VERDICTS,
     N_WORST_WORLDS,
@@ -24,7 +24,6 @@ from lavender.audit.pieces import (
     Worst,
 )
 from lavender.audit.simulated_worlds import Divergence, Runs
-from lavender.audit.step_sizes import StepSizes, describe_exceedance
 from lavender.base.arrays import FloatArray, check_choice
 from lavender.base.errors import InputError
 from lavender.io import read

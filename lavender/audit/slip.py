@@ -156,18 +156,17 @@ class SlipExplanation:
         }
 
     @property
-    def slips(self) -> list[ContactSlip]:
-        """Slip of each contact and its parts."""
-        speeds, parts = self.variants[0].speeds, self.parts
-        return [
-            ContactSlip(name, 1, float(speeds[i]), {cause: float(x[i]) for cause, x in parts.items()})
-            for i, name in enumerate(self.contacts)
-        ]
+    def slips(self) -> pd.DataFrame:
+        """Slip of each contact and its parts by cause [m/s], and the dominant cause."""
+        import pandas as pd
+
+        columns = {"contact": self.contacts, "points": 1, "speed": self.variants[0].speeds, **self.parts}
+        return _add_dominant_cause(pd.DataFrame(columns))
 
     @property
     def causes(self) -> tuple[str, ...]:
         """Dominant cause of each contact's slip: the largest part; "no slip" below 1e-6 m/s."""
-        return tuple(slip.cause for slip in self.slips)
+        return tuple(self.slips["cause"])
 
     @property
     def table(self) -> pd.DataFrame:
@@ -194,23 +193,22 @@ class SlipExplanation:
         if not self.contacts:
             return ["No contact was chosen."]
         i = int(np.argmax(self.variants[0].speeds))
-        slip = self.slips[i]
-        if slip.cause == "no slip":
+        slip = self.slips.iloc[i]
+        if slip["cause"] == "no slip":
             return [f"No chosen contact slides faster than {MIN_EXPLAINED_SLIP:g} m/s."]
-        part = format_size(slip.parts[slip.cause])
         lines = [
-            f"Fastest: {slip.contact} with {format_size(slip.speed)} m/s.",
-            f"Largest part: {slip.cause}, {part} m/s.",
+            f"Fastest: {slip['contact']} with {format_size(slip['speed'])} m/s.",
+            f"Largest part: {slip['cause']}, {format_size(slip['part'])} m/s.",
         ]
         use = None if self.friction_use is None else float(self.friction_use[i])
         has_force = use is None or not np.isnan(use)
         if self.speeds_before is not None:
             before, after = float(self.speeds_before[i]), float(self.variants[-1].speeds[i])
             lines.append(f"Before the step it slid with {format_size(before)} m/s.")
-            if slip.cause == CAUSES["coulomb"] and before >= MIN_EARLIER_FRACTION * after:
+            if slip["cause"] == CAUSES["coulomb"] and before >= MIN_EARLIER_FRACTION * after:
                 slows = "slows it" if after < before else "does not slow it"
                 lines.append(f"The cause is that it slid already; friction {slows}.")
-            elif slip.cause == CAUSES["coulomb"] and has_force:
+            elif slip["cause"] == CAUSES["coulomb"] and has_force:
                 lines.append("The load along the surface is above mu times the normal force.")
         if not has_force:
             lines.append(
@@ -254,14 +252,9 @@ class SlipExplanation:
 
 
 def explain_slip(
-    problem: Problem,
-    impulse: Any,
-    *,
-    contacts: Sequence[int] | Sequence[str] | str | None = None,
-    disk: Problem | None = None,
-    surface_velocity: Any = None,
-    tol: float = 1e-9,
-) -> SlipExplanation:
+    problem: Problem, impulse: Any, *, contacts: Sequence[int] | Sequence[str] | str | None = None,
+    disk: Problem | None = None, surface_velocity: Any = None, tol: float = 1e-9,
+) -> SlipExplanation:  # fmt: skip
     """Divide the slip of contacts after a step into parts by their causes.
 
     Parameters
@@ -426,50 +419,25 @@ def get_geoms(contact: str) -> str:
     return contact.partition(" (")[2].rstrip(")") or contact
 
 
-@dataclass(frozen=True)
-class ContactSlip:
-    """Slip of one contact, or the mean over its points and the states in which it occurred.
-
-    Parameters
-    ----------
-    contact : str
-        Name of the contact; for a mean, the names of both geoms.
-    count : int
-        Number of contact points, summed over all states.
-    speed : float, m/s
-    parts : dict
-        Cause -> part of the slip [m/s].
-    """
-
-    contact: str
-    count: int
-    speed: float
-    parts: dict[str, float]
-
-    @property
-    def cause(self) -> str:
-        """Dominant cause: the largest part; "no slip" below 1e-6 m/s."""
-        return max(self.parts, key=lambda c: self.parts[c]) if self.speed > MIN_EXPLAINED_SLIP else "no slip"
+def _add_dominant_cause(slips: pd.DataFrame) -> pd.DataFrame:
+    """Add the largest part of each contact's slip and its cause: `part` [m/s] and `cause`, "no slip" below 1e-6 m/s."""
+    parts, slides = slips[list(CAUSES.values())], slips["speed"] > MIN_EXPLAINED_SLIP
+    cause = parts.idxmax(axis=1) if len(slips) else slips["contact"]
+    return slips.assign(cause=cause.where(slides, "no slip"), part=parts.max(axis=1).where(slides, 0.0))
 
 
-def average_slip(explanations: Iterable[SlipExplanation]) -> list[ContactSlip]:
+def average_slip(explanations: Iterable[SlipExplanation]) -> pd.DataFrame:
     """Return the slip of each pair of geoms, averaged over its points in several states."""
-    groups: dict[str, list[ContactSlip]] = {}
-    for slip in (slip for explanation in explanations for slip in explanation.slips):
-        groups.setdefault(get_geoms(slip.contact), []).append(slip)
-    return [
-        ContactSlip(
-            geoms, len(slips), float(np.mean([slip.speed for slip in slips])),
-            {cause: float(np.mean([slip.parts[cause] for slip in slips])) for cause in CAUSES.values()},
-        )
-        for geoms, slips in groups.items()
-    ]  # fmt: skip
-
-
-def tabulate_slip(slips: Iterable[ContactSlip]) -> pd.DataFrame:
-    """Return a table of contacts, with speeds in m/s; a contact without slip has no part."""
     import pandas as pd
 
-    rows = [(s.contact, s.count, s.speed, s.parts.get(s.cause, 0.0), s.cause) for s in slips]
-    heads = ["contact", "points", "slip [m/s]", "largest part [m/s]", "cause of this part"]
-    return pd.DataFrame(rows, columns=heads)
+    slips = pd.concat([explanation.slips for explanation in explanations])
+    groups = slips.drop(columns=["cause", "part"]).groupby(slips["contact"].map(get_geoms), sort=False)
+    means = groups.mean(numeric_only=True).assign(points=groups["points"].sum())
+    return _add_dominant_cause(means.reset_index())
+
+
+def tabulate_slip(slips: pd.DataFrame) -> pd.DataFrame:
+    """Return a table of contacts, with speeds in m/s; a contact without slip has no part."""
+    heads = {"contact": "contact", "points": "points", "speed": "slip [m/s]", "part": "largest part [m/s]",
+             "cause": "cause of this part"}  # fmt: skip
+    return slips[list(heads)].rename(columns=heads)

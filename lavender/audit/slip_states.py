@@ -88,13 +88,9 @@ class SlipOfStates:
 
 
 def explain_slip_of_states(
-    model: Any,
-    states: Any = None,
-    *,
-    contacts: Sequence[str] | str | None = None,
-    steps: int = 1,
+    model: Any, states: Any = None, *, contacts: Sequence[str] | str | None = None, steps: int = 1,
     watch: Callable[[Event], None] | None = None,
-) -> SlipOfStates:
+) -> SlipOfStates:  # fmt: skip
     """Explain the slip of contacts of a MuJoCo model at given states.
 
     Parameters
@@ -210,7 +206,10 @@ def _simulate_remedies(
     if not speed > MIN_EXPLAINED_SLIP or (use is not None and np.isnan(use[i])):
         return  # No setting changes the slip of a contact without normal force.
     sliding = [
-        (a.speed, k) for k, e in enumerate(explanations) for a in average_slip([e]) if a.contact == pair
+        (speed, k)
+        for k, e in enumerate(explanations)
+        for contact, speed in average_slip([e])[["contact", "speed"]].itertuples(index=False)
+        if contact == pair
     ]
     chosen = [starts[k] for _, k in sorted(sliding, reverse=True)[:MAX_REMEDY_STATES]]
     settings = list(_change_settings(mj, model, pair))
@@ -235,7 +234,8 @@ def _simulate_remedies(
 
 def _find_fastest(explanation: SlipExplanation) -> tuple[float, str]:
     """Return the sliding speed of the fastest contact [m/s] and the names of its geoms."""
-    return max((slip.speed, get_geoms(slip.contact)) for slip in explanation.slips)
+    slips = explanation.slips
+    return max(zip(slips["speed"], slips["contact"].map(get_geoms), strict=True))
 
 
 def _compute_friction_use(mj: Any, model: Any, data: Any, name: str) -> float:

@@ -52,7 +52,6 @@ class Item:
     name: str
     source: str  # Path, or name in the suite.
     load: Callable[[], Problem]
-    reason: str = ""  # Property that the case tests.
     sequence: str = ""  # Name of the sequence that contains the case as a step; empty for a single case.
     step: int = -1  # Number of the step; -1 for a single case.
     in_memory: Problem | None = None  # The problem itself, if it was passed as an object.
@@ -116,78 +115,56 @@ def resolve_sources(sources: Source | Iterable[Source], sequences: bool | None =
     """
     if sequences is not None:
         check_bool("sequences", sequences)
-    items: list[Item] = []
-    visited: set[Path] = set()  # Folders that were searched: a link may lead back to one of them.
     sources = (
         [sources]
         if isinstance(sources, Source)
         else check_sequence("cases", sources, "files, folders, names or problems")
     )
-    if not sources:
-        items = [_make_item_of_case(case, case.name) for case in suite.default()]
-    for source in sources:
+    items = [] if sources else [_make_item_of_problem(case.problem, case.name) for case in suite.default()]
+    visited: set[Path] = set()  # Folders that were searched: a link may lead back to one of them.
+    for source in sources:  # Inner folders are added at the end.
         if isinstance(source, Problem):
-            name = source.name or f"problem {len(items)}"
-            items.append(Item(name, name, _make_loader(source), in_memory=source))
+            items.append(_make_item_of_problem(source, source.name or f"problem {len(items)}", source))
         elif isinstance(source, Item):
             items.append(source)
         elif isinstance(source, Case):
-            items.append(_make_item_of_case(source, source.name))
+            items.append(_make_item_of_problem(source.problem, source.name))
         elif not (isinstance(source, str) or hasattr(source, "__fspath__")):
             raise InputError(
                 f"case {source!r:.60} is a {type(source).__name__}; the path of a file, a name of the suite "
                 "or a Problem is needed"
             )
+        elif not is_path(source) and not sequences:
+            items += _list_items_of_set(str(source))
         elif sequences or (sequences is None and _holds_recorded_steps(Path(source))):
-            for _, group in groupby(list_steps_in_folder(source), key=lambda item: item.sequence):
-                steps = list(group)
-                items += _rename_duplicate_sequence(steps, items) if steps[0].sequence else steps
-            name, folder_name = items[-1].sequence, Path(source).resolve().name
-            missing = map(_make_item_of_file, _read_unrecorded_steps(Path(source)))
-            items += [
-                replace(item, name=f"{name or folder_name}, {item.name}", sequence=name) for item in missing
-            ]
-        elif Path(source).is_dir():
-            paths = _list_problem_files(Path(source))
-            visited.add(Path(source).resolve())
-            inner = [
-                p
-                for p in sorted(Path(source).iterdir())
-                if p.is_dir()
-                and p.resolve() not in visited
-                and os.access(p, os.R_OK)
-                and not _is_states_folder(p)
-                and _list_problem_files(p)
-            ]
+            items += _list_recorded_steps(Path(source), items)
+        elif (path := Path(source)).is_dir():
+            files, folders = _list_problem_files(path), sorted(p for p in path.iterdir() if p.is_dir())
+            visited.add(path.resolve())
+            folders = [p for p in folders if p.resolve() not in visited and os.access(p, os.R_OK)]
+            inner = [p for p in folders if not _is_states_folder(p) and _list_problem_files(p)]
             sources += inner
-            if not paths and not inner:
-                records = Path(source) / "records.jsonl"
+            if not files and not inner:
+                records = path / "records.jsonl"
                 shown = f": {records} shows its report again" if records.is_file() else ""
                 raise InputError(f"{source} holds no problem file ({', '.join(SUFFIXES)}){shown}")
-            items += [_make_item_of_file(path) for path in (*paths, *_read_unrecorded_steps(Path(source)))]
-        elif Path(source).exists() or Path(source) in _read_unrecorded_steps(Path(source).parent):
-            items.append(replace(_make_item_of_file(Path(source)), named=True))
-        elif is_path(source):
+            items += map(_make_item_of_file, (*files, *_read_unrecorded_steps(path)))
+        elif path.exists() or path in _read_unrecorded_steps(path.parent):
+            items.append(replace(_make_item_of_file(path), named=True))
+        else:
             raise InputError(
                 f"{source}: no such file; give problem files ({', '.join(SUFFIXES)}), folders or suite names"
-            )
-        else:
-            selected = [_make_item_of_name(name) for name in suite.get_case_names_of_set(str(source))]
-            items += (
-                _convert_to_sequence_steps(selected)
-                if str(source).removeprefix("@") == "sequences"
-                else selected
             )
     return _make_names_differ(items)
 
 
-def resolve_item(source: str | Problem, name: str, reason: str) -> Item:
+def resolve_item(source: str | Problem, name: str) -> Item:
     """Create the item of a source in a worker process; an invalid source raises an error when it is loaded."""
     try:
         (item,) = resolve_sources([source])
     except Exception as error:  # The file was removed, or reading its folder raises an error.
         item = Item(name, str(source), _raise_when_loaded(error))
-    return replace(item, name=name, reason=reason, sequence="", step=-1)
+    return replace(item, name=name, sequence="", step=-1)
 
 
 def make_sequence(problems: Iterable[Problem], name: str) -> list[Item]:
@@ -197,9 +174,8 @@ def make_sequence(problems: Iterable[Problem], name: str) -> list[Item]:
     items = []
     for i, problem in enumerate(check_sequence("problems", problems, "Problems")):
         check_problem(problem)
-        items.append(
-            Item(f"{name}[{i}]", name, _make_loader(problem), sequence=name, step=i, in_memory=problem)
-        )
+        item = _make_item_of_problem(problem, f"{name}[{i}]", problem)
+        items.append(replace(item, source=name, sequence=name, step=i))
     return items
 
 
@@ -212,63 +188,50 @@ def list_steps_in_folder(folder: str | Path) -> list[Item]:
     Raises
     ------
     InputError
-        `folder` is not a folder, or it holds fewer than two problem files.
+        `folder` is not a folder, it holds fewer than two problem files, or steps of several recordings: two files have
+        the same number, names have different prefixes, or the engine's list of steps does not contain a file.
     """
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(
             f"{folder} is not a folder; a sequence is a folder of problem files, one for each step"
         )
-    paths = _list_problem_files(folder)
+    paths, name = _list_problem_files(folder), folder.resolve().name
     if len(paths) < 2:
-        raise InputError(
-            f"{folder} holds {len(paths)} problem files ({', '.join(SUFFIXES)}); a sequence needs two"
-        )
-    _check_one_recording(folder, paths)
-    name = folder.resolve().name
+        n = f"{len(paths)} problem files ({', '.join(SUFFIXES)})"
+        raise InputError(f"{folder} holds {n}; a sequence needs two")
     lines = {str(line["file"]): line for line in _read_engine_records(folder)}
+    has_worlds = any("world" in line for line in lines.values())
+    # The files of a `Recorder` end with the number of the world, and its lines have the number of the step.
+    numbered = [m.groups() for p in paths if (m := re.fullmatch(r"(.*?)(\d+)", p.stem)) and not has_worlds]
+    series = [prefix for prefix, n in Counter(prefix for prefix, _ in numbered).items() if n > 1]
+    unlisted = [p.name for p in paths if lines and p.name not in lines]
+    reason = (
+        f"{unlisted[0]} is not listed in its {ENGINE}, or the recording was killed before that"
+        if unlisted
+        else ""
+    )
+    if len(numbered) > len({(prefix, int(number)) for prefix, number in numbered}):
+        reason = "two files have the same number"
+    elif len(series) > 1:
+        reason = f"files are named {series[0]}N and {series[1]}N"
+    if reason:
+        advice = "move each recording into a separate folder"
+        raise InputError(f"{folder} holds steps of more than one recording ({reason}): {advice}")
     n_worlds = len({line.get("world", 0) for line in lines.values()})
-    groups: dict[str, list[Path]] = {}
+    groups: dict[str, list[Item]] = {}
     for path in paths:
         line = lines.get(path.name, {})
         group = name if line.get("start") is None else f"{name}, state {line['start']}"
-        groups.setdefault(f"{group}, world {line.get('world', 0)}" if n_worlds > 1 else group, []).append(
-            path
-        )
+        group += f", world {line.get('world', 0)}" if n_worlds > 1 else ""
+        groups.setdefault(group, []).append(_make_item_of_file(path))
     return [
-        replace(_make_item_of_file(path), name=f"{group}[{i}]", sequence=group, step=i)
-        if len(members) > 1
-        else replace(_make_item_of_file(path), name=group)
-        for group, members in groups.items()
-        for i, path in enumerate(members)
+        replace(item, name=f"{group}[{i}]", sequence=group, step=i)
+        if len(items) > 1
+        else replace(item, name=group)
+        for group, items in groups.items()
+        for i, item in enumerate(items)
     ]
-
-
-def _check_one_recording(folder: Path, paths: list[Path]) -> None:
-    """Raise InputError if a folder holds steps of several recordings.
-
-    It does if two files have the same number, if file names have different prefixes, or if the list of steps that the
-    engine wrote to the folder does not contain a file.
-    """
-    lines = _read_engine_records(folder)
-    # The files of a `Recorder` end with the number of the world, and its lines have the number of the step.
-    numbered = [(m[1], int(m[2])) for p in paths if (m := re.fullmatch(r"(.*?)(\d+)", p.stem))]
-    numbered = [] if any("world" in line for line in lines) else numbered
-    series = [prefix for prefix, n in Counter(prefix for prefix, _ in numbered).items() if n > 1]
-    twice = len(numbered) > len(set(numbered))
-    listed = {str(line["file"]) for line in lines}
-    unlisted = [p.name for p in paths if listed and p.name not in listed]
-    if twice or len(series) > 1 or unlisted:
-        reason = (
-            f"{unlisted[0]} is not listed in its {ENGINE}, or the recording was killed before that"
-            if unlisted
-            else "two files have the same number"
-            if twice
-            else f"files are named {series[0]}N and {series[1]}N"
-        )
-        raise InputError(
-            f"{folder} holds steps of more than one recording ({reason}): move each recording into a separate folder"
-        )
 
 
 def _read_engine_records(folder: Path) -> list[dict[str, Any]]:
@@ -283,11 +246,8 @@ def _read_engine_records(folder: Path) -> list[dict[str, Any]]:
 
 def _read_unrecorded_steps(folder: Path) -> dict[Path, str]:
     """Return {file: reason} for steps that could not be recorded."""
-    steps = {
-        folder / Path(str(t["file"])).name: str(t["left_out"])
-        for t in _read_engine_records(folder)
-        if "left_out" in t
-    }
+    lost = [line for line in _read_engine_records(folder) if "left_out" in line]
+    steps = {folder / Path(str(line["file"])).name: str(line["left_out"]) for line in lost}
     return {path: reason for path, reason in steps.items() if not path.exists()}
 
 
@@ -336,47 +296,52 @@ def _holds_recorded_steps(folder: Path) -> bool:
         return False
 
 
-def _rename_duplicate_sequence(steps: list[Item], items: list[Item]) -> list[Item]:
-    """Rename a sequence if an earlier one has its name: prefix the parent folder's name, or append a number.
+def _list_recorded_steps(folder: Path, items: list[Item]) -> list[Item]:
+    """List the steps of a folder, in sequences with names that differ from the earlier `items`.
 
-    Figures are files named after sequences, so names must differ as file names, too.
+    A sequence whose name is taken gets the parent folder's name as prefix, or a number. Figures are files named after
+    sequences, so names must differ as file names, too.
     """
-    names = {make_file_name(item.sequence).lower() for item in items if item.sequence}
-    name, n = steps[0].sequence, 1
-    if make_file_name(name).lower() in names:
-        with_parent = f"{Path(steps[0].source).resolve().parent.parent.name}/{name}"
-        name = name if make_file_name(with_parent).lower() in names else with_parent
-    while make_file_name(unique := f"{name} #{n}" if n > 1 else name).lower() in names:
-        n += 1
-    return [replace(item, name=f"{unique}[{item.step}]", sequence=unique) for item in steps]
+    found: list[Item] = []
+    for name, group in groupby(list_steps_in_folder(folder), key=lambda item: item.sequence):
+        names = {make_file_name(item.sequence).lower() for item in (*items, *found) if item.sequence}
+        unique, n = name, 1
+        if name and make_file_name(name).lower() in names:
+            with_parent = f"{folder.resolve().parent.name}/{name}"
+            name = name if make_file_name(with_parent).lower() in names else with_parent
+            while make_file_name(unique := f"{name} #{n}" if n > 1 else name).lower() in names:
+                n += 1
+        found += [replace(s, name=f"{unique}[{s.step}]", sequence=unique) if unique else s for s in group]
+    missing, name = map(_make_item_of_file, _read_unrecorded_steps(folder)), found[-1].sequence
+    named = name or folder.resolve().name
+    return [*found, *(replace(item, name=f"{named}, {item.name}", sequence=name) for item in missing)]
 
 
-def _make_loader(problem: Problem) -> Callable[[], Problem]:
-    """Return a function that returns the problem."""
-    return lambda: problem
+def _make_item_of_problem(problem: Problem, name: str, in_memory: Problem | None = None) -> Item:
+    """Create the item of a problem."""
+    return Item(name, name, lambda: problem, in_memory=in_memory)
 
 
-def _make_item_of_case(case: Case, source: str) -> Item:
-    """Create the item of a case."""
-    return Item(case.name, source, _make_loader(case.problem), case.reason)
+def _list_items_of_set(name: str) -> list[Item]:
+    """List the items of a case or set of the suite; if a package is missing, loading an item raises the error.
 
-
-def _make_item_of_name(name: str) -> Item:
-    """Create the item of a name in the suite; if a package is missing, loading the item raises the error."""
-    try:
-        return _make_item_of_case(suite.case(name), name)
-    except SolverUnavailable as error:
-        return Item(name, name, _raise_when_loaded(error))
-
-
-def _convert_to_sequence_steps(items: list[Item]) -> list[Item]:
-    """Convert consecutive cases that differ only in `at` to the steps of sequences."""
-    out, count = [], Counter[str]()
+    Consecutive cases of @sequences that differ only in `at` are the steps of sequences.
+    """
+    items: list[Item] = []
+    for case in suite.get_case_names_of_set(name):
+        try:
+            items.append(_make_item_of_problem(suite.case(case).problem, suite.case(case).name))
+            items[-1].source = case
+        except SolverUnavailable as error:
+            items.append(Item(case, case, _raise_when_loaded(error)))
+    if name.removeprefix("@") != "sequences":
+        return items
+    steps = Counter[str]()
     for item in items:
-        name = item.name.rpartition(", at=")[0] + ")"
-        out.append(replace(item, name=f"{name}[{count[name]}]", sequence=name, step=count[name]))
-        count[name] += 1
-    return out
+        item.sequence = item.name.rpartition(", at=")[0] + ")"
+        item.step, steps[item.sequence] = steps[item.sequence], steps[item.sequence] + 1
+        item.name = f"{item.sequence}[{item.step}]"
+    return items
 
 
 def _raise_when_loaded(error: Exception) -> Callable[[], Problem]:
@@ -437,18 +402,14 @@ def _make_names_differ(items: list[Item]) -> list[Item]:
 def describe_case(item: Item, run: str) -> Row:
     """Load the problem of an item and return the row that describes it."""
     p = item.problem
-    contacts = count_contacts(p)
     answer = item.judge_stored_answer()
     structure, islands = classify_structure_and_count_islands(p)
     return {
         "kind": "case", "run": run, "case": item.name, "source": item.source, "sha": hash_problem(p), "law": p.law,
-        "rows": p.m, "blocks": p.n_blocks, "islands": islands, "contacts": contacts,
-        "bodies": p.rows.n_bodies if p.rows is not None else 0,
-        "nonzeros": int(p.jacobian.nnz if p.rows is not None else p.csr.nnz), "mass_ratio": compute_mass_ratio(p),
-        "structure": ", ".join(structure), "symmetric": bool(p.is_symmetric), "reason": item.reason,
-        "sequence": item.sequence, "step": item.step, "identity": "",
-        "stored": math.nan if answer is None else float(answer.relative),
-        "stored_verdict": answer.verdict_in_words if answer and answer.rounding else "",
+        "rows": p.m, "blocks": p.n_blocks, "islands": islands, "contacts": count_contacts(p),
+        "mass_ratio": compute_mass_ratio(p), "structure": ", ".join(structure), "symmetric": bool(p.is_symmetric),
+        "sequence": item.sequence,
+        "step": item.step, "identity": "", "stored": math.nan if answer is None else float(answer.relative),
         "nothing_to_do": bool(is_solved_by_zero(p)), "diagnostics": list(map(str, diagnose(p))),
         "guess": _classify_guess(item),
     }  # fmt: skip

@@ -39,9 +39,11 @@ from lavender.solving.prepared import check_arguments
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-NUMBER_COLUMNS = (
-    "relative [-]", "floor [-]", "error [m/s]", "distance [√J]", "allowed [√J]", "objective [J]", "time [s]"
-)  # fmt: skip
+#: Heads of the numbers of a row.
+NUMBER_COLUMNS = {
+    "relative": "relative [-]", "roundoff_floor": "floor [-]", "velocity": "error [m/s]", "distance": "distance [√J]",
+    "allowed": "allowed [√J]", "objective": "objective [J]", "time": "time [s]",
+}  # fmt: skip
 REFERENCES = ("osqp", "clarabel", "piqp", "direct")
 # Reference solvers, in order, under the law "cone" (relaxed friction), which does not give a QP.
 CONE_REFERENCES = ("clarabel_cone", "block_gauss_seidel")
@@ -117,32 +119,34 @@ class CrossCheck:
         return len(self.rows)
 
     def __getitem__(self, solver: str) -> CrossCheckRow:
-        for row in self.rows:
-            if row.solver == solver:
-                return row
-        raise InputError(
-            f"no solver {solver!r} in this check; it has {', '.join(r.solver for r in self.rows)}"
-        )
+        rows = {row.solver: row for row in self.rows}
+        if solver not in rows:
+            raise InputError(f"no solver {solver!r} in this check; it has {', '.join(rows)}")
+        return rows[solver]
+
+    def _select(self, *verdicts: str) -> tuple[CrossCheckRow, ...]:
+        """Return the rows with one of these verdicts."""
+        return tuple(row for row in self.rows if row.verdict in verdicts)
 
     @property
     def contradicted(self) -> tuple[CrossCheckRow, ...]:
         """Rows with a contradicted claim."""
-        return tuple(row for row in self.rows if row.contradicted)
+        return self._select(CLAIM_CONTRADICTED, BREACH)
 
     @property
     def agreed(self) -> tuple[CrossCheckRow, ...]:
         """Rows that agree with the reference."""
-        return tuple(row for row in self.rows if row.verdict == AGREES)
+        return self._select(AGREES)
 
     @property
     def unsolved(self) -> tuple[CrossCheckRow, ...]:
         """Rows of solvers that do not solve the problem, or claim without proof that it has no solution."""
-        return tuple(row for row in self.rows if row.verdict in (NOT_SOLVED, UNPROVED))
+        return self._select(NOT_SOLVED, UNPROVED)
 
     @property
     def refused(self) -> tuple[CrossCheckRow, ...]:
         """Rows of solvers that do not accept the problem; their notes give the reason."""
-        return tuple(row for row in self.rows if row.verdict == REFUSED)
+        return self._select(REFUSED)
 
     @property
     def ok(self) -> bool:
@@ -151,8 +155,8 @@ class CrossCheck:
         Without a reference nothing is compared: `reference` is None, as always under Coulomb's law, and solvers may
         have found different motions.
         """
-        verdicts = {row.verdict for row in self.rows} - {REFUSED}
-        return bool(verdicts) and verdicts <= {AGREES, AGREES_UNCOMPARED, NOTHING_TO_DO}
+        good = len(self._select(AGREES, AGREES_UNCOMPARED, NOTHING_TO_DO))
+        return good > 0 and good + len(self.refused) == len(self.rows)
 
     def __repr__(self) -> str:
         return f"<CrossCheck of {len(self)} solvers: {len(self.agreed)} agree, {len(self.unsolved)} did not solve it>"
@@ -166,15 +170,11 @@ class CrossCheck:
         """Row for each solver; the bounded variant that ran is named after an arrow."""
         import pandas as pd
 
-        return pd.DataFrame([
-            {
-                "solver": f"{r.solver} → {r.ran}" if r.ran else r.solver, "verdict": r.verdict, "status": r.status,
-                "relative [-]": r.relative, "floor [-]": r.roundoff_floor, "error [m/s]": r.velocity,
-                "distance [√J]": r.distance, "allowed [√J]": r.allowed, "objective [J]": r.objective,
-                "time [s]": r.time, "what ran": r.note,
-            }
-            for r in self.rows
-        ]).astype(dict.fromkeys(NUMBER_COLUMNS, float))  # fmt: skip
+        columns = ["solver", "verdict", "status", *NUMBER_COLUMNS, "note"]
+        rows = [{name: getattr(r, name) for name in columns} for r in self.rows]
+        table = pd.DataFrame(rows, columns=columns).astype(dict.fromkeys(NUMBER_COLUMNS, float))
+        table["solver"] = [f"{r.solver} → {r.ran}" if r.ran else r.solver for r in self.rows]
+        return table.rename(columns=NUMBER_COLUMNS | {"note": "what ran"})
 
     @property
     def description(self) -> str:
@@ -184,23 +184,15 @@ class CrossCheck:
         return f"{name} ({self.problem.law}), cold, tol {format_tolerance(self.tol)}{reference}"
 
     def __str__(self) -> str:
-        texts = format_cells(self.frame)
-        lines = [list(texts), *texts.to_numpy().tolist()]
-        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-        table = ["  ".join(x.ljust(n) for x, n in zip(line, widths, strict=True)).rstrip() for line in lines]
+        table = format_cells(self.frame).to_string(index=False)
         reason = [] if self.reference else [f"no reference: {self.reference_note}"]
-        return "\n".join([self.description, *reason, *table])
+        return "\n".join([self.description, *reason, table])
 
 
 def cross_check(
-    problem: Problem,
-    solvers: Iterable[str] | None = None,
-    reference: str = "osqp",
-    *,
-    tol: float = 1e-6,
-    max_iter: int | None = None,
-    time_limit: float | None = None,
-) -> CrossCheck:
+    problem: Problem, solvers: Iterable[str] | None = None, reference: str = "osqp", *, tol: float = 1e-6,
+    max_iter: int | None = None, time_limit: float | None = None,
+) -> CrossCheck:  # fmt: skip
     """Solve from the zero impulse with every solver, and compare each with a judged reference.
 
     The judged relative residual of the reference must be at most max(1e-9, 10 floor), with the round-off floor, and at
@@ -250,7 +242,7 @@ def cross_check(
             get(name)  # Raises UnknownName with similar names.
     with Worker() as worker:
         run_solver = partial(solve_isolated, worker, problem, time_limit=time_limit)
-        optimum, reference_solver, note = _solve_reference(problem, reference, reasons, run_solver)
+        optimum, reference_solver, note = solve_reference(problem, reference, reasons, run_solver)
         run_solver = partial(run_solver, tol=tol, max_iter=max_iter)
         rows = [_check_solver(problem, name, reasons[name], optimum, run_solver) for name in names]
     if optimum is not None or any(row.verdict == AGREES_UNCOMPARED for row in rows):
@@ -259,12 +251,9 @@ def cross_check(
 
 
 def _check_solver(
-    problem: Problem,
-    name: str,
-    reason: str | None,
-    optimum: Solution | None,
+    problem: Problem, name: str, reason: str | None, optimum: Solution | None,
     run_solver: Callable[..., Solution],
-) -> CrossCheckRow:
+) -> CrossCheckRow:  # fmt: skip
     """Run one solver and compare its solution with `optimum`.
 
     `reason` says why the solver does not accept the problem; its bounded variant runs instead, if it has one.
@@ -288,43 +277,35 @@ def _check_solver(
     return replace(compare_with_reference(problem, name, solution, optimum), ran="" if other is None else run)
 
 
-def _solve_reference(
+def solve_reference(
     problem: Problem, first: str, reasons: dict[str, str | None], run_solver: Callable[..., Solution]
 ) -> tuple[Solution | None, str | None, str]:
     """Return (solution, solver, quality) of the first reference that passes, or (None, None, reason)."""
+    failed, is_program = [], problem.has_singular_program
     if problem.law == "coulomb":
         reason = reasons.get(first, "not registered")
         if reason is None:
             reason = "solves it, but several motions may be solutions, so a distance to one of them is not an error"
-        return (
-            None,
-            None,
-            f"Coulomb friction is not the optimality condition of a QP ({first} {reason}); compare errors in m/s",
-        )
-    if not (problem.has_singular_program or problem.is_symmetric):
-        return (
-            None,
-            None,
-            f"A is not symmetric (by {format_residual(problem.asymmetry)}), so the problem is not a QP",
-        )
-    if not (problem.has_singular_program or problem.is_semidefinite):
+        why = f"({first} {reason}); compare errors in m/s"
+        return None, None, f"Coulomb friction is not the optimality condition of a QP {why}"
+    if not (is_program or problem.is_symmetric):
+        by = format_residual(problem.asymmetry)
+        return None, None, f"A is not symmetric (by {by}), so the problem is not a QP"
+    if not (is_program or problem.is_semidefinite):
         return (
             None,
             None,
             "A is not positive semidefinite: several solutions with different motions may exist",
         )
-    defaults = CONE_REFERENCES if problem.law == "cone" else REFERENCES
-    chain = (first, *(r for r in defaults if r != first))
-    failed = []
-    for name in chain:
+    for name in dict.fromkeys([first, *(CONE_REFERENCES if problem.law == "cone" else REFERENCES)]):
         reason = reasons.get(name, "not registered")
         if reason is not None:
             failed.append(f"{name} {reason}")
             continue
         spec = get(name)
+        # A reference may use 100 times the solver's default number of iterations.
+        budget = 100 * spec.max_iter if spec.resumable else None
         try:
-            # A reference may use 100 times the solver's default number of iterations.
-            budget = 100 * spec.max_iter if spec.resumable else None
             solution = raise_if_interrupted(
                 run_solver(name, tol=0.1 * REFERENCE_MAX_RESIDUAL, max_iter=budget)
             )
@@ -348,26 +329,24 @@ def compare_with_reference(
     """Compare one solver's solution with the optimum and build its row."""
     r = solution.residual
     note = "; ".join(
-        x for x in (solution.solver.form and f"{solution.solver.form} form", solution.message) if x
+        filter(None, (solution.solver.form and f"{solution.solver.form} form", solution.message))
     )
     fields: dict[str, Any] = {
-        "status": solution.status.name,
-        "relative": r.relative,
-        "roundoff_floor": r.roundoff_floor,
-        "velocity": r.velocity,
-        "time": solution.setup_time + solution.solve_time,
-        "solution": solution,
-    }
+        "status": solution.status.name, "relative": r.relative, "roundoff_floor": r.roundoff_floor,
+        "velocity": r.velocity, "time": solution.setup_time + solution.solve_time, "solution": solution,
+    }  # fmt: skip
     verdict, breached = AGREES_UNCOMPARED, False
     if optimum is not None and np.isfinite(solution.impulse).all():
         with np.errstate(over="ignore", invalid="ignore"):  # Squares of the impulses may overflow.
             distance, allowed = compute_separation(problem, solution, optimum)
-            fields |= {
-                "distance": distance,
-                "allowed": allowed,
-                "slack": float(np.abs(r.slack - optimum.slack).max(initial=0.0)),
-                "objective": _compute_objective(problem, solution) - _compute_objective(problem, optimum),
-            }
+            values = [
+                problem.qp.solution(s).objective if problem.has_singular_program
+                else 0.5 * (s.impulse @ (s.slack - problem.b))
+                for s in (solution, optimum)
+            ]  # fmt: skip
+            slack = float(np.abs(r.slack - optimum.slack).max(initial=0.0))
+            fields |= {"distance": distance, "allowed": allowed, "slack": slack,
+                       "objective": float(values[0] - values[1])}  # fmt: skip
         verdict, breached = AGREES, distance > allowed
     if breached:
         verdict = BREACH
@@ -384,14 +363,6 @@ def compare_with_reference(
     elif not (solution.success or r.at_floor):
         verdict = NOT_SOLVED
     return CrossCheckRow(name, verdict, note=note, **fields)
-
-
-def _compute_objective(problem: Problem, solution: Solution) -> float:
-    """Compute the objective 1/2 l.A l - b.l [J], or 1/2 x.P x + q.x of a program with a singular P."""
-    if problem.has_singular_program:
-        return float(problem.qp.solution(solution).objective)
-    lam = solution.impulse
-    return float(0.5 * (lam @ (solution.slack - problem.b)))
 
 
 def compute_separation(problem: Problem, one: Any, two: Any) -> tuple[float, float]:

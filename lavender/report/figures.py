@@ -27,8 +27,6 @@ Points: TypeAlias = Sequence[float] | FloatArray
 Style: TypeAlias = dict[str, Any]  # Colour, dash and mark of a solver, as arguments of matplotlib.
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from lavender.report.tables import Contents
 
 MIN_RESIDUAL = 1e-17  # A residual of exactly zero is drawn here.
@@ -58,7 +56,7 @@ FLAT_LINES_NOTE = (
 )
 EQUAL_RATIO = 1.1  # Points of two curves whose values differ by a smaller factor cover each other.
 EQUAL_SHARE = 0.25  # A curve covers another if this fraction of their common points do.
-COVERED_WIDTH = 2.6  # [points] A curve is drawn wider by this width for each later curve that covers it.
+COVERED_WIDTH = 2.2  # [points] A curve is drawn wider by this width for each later curve that covers it.
 
 
 @dataclass(frozen=True)
@@ -108,11 +106,11 @@ def build_figures(report: Contents) -> list[Figure]:
     return [figure for figure in figures if figure.curves]
 
 
-def select_drawn_solvers(report: Contents, frame: pd.DataFrame) -> list[str]:
-    """Select the solvers that figures show: the best of the ranking, at most `MAX_CURVES`, and all plug-ins."""
+def select_drawn_solvers(report: Contents, cases: Iterable[str] | None = None) -> list[str]:
+    """Select the solvers that figures of some cases show: the first `MAX_CURVES` of the ranking, and all plug-ins."""
     from lavender.report.tables import is_plug_in, rank_solvers
 
-    ranking = [str(name) for name in rank_solvers(frame, report.tolerance).index]
+    ranking = [str(name) for name in rank_solvers(report, report.tolerance, cases).index]
     plug_ins = [name for name in ranking if is_plug_in(name)]
     return [*[name for name in ranking if name not in plug_ins][:MAX_CURVES], *plug_ins]
 
@@ -138,7 +136,7 @@ def build_overall_figure(report: Contents, name: str = "error-against-time", law
     runs = runs.assign(
         place=place, number=runs["case"].map({case: i for i, case in enumerate(cases)}).astype(int)
     )
-    for solver in sorted(runs["solver"].unique()) if law else select_drawn_solvers(report, frame):
+    for solver in sorted(runs["solver"].unique()) if law else select_drawn_solvers(report, cases):
         own, reached = runs[runs["solver"] == solver], np.ones((len(cases), GRID_SIZE))
         np.minimum.at(reached, (own["number"], own["place"]), own["relative"].clip(MIN_RESIDUAL))
         reached = np.minimum.accumulate(reached, axis=1)
@@ -163,10 +161,10 @@ def build_overall_figure(report: Contents, name: str = "error-against-time", law
 
 def build_cost_figure(report: Contents) -> Figure:
     """Plot the time to the middle tolerance against the number of rows, with the fitted power of each solver."""
-    from lavender.report.tables import get_times, tabulate_costs
+    from lavender.report.tables import tabulate_costs
 
-    times, curves = get_times(report.frame, report.tolerance), list[Curve]()
-    drawn = select_drawn_solvers(report, report.frame)
+    times, curves = report.get_times(report.tolerance), list[Curve]()
+    drawn = select_drawn_solvers(report)
     for fit in tabulate_costs(report).to_dict("records"):
         if (solver := fit["solver"]) in drawn:
             own = times.loc[solver].dropna()
@@ -184,7 +182,7 @@ def build_sequence_figure(report: Contents, name: str) -> Figure:
     """Plot the time of all steps so far of a sequence to the middle tolerance, carried and cold (thin)."""
     runs = report.frame[(report.frame["sequence"] == name) & (report.frame["mode"] == "tol")]
     curves: list[Curve] = []
-    for solver in select_drawn_solvers(report, runs) if len(runs) else ():
+    for solver in select_drawn_solvers(report, runs["case"].unique()) if len(runs) else ():
         own = runs[(runs["solver"] == solver) & (runs["tol"] <= report.tolerance)]
         own = own[own["tol"] == own["tol"].max()].sort_values("step")
         for start in ("carried", "cold"):
@@ -263,7 +261,7 @@ def plot_figure(figure: Figure, styles: Mapping[str, Style]) -> Any:
     for axis, is_log in ((axes.xaxis, figure.x_log), (axes.yaxis, figure.y_log)):
         if is_log:
             axis.set_major_formatter(lambda x, _: f"{x:g}" if 0.1 <= x < 1e4 else format_tolerance(x))
-            axis.set_minor_formatter(lambda x, _: "")
+    axes.minorticks_off()
     axes.grid(True, color=GREY, linewidth=0.4, alpha=0.4)
     axes.spines[["top", "right"]].set_visible(False)
     axes.set_title(_shorten(figure.title, MAX_TITLE_LENGTH), fontsize=10, loc="left", parse_math=False)

@@ -69,9 +69,9 @@ SECTIONS: dict[str, tuple[str, str, Callable[[tables.Contents], pd.DataFrame]]] 
         "Failures", "Runs that missed their tolerance, that died, or that made a false claim.", tables.tabulate_failures
     ),
     "sweeps": ("Sweeps", (
-        "Largest errors over all steps after a fixed number of sweeps, from zero impulses (cold) and from the impulses "
-        "of the step before (carried). The velocity error is that of the worst row, the motion error the largest "
-        "difference of a body's velocity from that of a solution, over about 20 steps."
+        "Largest errors over the steps after the first, after a fixed number of sweeps, from zero impulses (cold) and "
+        "from the impulses of the step before (carried). The velocity error is that of the worst row, the motion error "
+        "the largest difference of a body's velocity from that of a solution, over about 20 steps."
     ), tables.tabulate_sweeps),
     "engines": ("Inside the engine", (
         "The engine's own answers, judged like all others. Its time excludes the copy of the problem and the judge."
@@ -83,8 +83,6 @@ SECTIONS: dict[str, tuple[str, str, Callable[[tables.Contents], pd.DataFrame]]] 
     "runs": ("Every case", "Time to each tolerance and smallest residual.", tables.tabulate_runs),
 }  # fmt: skip
 CAMPAIGN_SECTIONS = ("times", "budgets", "claims", "failures")  # Tables of a campaign, which has no times.
-# Tables of a run with unfinished passes only.
-PASS_SECTIONS = ("budgets", "claims", "failures", "sweeps", "sequences")
 
 
 class Report(tables.Contents):
@@ -111,9 +109,7 @@ class Report(tables.Contents):
         target = f"to {format_tol(self.tolerance)}"
         if not len(self.frame):
             return self.frame.iloc[:, :0]
-        if self.has_passes_only:
-            name, wanted = "sequences", ["target", "steps, cold", "time, cold [s]", "residual, cold [-]"]
-        elif "sweeps" in self.sections and (self.frame["mode"] == "budget").all():
+        if "sweeps" in self.sections and (self.frame["mode"] == "budget").all():
             starts = ("carried", "cold")
             errors = [f"{kind} error, {start} [m/s]" for kind in ("velocity", "motion") for start in starts]
             name, wanted = "sweeps", ["sequence", "solver", "sweeps", *errors]
@@ -128,8 +124,7 @@ class Report(tables.Contents):
     @cached_property
     def sections(self) -> dict[str, Section]:
         """The tables by name, in their order; tables without rows are left out."""
-        names = PASS_SECTIONS if self.has_passes_only else tuple(SECTIONS)
-        names = CAMPAIGN_SECTIONS if self.is_campaign else names
+        names = CAMPAIGN_SECTIONS if self.is_campaign else tuple(SECTIONS)
         made = [
             Section(title, [make(self)], note, name=name)
             for name, (title, note, make) in SECTIONS.items()
@@ -195,12 +190,9 @@ def render_report(report: Report, figures: bool = True, folder: Path | None = No
 
 
 def write(
-    source: pd.DataFrame | Report,
-    folder: str | Path,
-    *,
-    figures: bool = True,
+    source: pd.DataFrame | Report, folder: str | Path, *, figures: bool = True,
     watch: Callable[[Event], None] = lambda event: None,
-) -> Path:
+) -> Path:  # fmt: skip
     """Write `records.csv`, `tables/*.csv`, `tables/*.tex`, `figures/*.svg`, `summary.md` and `index.html`.
 
     Parameters
@@ -303,9 +295,10 @@ def _list_notes(report: Report, longest: int) -> Iterator[tuple[str, str]]:
     failures = tables.select_failures(report) if len(report.frame) else report.frame
     failures = failures.astype(dict.fromkeys(("solver", "case", "status", "message", "status_conflict"), str))
     false = failures[failures["status_conflict"] != ""]
-    # Each solver that died is named once, plug-ins first.
+    # Each solver that died is named once, plug-ins first. A backend that was killed at its time limit is not named.
     died = failures[failures["status"].str.startswith(tables.DEATHS)].drop_duplicates("solver")
-    died = died.sort_values("solver", key=lambda names: ~names.map(is_plug_in).astype(bool), kind="stable")
+    died = died.assign(own=died["solver"].map(is_plug_in).astype(bool)).sort_values("own", ascending=False)
+    died = died[died["own"] | (died["status"] != "KILLED")]
     kinds = {
         "crashed": ("red", [f"{r.solver} on {r.case}: {r.status}: {r.message}" for r in died.itertuples()]),
         "false claim": ("red", [f"{r.case}, {r.solver}: {r.status_conflict}" for r in false.itertuples()]),
@@ -399,9 +392,6 @@ def recommend(report: Contents) -> tuple[Statement, ...]:
     if not len(report.frame):
         stopped = report.is_stopped and len(report.runs)
         return (Statement("Stopped: no problem was measured with every solver."),) if stopped else ()
-    if report.has_passes_only:
-        solver = report.frame["solver"].iloc[0]
-        return (Statement(f"Stopped: the tables have the finished passes of {solver}."),)
     single, sweeps = report.frame["step"] < 0, _recommend_sweeps(report)
     if sweeps and (report.frame["mode"] == "budget").all():
         return sweeps
@@ -427,6 +417,11 @@ def _recommend_sweeps(report: Contents) -> tuple[Statement, ...]:
                 f"{name}: {format_count(best['sweeps'], 'sweep')} of {best['solver']} with warm starts keep every "
                 f"velocity error below {limit} ({format_residual(best[columns[0]])} m/s; {cold[0]})"
             )
+            plain = own[own["solver"].isin(PLAIN_SWEEPS)]
+            if len(plain) and best["solver"] not in PLAIN_SWEEPS:
+                least = plain.loc[plain[columns[0]].idxmin()]
+                error = format_residual(least[columns[0]])
+                text += f"; without acceleration {least['sweeps']} of {least['solver']} leave {error} m/s"
         else:
             best = own.loc[own[columns[0]].idxmin()].to_dict()
             text = (
@@ -439,7 +434,8 @@ def _recommend_sweeps(report: Contents) -> tuple[Statement, ...]:
 
 def _describe_own_sweeps(report: Contents, sequence: str) -> str:
     """Return the largest velocity error of the engine's own answers to a sequence, if it was recorded."""
-    sources = report.cases.loc[report.cases["sequence"] == sequence, "source"]
+    steps = report.cases[report.cases["sequence"] == sequence]
+    sources = steps.loc[steps["step"] > 0, "source"]  # The first step does not count in the table either.
     answers = report.engines.reindex([str(Path(s)) for s in sources]).dropna(subset="velocity")
     if not len(answers):
         return ""
@@ -451,14 +447,16 @@ def _describe_own_sweeps(report: Contents, sequence: str) -> str:
 
 def _recommend_for(report: Contents, frame: pd.DataFrame) -> Statement:
     """Recommend the first solver of the ranking on some cases, and name misses, ties, plug-ins and the engine."""
-    ranking, cases = rank_solvers(frame, report.tolerance), list(frame["case"].unique())
+    cases = list(frame["case"].unique())
+    ranking = rank_solvers(report, report.tolerance, cases)
     named = _describe_cases(report, cases)
     reached = f"down to {format_tol(report.tolerance)} of the error of the zero impulse"
     engine = tables.rank_engine(report, report.cases.loc[cases], report.tolerance)
     if not len(ranking) or not ranking["solved"].iloc[0]:
         stopped = "Stopped: no" if report.is_stopped else "No"
         return Statement(_add_engine(f"{stopped} solver brings {named} {reached}.", engine, None))
-    solver, first, runs = str(ranking.index[0]), ranking.iloc[0], tables.select_ranked_runs(frame)
+    solver, first, runs = str(ranking.index[0]), ranking.iloc[0], report.ranked_runs
+    runs = runs[runs["case"].isin(cases)]
     own = runs[(runs["solver"] == solver) & (runs[["tol", "relative"]].max(axis=1) <= report.tolerance)]
     missed, unreached = _list_unsolved_cases(report, runs, cases, solver)
     time = _describe_solved(first, named)

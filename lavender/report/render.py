@@ -147,12 +147,9 @@ def format_markdown(frame: pd.DataFrame) -> list[str]:
 
 
 def print_table(
-    console: Console,
-    frame: pd.DataFrame,
-    grouped: bool = False,
-    cut: bool = False,
+    console: Console, frame: pd.DataFrame, grouped: bool = False, cut: bool = False,
     optional: Sequence[str] = (),
-) -> None:
+) -> None:  # fmt: skip
     """Print a frame within the width of the terminal. Its texts are not read as markup.
 
     In a table that is too wide, heads and words fold and numbers stay whole. If that is not enough, each cell becomes
@@ -229,11 +226,9 @@ def _fold_words(grid: Grid, texts: pd.DataFrame, whole_first: bool = False) -> i
 
 
 def print_page(
-    console: Console,
-    statements: Sequence[Statement],
-    sections: Sequence[Section],
+    console: Console, statements: Sequence[Statement], sections: Sequence[Section],
     warnings: Sequence[str] = (),
-) -> None:
+) -> None:  # fmt: skip
     """Print the short form of a page: sentences, warnings, lines to copy, and rows of each section's first table."""
     for i, statement in enumerate(statements):
         console.print(statement.text, style="" if i else "bold", highlight=False, markup=False)
@@ -252,15 +247,9 @@ def print_page(
 
 
 def render_page(
-    title: str,
-    statements: Sequence[Statement],
-    sections: Sequence[Section],
-    *,
-    warnings: Sequence[str] = (),
-    first_figure: Figure | None = None,
-    folded: bool = False,
-    folder: Path | None = None,
-) -> str:
+    title: str, statements: Sequence[Statement], sections: Sequence[Section], *, warnings: Sequence[str] = (),
+    first_figure: Figure | None = None, folded: bool = False, folder: Path | None = None,
+) -> str:  # fmt: skip
     """Return a page as one HTML file without external parts, for dark and light themes, phones and print.
 
     Parameters

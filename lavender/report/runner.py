@@ -17,7 +17,7 @@ from functools import cache
 from itertools import product
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from lavender.base.arrays import FloatArray, check_sequence
 from lavender.base.errors import InputError, LavenderError, require_packages
@@ -58,9 +58,8 @@ if TYPE_CHECKING:
 UNGUARDED_TIME_RATIO = 0.05
 # Each step of a sequence with more steps is solved once, not `Plan.repeats` times: the sum over many steps varies less.
 MAX_REPEATED_STEPS = 20
-MAX_MOTION_STEPS = (
-    20  # The error of the motion is computed for about this number of steps, evenly distributed.
-)
+# The error of the motion is computed for about this number of steps of a sequence, evenly distributed.
+MAX_MOTION_STEPS = 20
 # A solver with up to this multiple of the fastest time on a case is timed again, alternately with the fastest.
 NEAR_TIME_RATIO = 1.6
 MAX_NEAR = 5  # Solvers that are timed again on a case, at most.
@@ -122,18 +121,10 @@ def select_solver_names(names: str | Sequence[str] | None) -> list[str]:
 
 
 def run(
-    cases: Source | Iterable[Source] = (),
-    solvers: str | Sequence[str] | None = None,
-    plan: Plan | None = None,
-    store: Store | str | Path | None = None,
-    *,
-    workers: int = 1,
-    backend: str = "loky",
-    watch: Watch | None = None,
-    memory: int | None = None,
-    into: list[Row] | None = None,
-    reuse: bool = True,
-) -> DataFrame:
+    cases: Source | Iterable[Source] = (), solvers: str | Sequence[str] | None = None, plan: Plan | None = None,
+    store: Store | str | Path | None = None, *, workers: int = 1, backend: str = "loky",
+    watch: Watch | None = None, memory: int | None = None, into: list[Row] | None = None, reuse: bool = True,
+) -> DataFrame:  # fmt: skip
     """Measure every solver on every case that it accepts.
 
     Parameters
@@ -203,32 +194,22 @@ class Runner:
     """Measures pairs of case and solver. Stored measurements are reused, new ones stored as soon as they are made."""
 
     def __init__(
-        self,
-        this: Row,
-        plan: Plan,
-        names: list[str],
-        worker: Worker,
-        store: Store | None = None,
-        watch: Watch | None = None,
-        reuse: bool = True,
-    ) -> None:
+        self, this: Row, plan: Plan, names: list[str], worker: Worker, store: Store | None = None,
+        watch: Watch | None = None, reuse: bool = True,
+    ) -> None:  # fmt: skip
         self.this, self.plan, self.names = this, plan, names
         self.store, self.watch, self.worker = store, watch, worker
         self.specs = registry.specs()
         self.out: list[Row] = []
-        self.done = 0
-        self.total = 0
+        self.done = self.total = 0
         self.known: dict[Any, Row] = {}
         self.described: dict[str, Row] = {}  # Many cases take longer to describe than to load.
         if store is not None and reuse:
-            parts = {"run": RUN_COLUMNS, "case": CASE_DETAILS | CASE_COLUMNS}
-            for kind, columns in parts.items():
-                for row in convert_columns(store.lines, kind, columns).to_dict("records"):
-                    if row["run"] == this["run"] and kind == "run":
-                        times = [float(t) for t in row["times"]]
-                        self.known[get_key(row)] = {"kind": kind, **row, "times": times}
-                    elif row["run"] == this["run"]:
-                        self.described[row["case"]] = {"kind": kind, **row}
+            stored = store.lines[store.lines["run"] == this["run"]] if "run" in store.lines else store.lines
+            for row in convert_columns(stored, "run", RUN_COLUMNS).to_dict("records"):
+                self.known[get_key(row)] = {"kind": "run", **row, "times": list(map(float, row["times"]))}
+            for row in convert_columns(stored, "case", CASE_DETAILS | CASE_COLUMNS).to_dict("records"):
+                self.described[row["case"]] = {"kind": "case", **row}
 
     def add_row(self, row: Row) -> None:
         """Add a row to the returned rows and to the store."""
@@ -238,8 +219,8 @@ class Runner:
 
     def add_skip(self, case: str, solver: str, reason: str, sequence: str = "") -> None:
         """Add the row of a solver that does not run on a case, or without a solver of a case that does not load."""
-        self.add_row({"kind": "skip", "run": self.this["run"], "case": case, "solver": solver, "reason": reason,
-                      "sequence": sequence})  # fmt: skip
+        pair = {"case": case, "solver": solver, "sequence": sequence}
+        self.add_row({"kind": "skip", "run": self.this["run"], **pair, "reason": reason})
 
     def report_progress(self, case: str, solver: str, row: Row | None = None, reused: bool = False) -> None:
         """Call `watch` with the number of pairs that are done."""
@@ -279,39 +260,35 @@ class Runner:
         if backend == "loky" and memory is None:
             memory = machine.get_memory_per_process(joblib.effective_n_jobs(workers))
         local = tuple(spec for n in self.names if not ((spec := self.specs[n]).builtin or spec.distribution))
-        order = Order(self.plan, self.this, memory, local)
         known: dict[tuple[str, str], list[Row]] = {}
         for row in self.known.values():
             known.setdefault((row["case"], row["solver"]), []).append(row)
-        pairs: list[Pair] = []
+        calls: list[tuple[Any, ...]] = []
         for item, name in product(items, self.names):
             # Send a name or path, which the worker reads itself: machines of a cluster share files and suite.
             source = item.source if item.in_memory is None else replace(item.in_memory, copy=False)
-            stored, described = tuple(known.get((item.name, name), ())), self.described.get(item.name)
-            pair = Pair(
-                index=len(pairs), case=item.name, source=source, reason=item.reason, solver=name, described=described,
-                known=stored,
-            )  # fmt: skip
-            pairs.append(pair)
+            stored = known.get((item.name, name), [])
+            pair = Pair(number=len(calls), case=item.name, source=source, solver=name,
+                        described=self.described.get(item.name), known=stored)  # fmt: skip
+            calls.append((pair, self.this, self.plan, memory, local))
         rows: dict[int, list[Row]] = {}
         try:
             for _ in range(MAX_ATTEMPTS):
-                remaining = [p for p in pairs if p.index not in rows]
-                if not remaining:
-                    break
-                calls = ((pair, order) for pair in remaining)
-                for index, new in map_unordered(measure_in_worker, calls, workers, backend):
+                remaining = [call for call in calls if call[0].number not in rows]
+                for index, new in (
+                    map_unordered(measure_in_worker, remaining, workers, backend) if remaining else ()
+                ):
                     self.store_new(new)
-                    rows[index], pair = new, pairs[index]
+                    rows[index], pair = new, calls[index][0]
                     self.done += 1
                     for row in (row for row in new if row["kind"] == "run"):
                         self.report_progress(pair.case, pair.solver, row, get_key(row) in self.known)
                     self.report_progress(pair.case, pair.solver)
         finally:
             self.out.extend(row for index in sorted(rows) for row in rows[index])
-        if len(rows) < len(pairs):
+        if len(rows) < len(calls):
             raise InputError(
-                f"{len(pairs) - len(rows)} of {len(pairs)} pairs are not done: workers were lost {MAX_ATTEMPTS} "
+                f"{len(calls) - len(rows)} of {len(calls)} pairs are not done: workers were lost {MAX_ATTEMPTS} "
                 "times; run the same command again, with fewer workers if memory is short"
             )
 
@@ -365,21 +342,20 @@ class Runner:
             best.setdefault(r["solver"], r)
         limit = NEAR_TIME_RATIO * min((r["time"] for r in best.values()), default=0.0)
         near = [r for r in best.values() if r["time"] <= limit][:MAX_NEAR]
-        wanted = 2 * self.plan.repeats + 1
         if len(near) < 2 or any(self.was_timed_again(r) for r in near):
             return
         changed, begun = dict[str, Row](), perf_counter()
-        while any(len(r["times"]) < wanted for r in near) and (
-            perf_counter() - begun < AGAIN_TIME or not changed
-        ):
+        for _ in range(2 * self.plan.repeats + 1):
             for i, r in enumerate(near):
-                if len(r["times"]) < wanted:
+                if len(r["times"]) <= 2 * self.plan.repeats:
                     self.report_progress(item.name, f"{r['solver']}, again")
                     task = Task.of_row(r, self.plan.time_limit)
                     new = self.measure_task(item.problem, task, self.specs[r["solver"]], None)[0]
                     near[i] = changed[r["solver"]] = add_times(
                         r, [*r["times"], *(new["times"] or [math.inf])]
                     )
+            if perf_counter() - begun > AGAIN_TIME:
+                break
         for row in changed.values():
             self.add_row(row)
 
@@ -389,27 +365,21 @@ class Runner:
 
     def measure_sequence(self, items: list[Item]) -> None:
         """Measure every solver on the steps of a sequence, in passes: each budget and tolerance, cold and carried."""
-        cases = [self.load_case(item) for item in items]
-        identity = hashlib.sha256("".join(c["sha"] for c in cases if c is not None).encode()).hexdigest()[:16]
-        steps = [
-            (item, {**case, "identity": identity})
-            for item, case in zip(items, cases, strict=True)
-            if case is not None
-        ]
-        for _, case in steps:
+        steps = [(item, case) for item in items if (case := self.load_case(item)) is not None]
+        identity = hashlib.sha256("".join(case["sha"] for _, case in steps).encode()).hexdigest()[:16]
+        loaded = [item for item, _ in steps]
+        cases = [{**case, "identity": identity} for _, case in steps]
+        for case in cases:
             self.add_row(case)
+        repeats = self.plan.repeats if len(steps) <= MAX_REPEATED_STEPS else 1
         for name in self.names:
-            spec = self.select_solver(items[0].sequence, name, [item for item, _ in steps])
+            spec = self.select_solver(items[0].sequence, name, loaded)
             if spec is not None:
-                for mode, tol, max_iter, start in list_passes(self.plan, spec):
+                for target in list_passes(self.plan, spec):
                     self.report_progress(items[0].sequence, spec.name)
-                    repeats = self.plan.repeats if len(steps) <= MAX_REPEATED_STEPS else 1
                     limit = self.plan.time_limit
-                    tasks = [
-                        Task.of_case(case, spec.name, mode, tol, max_iter, start, limit, repeats)
-                        for _, case in steps
-                    ]
-                    self.measure_pass([item for item, _ in steps], spec, tasks)
+                    tasks = [Task.of_case(case, spec.name, *target, limit, repeats) for case in cases]
+                    self.measure_pass(loaded, spec, tasks)
             self.done += len(items)
 
     def measure_pass(self, problems: list[Item], spec: SolverSpec, tasks: list[Task]) -> None:
@@ -446,13 +416,9 @@ class Runner:
             self.add_skip(f"{problems[0].sequence}, {target}, {call.start}", spec.name, reason)
 
     def measure_step(
-        self,
-        problem: Problem,
-        task: Task,
-        spec: SolverSpec,
-        before: tuple[Problem, FloatArray] | None,
+        self, problem: Problem, task: Task, spec: SolverSpec, before: tuple[Problem, FloatArray] | None,
         with_motion: bool = False,
-    ) -> tuple[Row, tuple[Problem, FloatArray] | None]:
+    ) -> tuple[Row, tuple[Problem, FloatArray] | None]:  # fmt: skip
         """Measure one step; if its task has start "carried", start from the previous problem and impulses.
 
         `with_motion` adds the error of the motion after a fixed number of sweeps, which is not timed.
@@ -464,9 +430,8 @@ class Runner:
             task = replace(task, carry_time=perf_counter() - begun)
         row, impulse = self.measure_task(problem, task, spec, start)
         if with_motion and task.mode == "budget" and spec.order and impulse is not None:
-            error = motion_error(
-                problem, impulse
-            )  # Without bodies, the largest difference of a row's velocity counts.
+            error = motion_error(problem, impulse)
+            # Without bodies, the largest difference of a row's velocity counts.
             speed = error.rows if error.speed is None else error.speed
             row["motion_error"] = math.nan if speed is None else float(speed)
         return row, None if impulse is None else (problem, impulse)
@@ -555,34 +520,19 @@ def describe_load_error(source: str, error: Exception) -> str:
 # -- pairs of a campaign, in workers -----------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Pair:
+class Pair(NamedTuple):
     """One case and one solver, as they are sent to a worker."""
 
-    index: int
+    number: int
     case: str
     source: str | Problem  # A name or path that the worker resolves itself, or the problem.
-    reason: str
     solver: str
     described: Row | None  # Stored description of the case.
-    known: tuple[Row, ...]  # Stored rows of the pair.
+    known: list[Row]  # Stored rows of the pair.
 
 
-@dataclass(frozen=True)
-class Order:
-    """Data that all workers need."""
-
-    plan: Plan
-    machine: Row
-    # [bytes] Memory limit of each third-party solver's process; None: a share of the machine's.
-    memory: int | None
-    local: tuple[SolverSpec, ...] = ()  # Solvers that are registered only in the parent.
-
-
-@cache
-def _get_isolated_worker(memory: int) -> Worker:
-    """Return the process for third-party solvers; each worker has one, which all of its pairs use."""
-    return Worker(memory)
+#: Return the process for third-party solvers with a memory limit; each worker has one, which all of its pairs use.
+_get_isolated_worker = cache(Worker)
 
 
 @contextlib.contextmanager
@@ -603,22 +553,34 @@ def _register_solvers(specs: tuple[SolverSpec, ...]) -> Iterator[None]:
 _last_case: tuple[Any, Item | None, Row | None] = None, None, None
 
 
-def measure_in_worker(pair: Pair, order: Order) -> tuple[int, list[Row]]:
-    """Measure a pair in a worker, on one thread as pairs run in parallel; return its index and its rows."""
+def measure_in_worker(
+    pair: Pair, this: Row, plan: Plan, memory: int | None, local: tuple[SolverSpec, ...]
+) -> tuple[int, list[Row]]:
+    """Measure a pair in a worker, on one thread as pairs run in parallel; return its number and its rows.
+
+    Parameters
+    ----------
+    pair : Pair
+    this : row of the machine
+    plan : Plan
+    memory : int, bytes, optional
+        Memory limit of each third-party solver's process. Default: a share of the machine's.
+    local : solvers that are registered only in the parent
+    """
     global _last_case
-    shared = machine.get_memory_per_process(os.cpu_count() or 1) if order.memory is None else order.memory
-    with _register_solvers(order.local), limit_to_one_thread(pair.solver):
-        runner = Runner(order.machine, order.plan, [pair.solver], _get_isolated_worker(shared))
+    shared = machine.get_memory_per_process(os.cpu_count() or 1) if memory is None else memory
+    with _register_solvers(local), limit_to_one_thread(pair.solver):
+        runner = Runner(this, plan, [pair.solver], _get_isolated_worker(shared))
         runner.known = {get_key(row): row for row in pair.known}
         runner.described = {} if pair.described is None else {pair.case: pair.described}
         key, item, case = None, None, None
         if not isinstance(pair.source, Problem):
             changed = os.stat(pair.source).st_mtime_ns if os.path.exists(pair.source) else 0
-            key = order.machine["run"], pair.case, pair.source, changed
+            key = this["run"], pair.case, pair.source, changed
             if _last_case[0] == key:
                 _, item, case = _last_case
-        item = item or resolve_item(pair.source, pair.case, pair.reason)
+        item = item or resolve_item(pair.source, pair.case)
         runner.measure_case(item, case)
     case = next((row for row in runner.out if row["kind"] == "case"), None)
     _last_case = key, item, case
-    return pair.index, runner.out
+    return pair.number, runner.out

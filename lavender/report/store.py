@@ -17,14 +17,14 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
 from lavender.base.errors import InputError, require_packages
-from lavender.io.stored import MAX_BYTES, as_path, lock_output, make_folder, resolve_destination
+from lavender.io.stored import as_path, lock_output, make_folder, read_whole_file, resolve_destination
 from lavender.judge.solution import CLAIM_CHECKS, CONFIRMED
 from lavender.report.text import escape_unprintable, format_tolerance
 
@@ -33,9 +33,7 @@ if TYPE_CHECKING:
 
 Row: TypeAlias = dict[str, Any]  # Content of one line.
 KINDS = ("machine", "case", "run", "skip")
-MAX_LINE_BYTES = (
-    2**26
-)  # A longer last line is not of a records file; the longest lines have a few thousand bytes.
+MAX_LINE_BYTES = 2**26  # A longer last line is not of a records file; lines have a few thousand bytes.
 SYNC_INTERVAL = 1.0  # [s] A power cut loses at most the lines of this time, a killed process none.
 # Statuses of a run that returned no solution, in addition to the statuses of a solve.
 ERROR, KILLED, CRASHED = "ERROR", "KILLED", "CRASHED"
@@ -57,8 +55,8 @@ CASE_COLUMNS: Row = {
     "symmetric": True, "sequence": "", "nothing_to_do": False,
 }  # fmt: skip
 CASE_DETAILS: Row = {
-    "run": "", "case": "", "sha": "", "step": -1, "source": "", "identity": "", "bodies": 0, "nonzeros": 0,
-    "reason": "", "guess": "", "stored": math.nan, "stored_verdict": "", "diagnostics": (),
+    "run": "", "case": "", "sha": "", "step": -1, "source": "", "identity": "", "guess": "", "stored": math.nan,
+    "diagnostics": (),
 }  # fmt: skip
 CHOICES = {"start": ("cold", "warm", "carried"), "mode": ("tol", "budget"), "claim_check": CLAIM_CHECKS}
 SKIP_COLUMNS: Row = {"run": "", "case": "", "solver": "", "reason": "", "sequence": ""}
@@ -79,12 +77,12 @@ def to_jsonable(value: Any) -> Any:
     """Convert a value to one that JSON can hold: inf and nan become strings."""
     if isinstance(value, float):
         return value if math.isfinite(value) else str(value)
+    if value is None or isinstance(value, (int, str)):
+        return value
     if isinstance(value, Mapping):
         return {str(k): to_jsonable(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
-        return [to_jsonable(v) for v in value]
-    if isinstance(value, (bool, int, str)) or value is None:
-        return value
+        return list(map(to_jsonable, value))
     return to_jsonable(value.tolist()) if hasattr(value, "tolist") else str(value)
 
 
@@ -159,14 +157,9 @@ class Store:
         self.close()
 
 
-@contextlib.contextmanager
-def open_store(store: Store | str | Path | None) -> Iterator[Store | None]:
-    """Yield a store, or open the store of a path and close it at the end."""
-    if store is None or isinstance(store, Store):
-        yield store
-        return
-    with Store(store) as made:
-        yield made
+def open_store(store: Store | str | Path | None) -> contextlib.AbstractContextManager[Store | None]:
+    """Return a context manager of a store, which opens the store of a path and closes it at the end."""
+    return contextlib.nullcontext(store) if store is None or isinstance(store, Store) else Store(store)
 
 
 def make_lines(rows: Iterable[Row], source: str = "", dropped: int = 0) -> DataFrame:
@@ -198,18 +191,7 @@ def read(path: str | Path) -> DataFrame:
 
     path = as_path(path)
     path = path / "records.jsonl" if path.is_dir() else path
-    if path.exists() and not path.is_file():
-        raise InputError(f"{path} is not a file; a records.jsonl is needed")
-    try:
-        if (size := path.stat().st_size) > MAX_BYTES:
-            raise InputError(
-                f"{path} holds {size} bytes, more than the limit of {MAX_BYTES}; measure fewer cases in one folder"
-            )
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(
-            f"cannot read {path} ({error.strerror or error}); a records.jsonl is needed"
-        ) from None
+    content = read_whole_file(path, "records")
     dropped = len(content) - content.rfind(b"\n") - 1
     if dropped > MAX_LINE_BYTES:
         raise InputError(f"{path} has a line of more than {MAX_LINE_BYTES} bytes; a records.jsonl is needed")
@@ -226,9 +208,9 @@ def read(path: str | Path) -> DataFrame:
     except (ValueError, RecursionError, OverflowError, TypeError):
         is_known = False
     if not is_known:
+        reason = _describe_invalid_line(whole)
         raise InputError(
-            f"{path}{_describe_invalid_line(whole)}. Give a records.jsonl that `lavender report` wrote, or remove this "
-            "line"
+            f"{path}{reason}. Give a records.jsonl that `lavender report` wrote, or remove this line"
         )
     lines = lines if len(lines) else make_lines([])
     lines.attrs = {"source": str(path), "dropped": int(dropped > 0)}
@@ -239,17 +221,14 @@ def read(path: str | Path) -> DataFrame:
 def _describe_invalid_line(content: bytes) -> str:
     """Return the number of the first line that is not a row, and the reason."""
     for number, line in enumerate(content.decode(errors="replace").splitlines(), 1):
+        reason = "it is not an entry of a records file"
         try:
             row = json.loads(line) if line.strip() else {"kind": KINDS[0]}
-            reason = (
-                ""
-                if isinstance(row, dict) and row.get("kind") in KINDS
-                else "it is not an entry of a records file"
-            )
+            if isinstance(row, dict) and row.get("kind") in KINDS:
+                continue
         except (ValueError, RecursionError, TypeError) as error:
             reason = f"it is not JSON ({error})"
-        if reason:
-            return f", line {number}: {reason}; an object with a kind is needed, one of {', '.join(KINDS)}"
+        return f", line {number}: {reason}; an object with a kind is needed, one of {', '.join(KINDS)}"
     return ": a number or text is too large"
 
 
@@ -271,22 +250,19 @@ def convert_columns(lines: DataFrame, kind: str, columns: Row) -> DataFrame:
     some, converted = lines[lines["kind"] == kind], {}
     for name, default in columns.items():
         if name not in some:
-            converted[name] = pd.Series([default] * len(some), index=some.index, dtype=object)
+            values = pd.Series([default] * len(some), index=some.index, dtype=object)
         else:
-            converted[name] = some[name].astype(object).where(some[name].notna(), None)
-        values = converted[name]
+            known = some[name].notna()
+            values = some[name] if known.all() else some[name].astype(object).where(known, None)
+            values = values if known.all() else values.map(lambda x, y=default: y if x is None else x)
         try:
             if isinstance(default, tuple):
-                values = values.map(lambda x: [] if x is None else list(x))
-            else:
-                values = values.map(lambda x, default=default: default if x is None else x)
-            if isinstance(default, str):
-                unique = values.unique().tolist()
-                if not all(isinstance(text, str) and text in CHOICES.get(name, (text,)) for text in unique):
+                values = values.map(list)
+            elif isinstance(default, str):
+                unique, choices = values.unique().tolist(), CHOICES.get(name, ())
+                if not all(isinstance(text, str) and (text in choices or not choices) for text in unique):
                     raise TypeError(
-                        f"one of {', '.join(CHOICES[name])} is needed"
-                        if name in CHOICES
-                        else "a text is needed"
+                        f"one of {', '.join(choices)} is needed" if choices else "a text is needed"
                     )
                 texts = {text: escape_unprintable(text, name == "message") for text in unique}
                 values = values.map(texts).astype("category")
@@ -294,7 +270,7 @@ def convert_columns(lines: DataFrame, kind: str, columns: Row) -> DataFrame:
                 if not values.isin([True, False]).all():
                     raise TypeError("true or false is needed")
                 values = values.astype(bool)
-            elif not isinstance(default, tuple):
+            else:
                 values = values.astype("int64" if isinstance(default, int) else float)
         except (TypeError, ValueError, OverflowError) as error:
             raise InputError(

@@ -42,8 +42,6 @@ INSIDE = "inside the engine, warm-started, without copy and judge"
 SERVED_RESIDUAL = 0.5  # A case is served if at most this fraction of the start's residual remains.
 # A solver is recommended for a time or budget if it serves at least this share of the cases.
 SERVED_QUANTILE = 0.9
-# Columns with equal values in all runs of a pass over a sequence.
-PASS_COLUMNS = ["solver", "mode", "tol", "max_iter", "start"]
 RESIDUAL_NOISE_FACTOR = 2.0  # Residuals within this factor count as equal.
 DEATHS = ("ERROR", "KILLED", "CRASHED")
 # An exponent is fitted to at least so many cases and ratio of rows.
@@ -111,47 +109,42 @@ def compute_mean(times: Any, axis: int = 0) -> Any:
     return np.exp(np.log(np.add(times, MEAN_TIME_SHIFT)).mean(axis=axis)) - MEAN_TIME_SHIFT
 
 
-def get_times(frame: Frame, tolerance: float) -> Frame:
-    """Return the time [s] of each solver (row) on each case (column) to a tolerance: nan if it did not reach it."""
-    runs = select_ranked_runs(frame)
-    reached = runs[(runs["tol"] <= tolerance) & (runs["relative"] <= tolerance)].fillna({"time": 0.0})
-    times = reached.groupby(["solver", "case"], observed=True)["time"].min().unstack()
-    return times.reindex(index=sorted(map(str, runs["solver"].unique())), columns=list(runs["case"].unique()))
-
-
-def compute_noise(frame: Frame) -> pd.Series[float]:
-    """Return the noise of each solver's times, relative to its times, from the spread of its repetitions."""
-    ratio = (frame["time_median"] / frame["time"] - 1.0).groupby(frame["solver"].astype(str)).median()
-    return (2.0 * ratio).clip(MIN_NOISE, MAX_NOISE).fillna(MIN_NOISE)
-
-
-def rank_solvers(frame: Frame, tolerance: float) -> Frame:
+def rank_solvers(report: Contents, tolerance: float, cases: Iterable[str] | None = None) -> Frame:
     """Rank solvers by the number of cases that they bring to a tolerance, then by their mean time.
 
     Solvers with a contradicted claim come last. The first rows are within noise of the best (`tie`), `auto` first.
 
+    Parameters
+    ----------
+    report : Contents
+    tolerance : float
+    cases : names, optional
+        Cases that are ranked; default: all that a ranking counts.
+
     Returns
     -------
     DataFrame
-        By solver: `solved`, `cases`, `mean` [s] and `worst` [s] of the solved cases, `hardest` (case), `tie`, `place`.
+        By solver: `solved`, `cases`, `mean` [s] and `worst` [s] of the solved cases, `hardest` (case), `false`,
+        `noise`, `tie` and `place`.
     """
-    times, runs = get_times(frame, tolerance), select_ranked_runs(frame)
-    false = frame.loc[frame["claim_check"] == CONTRADICTED, "solver"].unique()
+    times = report.get_times(tolerance)
+    names = times.columns if cases is None else [case for case in cases if case in times]
+    times = times.loc[report.has_runs[names].any(axis=1), names]
+    false = report.frame["case"].isin(names) & (report.frame["claim_check"] == CONTRADICTED)
+    mean, solved = compute_mean(times, axis=1), times.notna().sum(axis=1)
     ranking = pd.DataFrame({
-        "solved": times.notna().sum(axis=1), "cases": times.shape[1], "worst": times.max(axis=1),
-        "mean": compute_mean(times, axis=1),
-        "hardest": times.fillna(-1.0).idxmax(axis=1) if len(times.columns) else "",
-        "false": times.index.isin(false), "noise": compute_noise(runs).reindex(times.index),
-    }, index=times.index)  # fmt: skip
+        "solved": solved, "cases": len(names), "mean": mean, "worst": times.max(axis=1),
+        "hardest": times.fillna(-1.0).idxmax(axis=1) if len(names) else "",
+        "false": times.index.isin(report.frame.loc[false, "solver"]), "noise": report.noise.reindex(times.index),
+    })  # fmt: skip
     ranking = ranking.sort_values(["false", "solved", "mean"], ascending=[True, False, True], kind="stable")
-    tie = [
-        is_tie(ranking.iloc[0], row) and not row["false"] > ranking["false"].iloc[0]
-        for _, row in ranking.iterrows()
-    ]
-    ranking["tie"] = np.array(tie, bool)
-    ranking["place"] = np.where(tie, 1, np.arange(1, len(ranking) + 1))
-    later = ~(ranking["tie"] & (ranking.index == PREFERRED_SOLVER))
-    return ranking.assign(later=later).sort_values(["place", "later"], kind="stable").drop(columns="later")
+    records = ranking.to_dict("records")
+    tie = np.array([is_tie(records[0], x) and x["false"] <= records[0]["false"] for x in records], bool)
+    ranking = ranking.assign(tie=tie, place=np.where(tie, 1, np.arange(1, len(tie) + 1)))
+    order = sorted(
+        range(len(tie)), key=lambda i: (not tie[i], tie[i] and ranking.index[i] != PREFERRED_SOLVER)
+    )
+    return ranking.iloc[order]
 
 
 def is_tie(first: Any, other: Any) -> bool:
@@ -167,22 +160,9 @@ def is_plug_in(solver: str) -> bool:
     return spec is None or not spec.builtin
 
 
-def choose_time_budgets(times: Frame) -> tuple[float, ...]:
-    """Return three decades of time [s] about the median over the cases of the fastest time."""
-    fastest = times.min().dropna()
-    fastest = fastest[fastest > 0.0]
-    middle = math.ceil(math.log10(fastest.median())) if len(fastest) else -3
-    return tuple(10.0**k for k in (middle - 1, middle, middle + 1))
-
-
 def put_preferred_first(names: Iterable[Any]) -> list[str]:
     """Return equally good solvers in their order, with `PREFERRED_SOLVER` first."""
     return sorted(map(str, names), key=lambda name: name != PREFERRED_SOLVER)
-
-
-def compute_quantiles(groups: Any, q: float | list[float]) -> Any:
-    """Compute quantiles of groups of residuals, interpolated linearly; inf if they lie between infinite residuals."""
-    return groups.quantile(q).fillna(math.inf)
 
 
 # -- answers of engines ------------------------------------------------------------------------------------
@@ -298,6 +278,7 @@ class Contents:
     earlier: Frame | None = None
     times: Sequence[float] = ()
     engines: Frame = field(default_factory=_make_answers)
+    _times: dict[float, Frame] = field(default_factory=dict, init=False)  # Results of `get_times`.
 
     @cached_property
     def runs(self) -> Frame:
@@ -336,27 +317,16 @@ class Contents:
         return bool(self.machine.get("plan", {}).get("campaign"))
 
     @cached_property
-    def newest(self) -> pd.DataFrame:
-        """The newest run; if it was stopped, the part in which all cases have the same measurements."""
-        return self._select_finished_part()[0]
+    def _finished_part(self) -> tuple[pd.DataFrame, list[str]]:
+        """Runs of the newest run that can be compared, and solvers that were not measured to the end on their cases.
 
-    @cached_property
-    def unfinished(self) -> list[str]:
-        """Solvers of a stopped run that were not measured to the end on the shown cases."""
-        return self._select_finished_part()[1]
-
-    @property
-    def has_passes_only(self) -> bool:
-        """Whether a run was stopped in the first solver of its first sequence, so that solvers cannot be compared."""
-        return bool(len(self.newest) and self.newest["solver"].iloc[0] in self.unfinished)
-
-    def _select_finished_part(self) -> tuple[pd.DataFrame, list[str]]:
-        """Return `newest` and `unfinished`.
-
-        A stopped run has the cases on which every solver was measured. If it was stopped in its first sequence, it has
-        the solvers before the one that was measured then, or, without any, the passes before the last.
+        A stopped run has the cases on which every solver was measured; if it was stopped in its first sequence, it has
+        the solvers before the one that was measured then.
         """
-        frame = select_newest_runs(self.runs, self.cases, self.machine)
+        # Times are compared only within one run, and a file that has changed is another problem.
+        sha = self.runs["case"].astype(object).map(self.cases["sha"].astype(str).to_dict())
+        is_newest = self.runs["run"] == self.machine.get("run", "")
+        frame = self.runs[is_newest & (self.runs["sha"].astype(str) == sha)]
         if not (self.is_stopped and len(frame)):
             return frame, []
         last, solvers = frame.iloc[-1], self.machine["plan"].get("solvers", ())
@@ -372,9 +342,17 @@ class Contents:
         whole = finished[finished["case"].isin([name for name, some in done.items() if some >= set(solvers)])]
         if len(whole) or not last["sequence"]:
             return whole, []
-        passes = frame[(frame[PASS_COLUMNS] != last[PASS_COLUMNS]).any(axis=1)]
-        some = done.get(str(last["case"]), set())
-        return finished if len(finished) else passes, [name for name in solvers if name not in some]
+        return finished, [name for name in solvers if name not in done.get(str(last["case"]), set())]
+
+    @property
+    def newest(self) -> pd.DataFrame:
+        """The newest run; if it was stopped, the part in which all cases have the same measurements."""
+        return self._finished_part[0]
+
+    @property
+    def unfinished(self) -> list[str]:
+        """Solvers of a stopped run that were not measured to the end on the shown cases."""
+        return self._finished_part[1]
 
     @cached_property
     def frame(self) -> pd.DataFrame:
@@ -382,11 +360,35 @@ class Contents:
         return self.newest[~self.newest["nothing_to_do"].astype(bool)]
 
     @cached_property
-    def earlier_frame(self) -> pd.DataFrame:
-        """The newest of the earlier runs."""
-        assert self.earlier is not None
-        earlier = Contents(self.earlier)
-        return select_newest_runs(earlier.runs, earlier.cases, earlier.machine)
+    def ranked_runs(self) -> Frame:
+        """The runs of `frame` that rankings count."""
+        return select_ranked_runs(self.frame)
+
+    @cached_property
+    def has_runs(self) -> Frame:
+        """Whether each solver (row) has a run on each case (column) that rankings count."""
+        runs = self.ranked_runs[["solver", "case"]].astype(str)
+        return pd.crosstab(runs["solver"], runs["case"]) > 0
+
+    @cached_property
+    def noise(self) -> pd.Series[float]:
+        """Noise of each solver's times, relative to its times: twice the spread of its repetitions, within bounds."""
+        runs = self.ranked_runs
+        ratio = (runs["time_median"] / runs["time"] - 1.0).groupby(runs["solver"].astype(str)).median()
+        return (2.0 * ratio).clip(MIN_NOISE, MAX_NOISE).fillna(MIN_NOISE)
+
+    def get_times(self, tolerance: float) -> Frame:
+        """Return the time [s] of each solver (row) on each case (column) to a tolerance: nan if it did not reach it."""
+        if tolerance not in self._times:
+            runs = self.ranked_runs
+            reached = runs[(runs["tol"] <= tolerance) & (runs["relative"] <= tolerance)].fillna({"time": 0.0})
+            times = reached.groupby(["solver", "case"], observed=True)["time"].min().unstack()
+            names = {
+                "index": sorted(map(str, runs["solver"].unique())),
+                "columns": list(runs["case"].unique()),
+            }
+            self._times[tolerance] = times.reindex(**names)
+        return self._times[tolerance]
 
     @cached_property
     def tolerances(self) -> tuple[float, ...]:
@@ -404,8 +406,11 @@ class Contents:
 
     @cached_property
     def time_budgets(self) -> tuple[float, ...]:
-        """Time budgets [s] for which a solver is recommended."""
-        return tuple(self.times) or choose_time_budgets(get_times(self.frame, self.tolerance))
+        """Time budgets [s] for which a solver is recommended; default: three decades about the fastest times."""
+        fastest = self.get_times(self.tolerance).min()
+        fastest = fastest[fastest > 0.0]
+        middle = math.ceil(math.log10(fastest.median())) if len(fastest) else -3
+        return tuple(self.times) or tuple(10.0**k for k in (middle - 1, middle, middle + 1))
 
     @cached_property
     def structures(self) -> dict[str, list[str]]:
@@ -415,20 +420,11 @@ class Contents:
     @cached_property
     def busy_warning(self) -> str:
         """A sentence if other processes used the processors while times were taken; else empty."""
-        if self.is_campaign or not len(self.frame):
+        if self.is_campaign or (self.frame["mode"] == "budget").all():  # Errors do not depend on the load.
             return ""
         loads = [None if x != x else float(x) for x in self.frame["load"]]
         busy = machine.make_busy_warning(loads, int(self.frame["cores"].iloc[0]))
         return f"{busy} The times are invalid; measure again with --no-reuse." if busy else ""
-
-
-def select_newest_runs(runs: Frame, cases: Frame, machine: Row) -> Frame:
-    """Return the runs of the machine that wrote last, of cases with unchanged numbers.
-
-    Times are compared only within one run, and a file that has changed is another problem.
-    """
-    same = runs["sha"].astype(str) == runs["case"].astype(object).map(cases["sha"].astype(str).to_dict())
-    return runs[same & (runs["run"] == machine.get("run", ""))]
 
 
 # -- tables ------------------------------------------------------------------------------------------------
@@ -438,10 +434,9 @@ def tabulate_fastest(report: Contents) -> Frame:
     """Tabulate the fastest solver to each tolerance by structure and sequence, with the solvers that tie with it."""
     rows = []
     for name, cases in report.structures.items():
-        some = report.frame[report.frame["case"].isin(cases)]
         row: Row = {"structure": name, "cases": len(cases)}
         for tolerance in report.tolerances:
-            ranking, target = rank_solvers(some, tolerance), f"to {format_tolerance(tolerance)}"
+            ranking, target = rank_solvers(report, tolerance, cases), f"to {format_tolerance(tolerance)}"
             ties, first = list(map(str, ranking.index[ranking["tie"]]))[:MAX_TIES], ranking.head(1)
             row[target] = " ≈ ".join(ties) or "none"
             if ties and (solved := first["solved"].iloc[0]) < len(cases):
@@ -458,10 +453,14 @@ def tabulate_times(report: Contents) -> Frame:
     """
     tables = []
     for law, some in report.frame.groupby("law", observed=True):
-        order = rank_solvers(some, report.tolerance).index
-        parts: Row = {"law": law, "solver": order, "cases": some["case"].nunique()}
+        cases = list(some["case"].unique())
+        order = rank_solvers(report, report.tolerance, cases).index
+        parts: Row = {"law": law, "solver": order, "cases": len(cases)}
         for tolerance in report.tolerances:
-            ranking, target = rank_solvers(some, tolerance).loc[order], f"to {format_tolerance(tolerance)}"
+            ranking, target = (
+                rank_solvers(report, tolerance, cases).loc[order],
+                f"to {format_tolerance(tolerance)}",
+            )
             parts |= {
                 f"solved {target}": ranking["solved"].array,
                 f"time {target} [s]": ranking["mean"].array,
@@ -473,10 +472,14 @@ def tabulate_times(report: Contents) -> Frame:
 
 def tabulate_cases(report: Contents) -> Frame:
     """Tabulate each case: size, fastest solvers to the middle tolerance, and residual of its stored answer."""
-    false = report.frame["claim_check"] == CONTRADICTED
-    times = get_times(report.frame[~false], report.tolerance)
-    noise, fastest = compute_noise(report.frame).reindex(times.index), times.min()
-    near = times.div(1.0 + np.maximum(noise, MIN_NOISE), axis=0) <= fastest
+    false = report.frame.loc[
+        report.frame["claim_check"] == CONTRADICTED, ["solver", "case"]
+    ].drop_duplicates()
+    times = report.get_times(report.tolerance).copy()
+    for solver, case in false.itertuples(index=False):
+        times.loc[times.index == solver, times.columns == case] = math.nan
+    fastest = times.min()
+    near = times.div(1.0 + report.noise.reindex(times.index), axis=0) <= fastest
     table = report.cases.loc[times.columns, ["case", "law", "rows", "contacts", "islands", "structure"]]
     table[f"fastest to {format_tolerance(report.tolerance)}"] = [
         " ≈ ".join(put_preferred_first(times[case][near[case]].sort_values().index)[:MAX_TIES]) or "none"
@@ -557,7 +560,7 @@ def tabulate_costs(report: Contents) -> Frame:
 
     The exponent is fitted to the logarithms of the cases that a solver solves.
     """
-    times, rows_of = get_times(report.frame, report.tolerance), report.cases["rows"].to_dict()
+    times, rows_of = report.get_times(report.tolerance), report.cases["rows"].to_dict()
     rows = []
     for solver, own in times.iterrows():
         t = own.dropna()
@@ -580,7 +583,8 @@ def tabulate_budgets(report: Contents) -> Frame:
     """Tabulate the residual of each solver after fixed numbers of iterations: median and 90th percentile."""
     runs = select_starts(report.frame[report.frame["mode"] == "budget"])
     groups = runs.groupby(["solver", "max_iter"], observed=True)["relative"]
-    table = compute_quantiles(groups, [0.5, SERVED_QUANTILE]).unstack([1, 2]).sort_index(axis=1)
+    # Between two infinite residuals, the interpolated quantile is nan.
+    table = groups.quantile([0.5, SERVED_QUANTILE]).fillna(math.inf).unstack([1, 2]).sort_index(axis=1)
     names = {0.5: "median", SERVED_QUANTILE: "90 %"}
     table.columns = [f"{format_count(n, 'iteration')}, {names[q]} [-]" for n, q in table.columns]
     return table.rename_axis("solver").reset_index() if len(runs) else pd.DataFrame()
@@ -588,19 +592,18 @@ def tabulate_budgets(report: Contents) -> Frame:
 
 def tabulate_in_time(report: Contents) -> Frame:
     """Tabulate the solver with the smallest residual within each time by structure; none if it serves too few cases."""
-    runs, rows = select_starts(report.frame), []
-    for name, cases in report.structures.items():
-        some, row = runs[runs["case"].isin(cases)], {"structure": name, "cases": len(cases)}
-        for t in report.time_budgets:
-            done = some[some["time"] <= t].groupby(["solver", "case"], observed=True)["relative"].min()
-            left = done.unstack().reindex(columns=cases).fillna(1.0)
-            groups = left.stack().groupby("solver", observed=True)
-            score = compute_quantiles(groups, SERVED_QUANTILE).sort_values(kind="stable")
-            score = score[(left <= SERVED_RESIDUAL).mean(axis=1).reindex(score.index) >= SERVED_QUANTILE]
+    rows: list[Row] = [{"structure": name, "cases": len(cases)} for name, cases in report.structures.items()]
+    runs = select_starts(report.frame)
+    for t in report.time_budgets:
+        done = runs[runs["time"] <= t].groupby(["solver", "case"], observed=True)["relative"].min().unstack()
+        left = done.reindex(columns=list(runs["case"].unique())).fillna(1.0)
+        for row, cases in zip(rows, report.structures.values(), strict=True):
+            own = left[cases][(left[cases] <= SERVED_RESIDUAL).mean(axis=1) >= SERVED_QUANTILE]
+            # Between two infinite residuals, the interpolated quantile is nan.
+            score = own.quantile(SERVED_QUANTILE, axis=1).fillna(math.inf).sort_values(kind="stable")
             near = put_preferred_first(score.index[score <= RESIDUAL_NOISE_FACTOR * score.min()])
             row[f"in {format_seconds(t)}"] = " ≈ ".join(near[:MAX_TIES]) or "none"
             row[f"residual in {format_seconds(t)} [-]"] = score[near[0]] if near else math.nan
-        rows.append(row)
     return pd.DataFrame(rows)
 
 
@@ -633,27 +636,26 @@ def tabulate_sweeps(report: Contents) -> Frame:
     """Tabulate the largest errors over the steps of each sequence after fixed numbers of sweeps, cold and carried.
 
     The solvers are those with a sweep order. The velocity error is the judge's, of the worst row. The motion error is
-    the largest difference of a body's velocity from that of a solution, over about 20 steps of a sequence.
+    the largest difference of a body's velocity from that of a solution, over about 20 steps of a sequence. The first
+    step, which has no step before it, does not count. `steps` is the number of steps with all of these runs.
     """
     sweeps = [name for name, spec in registry.specs().items() if spec.order and name not in PLAIN_SWEEPS]
     order = [*PLAIN_SWEEPS, *sorted(sweeps)]
-    runs = report.frame[(report.frame["mode"] == "budget") & (report.frame["step"] >= 0)]
+    runs = report.frame[(report.frame["mode"] == "budget") & (report.frame["step"] > 0)]
     runs = runs[(runs["order"] == "given") & runs["solver"].isin(order)]
     if not len(runs):
         return pd.DataFrame()
     keys = ["sequence", "solver", "max_iter", "start"]
     groups = runs.astype(dict.fromkeys(("sequence", "solver", "start"), str)).groupby(keys, sort=False)
-    largest = groups.agg(steps=("case", "size"), relative=("relative", "max"), velocity=("velocity", "max"),
-                         motion=("motion_error", "max"))  # fmt: skip
-    table = largest.unstack("start")
+    heads = {"relative": "residual, {} [-]", "velocity": "velocity error, {} [m/s]",
+             "motion_error": "motion error, {} [m/s]"}  # fmt: skip
+    table, steps = groups[list(heads)].max().unstack("start"), groups.size().unstack("start").min(axis=1)
     out = table.index.to_frame(index=False).rename(columns={"max_iter": "sweeps"})
-    columns = {"steps": "", "relative": "residual, {} [-]", "velocity": "velocity error, {} [m/s]",
-               "motion": "motion error, {} [m/s]"}  # fmt: skip
-    for name, head in columns.items():
+    for name, head in heads.items():
         for start in ("cold", "carried"):
-            if head and (name, start) in table:
+            if (name, start) in table:
                 out[head.format(start)] = table[name, start].to_numpy()
-    out["steps"] = table["steps"].max(axis=1).to_numpy()
+    out["steps"] = steps.to_numpy()
     return out.sort_values("solver", key=lambda solvers: solvers.map(order.index), kind="stable")
 
 
@@ -665,7 +667,7 @@ def tabulate_engines(report: Contents) -> Frame:
         own, cases = every[every["verdict"] != LEFT_OUT], report.cases[folders == folder]
         if not len(own):
             continue
-        ranking = rank_solvers(report.frame[report.frame["case"].isin(cases.index)], report.tolerance)
+        ranking = rank_solvers(report, report.tolerance, cases.index)
         first = {"solver": "none"} | next(
             iter(ranking[ranking["solved"] > 0].reset_index().to_dict("records")), {}
         )
@@ -692,7 +694,8 @@ def tabulate_changes(report: Contents) -> Frame:
     Earlier times are multiplied by the change of the time of the loop of fixed work on the same case.
     """
     rows, keys = [], ["case", "sha", "solver", "start", "tol"]
-    frames = (report.earlier_frame, report.frame[report.frame["step"] < 0])
+    assert report.earlier is not None
+    frames = Contents(report.earlier).newest, report.frame[report.frame["step"] < 0]
     some = [
         f[(f["mode"] == "tol") & (f["order"] == "given")].astype(dict.fromkeys(keys[:4], str)) for f in frames
     ]

@@ -11,7 +11,7 @@ from __future__ import annotations
 import gc
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
@@ -43,6 +43,8 @@ UNLIMITED_ITERATIONS = 10_000_000  # Iteration limit of a run to a tolerance; th
 HANG_LIMIT = 60.0
 LONG_TIME = 0.05  # [s] A call that took longer is not repeated: caches and the clock hardly affect its time.
 CLAIM_STATUSES = (Status.CONVERGED, Status.ROUNDOFF_LIMIT, Status.INFEASIBLE)
+# A run that missed its tolerance with one of these reaches no tighter tolerance either.
+HOPELESS_STATUSES = ("TIME_LIMIT", "KILLED", "ERROR", "INFEASIBLE", "CRASHED")
 # Line that removes a guess from a problem.
 COLD_PROBLEM = "problem = dataclasses.replace(problem, guess=None)"
 CARRIED_START = (
@@ -90,7 +92,7 @@ class Task:
     @classmethod
     def of_row(cls, row: Row, time_limit: float) -> Task:
         """Create the task that measures the run of a row once more."""
-        return cls(**{**{name: row[name] for name in _SHARED}, "time_limit": time_limit})
+        return cls(**{name: row[name] for name in _SHARED} | {"time_limit": time_limit})
 
     @property
     def arguments(self) -> dict[str, Any]:
@@ -209,15 +211,12 @@ def run_task_or_return_error(problem: Problem, task: Task, impulse: Any = None) 
         _import_solver_code(task.solver)
         with _stabilise_timing(task.solver):
             begun = perf_counter()
-            while not times or len(times) < task.repeats:
+            while len(times) < max(1, task.repeats):
                 calibration_times.append(measure_calibration_time())
                 solution, elapsed = _time_call(problem, task, impulse, limited=task.guarded and not times)
                 times.append(elapsed)
-                if (
-                    solution.status is Status.TIME_LIMIT
-                    or elapsed > LONG_TIME
-                    or perf_counter() - begun > task.time_limit
-                ):
+                late = elapsed > LONG_TIME or perf_counter() - begun > task.time_limit
+                if late or solution.status is Status.TIME_LIMIT:
                     break
     except Exception as error:
         # A backend may raise any exception; only its own record is lost.
@@ -263,10 +262,8 @@ def _time_call(problem: Problem, task: Task, impulse: Any, limited: bool) -> tup
     spec, arguments = registry.get(task.solver), task.arguments
     if limited:
         arguments["time_limit"] = task.time_limit
-        if (
-            "isolate" in spec.accepts
-        ):  # The runner has placed third-party solvers in a separate process already.
-            arguments.setdefault("isolate", False)
+        # The runner has placed third-party solvers in a separate process already.
+        arguments |= {"isolate": False} if "isolate" in spec.accepts else {}
     if task.start == "carried":
         arguments["impulse"] = problem.start() if impulse is None else impulse
     limits = [None] if task.mode == "tol" and not spec.builtin and task.max_iter else []
@@ -374,14 +371,17 @@ class Plan:
         for name in ("tolerances", "budgets", "orders"):
             entries = check_sequence(name, getattr(self, name), "words" if name == "orders" else "numbers")
             object.__setattr__(self, name, tuple(entries))
-        for value in self.tolerances:
-            check_float("tolerance", value, above=0.0)
-        if not self.tolerances and not self.budgets:
+        tolerances = [check_float("tolerance", value, above=0.0) for value in self.tolerances]
+        budgets = [check_int("budget", n, 1) for n in self.budgets]
+        if not tolerances and not budgets:
             raise InputError("without tolerances and budgets there is nothing to run: give one of the two")
-        check_int("repeats", self.repeats, 1)
-        check_int("cap", self.cap, 1)
-        check_float("time_limit", self.time_limit, above=0.0)
-        check_float("sequence_time_limit", self.sequence_time_limit, above=0.0)
+        # Remove duplicates: a value given twice would be run twice and change the middle value.
+        object.__setattr__(self, "tolerances", tuple(sorted(set(tolerances), reverse=True)))
+        object.__setattr__(self, "budgets", tuple(sorted(set(budgets))))
+        for name in ("repeats", "cap"):
+            check_int(name, getattr(self, name), 1)
+        for name in ("time_limit", "sequence_time_limit"):
+            check_float(name, getattr(self, name), above=0.0)
         for name in ("warm", "campaign"):
             check_bool(name, getattr(self, name))
         for word in self.orders:
@@ -389,18 +389,9 @@ class Plan:
             if name not in SWEEP_ORDERS:
                 raise UnknownName("order", name, SWEEP_ORDERS)
             if seed and not (name == "random" and seed.isdecimal()):
-                raise InputError(
-                    f"order {word!r} has an invalid seed {seed!r}; only the order random has a seed, an "
-                    "integer: random:3"
-                )
-        # Remove duplicates: a value given twice would be run twice and change the middle value.
-        unique: dict[str, Iterable[Any]] = {
-            "tolerances": sorted({float(x) for x in self.tolerances}, reverse=True),
-            "budgets": sorted({check_int("budget", n, 1) for n in self.budgets}),
-            "orders": dict.fromkeys(self.orders),
-        }
-        for name, values in unique.items():
-            object.__setattr__(self, name, tuple(values))
+                advice = "only the order random has a seed, an integer: random:3"
+                raise InputError(f"order {word!r} has an invalid seed {seed!r}; {advice}")
+        object.__setattr__(self, "orders", tuple(dict.fromkeys(self.orders)))
 
     def measure_solver(
         self, case: Row, problem: Problem, spec: SolverSpec, make: Callable[[Task], Row]
@@ -415,10 +406,8 @@ class Plan:
 
         def measure_one(mode: str, tol: float, max_iter: int, start: str, order: str = "given") -> Row:
             """Make one measurement; a fixed number of iterations is timed once."""
-            repeats = 1 if mode == "budget" else self.repeats
-            return make(
-                Task.of_case(case, spec.name, mode, tol, max_iter, start, self.time_limit, repeats, order)
-            )
+            target, repeats = (mode, tol, max_iter, start), 1 if mode == "budget" else self.repeats
+            return make(Task.of_case(case, spec.name, *target, self.time_limit, repeats, order))
 
         starts = ["cold"]
         if self.warm and case["guess"] == "start" and spec.impulse and not spec.exact:
@@ -427,7 +416,7 @@ class Plan:
         for start in starts:
             for tolerance in self.tolerances[-1:] if spec.exact else self.tolerances:
                 row = measure_one("tol", tolerance, max_iterations, start)
-                is_last = spec.resumable or _rules_out_tighter_tolerances(row)
+                is_last = spec.resumable or str(row["status"]).startswith(HOPELESS_STATUSES)
                 if is_last and not row["relative"] <= tolerance:
                     break
             if spec.resumable and not spec.exact:
@@ -465,8 +454,3 @@ def list_passes(plan: Plan, spec: SolverSpec) -> list[tuple[str, float, int, str
         targets = [*(("budget", 0.0, n) for n in plan.budgets), *targets]
     starts = ("cold", "carried") if spec.impulse and not spec.exact else ("cold",)
     return [(*target, start) for start in starts for target in targets]
-
-
-def _rules_out_tighter_tolerances(row: Row) -> bool:
-    """Whether a run that missed its tolerance shows that tighter tolerances cannot be reached either."""
-    return str(row["status"]).startswith(("TIME_LIMIT", "KILLED", "ERROR", "INFEASIBLE", "CRASHED"))

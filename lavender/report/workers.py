@@ -47,11 +47,9 @@ GRACE_TIME = 2.0  # [s] Time for set-up and judging beyond the repetitions' limi
 
 def check_workers(workers: Any) -> None:
     """Raise InputError unless the number of workers is -1 or 1 to MAX_WORKERS."""
-    is_int = isinstance(workers, int) and not isinstance(workers, bool)
-    if not is_int or not (workers == -1 or 1 <= workers <= MAX_WORKERS):
-        raise InputError(
-            f"workers is {workers!r}; -1 (one for each core) or a whole number from 1 to {MAX_WORKERS} is needed"
-        )
+    if type(workers) is not int or not (workers == -1 or 1 <= workers <= MAX_WORKERS):
+        need = f"-1 (one for each core) or a whole number from 1 to {MAX_WORKERS} is needed"
+        raise InputError(f"workers is {workers!r}; {need}")
 
 
 def map_unordered(
@@ -77,13 +75,10 @@ def map_unordered(
         lost = (*lost, KilledWorker, FutureCancelledError)
     parent = os.getpid() if backend == "loky" else 0  # 0 if workers belong to a cluster.
     with joblib.parallel_config(backend=backend, n_jobs=workers):
-        calls = (
-            joblib.delayed(_call_in_worker)(parent, function, call_arguments) for call_arguments in arguments
-        )
+        calls = (joblib.delayed(_call_in_worker)(parent, function, each) for each in arguments)
         try:
-            parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1)
             with _ignore_sigint() if hasattr(signal, "pthread_sigmask") else contextlib.nullcontext():
-                results = parallel(calls)
+                results = joblib.Parallel(return_as="generator_unordered", batch_size=1)(calls)
             try:
                 for result in results:  # noqa: UP028 - `yield from` would close `results` without the filter below
                     yield result
@@ -143,17 +138,11 @@ def connect_backend(spec: str) -> tuple[str, contextlib.AbstractContextManager[A
     from joblib.parallel import BACKENDS
 
     name, _, address = spec.partition("=")
-    if name == "dask":
-        return name, _connect_dask(address)
-    if name not in BACKENDS or address or name == "ray":
-        raise InputError(
-            f"joblib has no backend {spec!r}: 'loky' runs processes on this machine, 'dask' or 'dask=ADDRESS' a cluster"
-        )
-    return name, contextlib.nullcontext()
-
-
-def _connect_dask(address: str) -> contextlib.AbstractContextManager[Any]:
-    """Return a client of the scheduler, or an empty context if there is a client already."""
+    if name not in (*BACKENDS, "dask") or (address and name != "dask") or name == "ray":
+        known = "'loky' runs processes on this machine, 'dask' or 'dask=ADDRESS' a cluster"
+        raise InputError(f"joblib has no backend {spec!r}: {known}")
+    if name != "dask":
+        return name, contextlib.nullcontext()
     try:
         import dask
         import distributed
@@ -164,16 +153,17 @@ def _connect_dask(address: str) -> contextlib.AbstractContextManager[Any]:
     address = address or dask.config.get("scheduler-address", "")
     try:
         if address:
-            return distributed.Client(address, timeout=CONNECT_TIMEOUT)  # type: ignore[no-untyped-call]
+            client = distributed.Client(address, timeout=CONNECT_TIMEOUT)  # type: ignore[no-untyped-call]
+            return name, client
         distributed.get_client()
     except (OSError, ValueError) as error:
+        advice = "use dask=tcp://HOST:8786, set DASK_SCHEDULER_ADDRESS, or make a distributed.Client first"
         raise InputError(
             f"no dask scheduler answers at {address!r} ({error}); start one there"
             if address
-            else "backend 'dask' needs a scheduler: use dask=tcp://HOST:8786, set DASK_SCHEDULER_ADDRESS, or make a "
-            "distributed.Client first"
+            else f"backend 'dask' needs a scheduler: {advice}"
         ) from None
-    return contextlib.nullcontext()
+    return name, contextlib.nullcontext()  # The current client is used.
 
 
 # -- the isolated process ----------------------------------------------------------------------------------
@@ -269,15 +259,9 @@ class Worker:
 
 
 def solve_isolated(
-    worker: Worker,
-    problem: Problem,
-    name: str,
-    *,
-    tol: float,
-    max_iter: int | None = None,
-    time_limit: float | None = None,
-    **options: Any,
-) -> Solution:
+    worker: Worker, problem: Problem, name: str, *, tol: float, max_iter: int | None = None,
+    time_limit: float | None = None, **options: Any,
+) -> Solution:  # fmt: skip
     """Solve as `lv.solve` does. A solver that another process can import by its entry point runs in the worker.
 
     Raises
@@ -318,7 +302,7 @@ def run_task(problem: Problem | None, task: Task, impulse: Any) -> subprocesses.
 
 def _is_count(value: Any) -> bool:
     """Return whether a value is a 64-bit integer that is not negative."""
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**63
+    return type(value) is int and 0 <= value < 2**63
 
 
 #: Test of each entry of an outcome but its arrays, as another process sends it; times are tested later.
@@ -346,16 +330,12 @@ def parse_outcome(answer: Row, arrays: list[Any], m: int, elapsed: float) -> Row
         if not is_valid(answer.get(name)):
             raise ValueError(f"{name} is {answer.get(name)!r:.60}")
     if len(arrays) != 2 or arrays[0] is None or any(x is not None and len(x) != m for x in arrays):
-        sizes = ["none" if x is None else str(len(x)) for x in arrays]
-        raise ValueError(
-            f"the worker returned {len(arrays)} arrays with numbers of entries {', '.join(sizes)}; two arrays are "
-            f"needed: {m} impulses, and {m} impulses or none"
-        )
+        sizes = ", ".join("none" if x is None else str(len(x)) for x in arrays)
+        raise ValueError(f"arrays of {sizes} numbers; {m} impulses, and {m} impulses or none are needed")
     times = [answer["setup_time"], answer["solve_time"], *answer["times"]]
-    if not all(0.0 <= t <= elapsed for t in times):
-        raise ValueError(
-            f"the worker returned negative times, or times longer than the call of {elapsed:.3g} s"
-        )
-    if math.fsum(times[2:]) > elapsed or not 0.0 <= answer["calibration_time"] <= elapsed:
-        raise ValueError(f"the worker returned times that add up to more than the call of {elapsed:.3g} s")
+    if (
+        not all(0.0 <= t <= elapsed for t in (*times, answer["calibration_time"]))
+        or math.fsum(answer["times"]) > elapsed
+    ):
+        raise ValueError(f"negative times, or times that add up to more than the call of {elapsed:.3g} s")
     return {name: answer[name] for name in OUTCOME_TESTS} | dict(zip(OUTCOME_ARRAYS, arrays, strict=True))

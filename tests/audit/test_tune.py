@@ -9,10 +9,10 @@ from calls import EARLY_BOXES as EARLY
 
 import lavender as lv
 from lavender.audit.audit import audit
+from lavender.audit.page import StepSizes
 from lavender.audit.settings import OPTIONS, PROBLEM_OPTIONS
 from lavender.audit.settings import MujocoSetting as Setting
 from lavender.audit.simulated_worlds import Runs
-from lavender.audit.step_sizes import StepSizes
 from lavender.audit.tune import Measured, Tuning, mujoco_settings, sweep, tune
 from lavender.audit.tune.mujoco_settings import Stage, list_first_settings
 

@@ -30,14 +30,8 @@ def record(case, solver, time, relative, **more):
 
 
 def skip(case, solver, reason, sequence=""):
-    return {
-        "kind": "skip",
-        "run": "run",
-        "case": case,
-        "solver": solver,
-        "reason": reason,
-        "sequence": sequence,
-    }
+    pair = {"case": case, "solver": solver, "sequence": sequence}
+    return {"kind": "skip", "run": "run", "reason": reason, **pair}
 
 
 def lines_of(*made, cases=None, whole=True, solvers=None, walk=False, more=()):

@@ -110,6 +110,21 @@ def test_relaxed_friction_is_compared_with_a_solver_of_cones_although_a_qp_solve
         assert row.velocity == solution.residual.velocity
 
 
+@pytest.mark.parametrize(
+    ("relative", "floor", "passes"), [(9e-6, 1e-6, True), (1e-3, 1e-2, False), (2e-9, 0.0, False)]
+)
+def test_solve_reference_excuses_ten_floors_up_to_the_largest_excused_residual(relative, floor, passes):
+    problem = bounded_problem(1)
+    solution = lv.solve(problem, "osqp", tol=1e-10)
+    judged = replace(solution.residual, relative=relative, roundoff_floor=floor)
+
+    def run_solver(name, **_):
+        return replace(solution, residual=judged)
+
+    found = check.solve_reference(problem, "osqp", lv.known(problem), run_solver)
+    assert (found[1] == "osqp") == passes and (found[0] is None) != passes
+
+
 # -- claims ---------------------------------------------------------------------------------------------
 
 

@@ -17,7 +17,7 @@ def test_a_report_shows_the_verdict_of_a_stored_answer_in_float32(tmp_path):
     problem = dataclasses.replace(robot(2), precision="float32")
     lv.io.save(problem, tmp_path / "early.npz", impulse=0.9 * lv.solve(problem, tol=1e-11).impulse)
     (item,) = resolve_sources([tmp_path / "early.npz"])
-    assert describe_case(item, "run")["stored_verdict"].startswith("stopped before convergence, ")
+    assert item.judge_stored_answer().verdict == "stopped before convergence"
 
 
 def test_a_recording_of_a_float32_engine_counts_its_early_answers(tmp_path):

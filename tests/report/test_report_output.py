@@ -14,17 +14,9 @@ import pytest
 from rich.console import Console
 from worked import python
 
+from lavender.report import figures as drawing
 from lavender.report import write
-from lavender.report.figures import (
-    PLUG_IN_COLORS,
-    SOLVER_COLORS,
-    Curve,
-    Figure,
-    assign_styles,
-    build_figures,
-    build_overall_figure,
-    render_svg,
-)
+from lavender.report.figures import Curve, Figure, assign_styles, build_figures, render_svg
 from lavender.report.findings import COMMAND_LINES, MAX_LINES, SECTIONS
 from lavender.report.render import (
     NUMBER,
@@ -169,8 +161,8 @@ def test_print_table_that_is_too_wide_leaves_numbers_out_and_keeps_the_first_col
 def test_styles_tell_solvers_apart_and_plug_ins_have_their_own_colours():
     styles = assign_styles(["auto", "direct", "newton", "pgs", "osqp", "anderson", "mine", "yours"])
     assert len({(s["color"], s["linestyle"]) for s in styles.values()}) == len(styles)
-    assert {styles[n]["color"] for n in ("mine", "yours")} <= set(PLUG_IN_COLORS)
-    assert not set(PLUG_IN_COLORS) & set(SOLVER_COLORS)
+    assert {styles[n]["color"] for n in ("mine", "yours")} <= set(drawing.PLUG_IN_COLORS)
+    assert not set(drawing.PLUG_IN_COLORS) & set(drawing.SOLVER_COLORS)
     assert assign_styles(["auto", "x"])["auto"] == assign_styles(["auto", "pgs"])["auto"]
 
 
@@ -213,7 +205,7 @@ def test_render_svg_draws_a_covered_curve_wider_so_that_it_can_be_seen():
 def test_build_overall_figure_is_the_median_of_the_residuals_reached_by_each_time():
     made = [record(c, "pgs", t, x) for c, t, x in (("a", 1e-3, 1e-2), ("b", 1e-2, 1e-4), ("c", 1e-1, 1e-6))]
     made.append(record("a", "some", 1e-3, 1e-8))
-    figure = build_overall_figure(report_of(*made))
+    figure = drawing.build_overall_figure(report_of(*made))
     assert figure.title == "Error against time, median over 3 cases"
     by = {c.solver: c for c in figure.curves}
     # Two of three cases have a result from 10 ms on; the median is then the worse of the two.

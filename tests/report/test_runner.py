@@ -20,15 +20,7 @@ from worked import python
 import lavender as lv
 from lavender import report, suite
 from lavender.report import cases, machine, runner, store, timing, workers
-from lavender.report.store import (
-    KEY,
-    RUN_COLUMNS,
-    make_lines,
-    select_cases,
-    select_runs,
-    select_skips,
-    to_jsonable,
-)
+from lavender.report.store import KEY, RUN_COLUMNS, make_lines, select_cases, select_runs, select_skips
 from lavender.report.timing import format_call
 
 QUICK = report.Plan(tolerances=(1e-3, 1e-8), budgets=(2, 5), repeats=2, time_limit=60.0, orders=("reverse",))
@@ -70,11 +62,8 @@ def test_run_records_have_the_judged_result_of_each_target_and_its_times():
         again = lv.solve(p, "pgs", tol=r.tol, max_iter=r.max_iter, order=r.order)
         error = again.residual
         assert (r.relative, r.energy, r.velocity) == (error.relative, error.energy, error.velocity)
-        assert (r.status, r.worst_row, json.loads(r.work)) == (
-            again.status.name,
-            error.worst_row,
-            dict(again.work),
-        )
+        found = r.status, r.worst_row, json.loads(r.work)
+        assert found == (again.status.name, error.worst_row, dict(again.work))
         assert r.success == (r.mode == "tol") and 1 <= r.repetitions <= (1 if r.mode == "budget" else 2)
         assert 0.0 < r.time <= r.time_median and r.setup_time + r.solve_time > 0.0
         assert (r.structure, r.islands, r.rows) == ("stack", 1, 12)
@@ -224,7 +213,7 @@ def test_store_has_each_row_when_it_is_made(tmp_path):
 
     def watch(event):
         if event.row is not None:
-            seen.append(json.loads(path.read_text().splitlines()[-1]) == to_jsonable(event.row))
+            seen.append(json.loads(path.read_text().splitlines()[-1]) == store.to_jsonable(event.row))
 
     found = report.run(
         [stack(6)], ["pgs", "direct"], dataclasses.replace(QUICK, repeats=1), path, watch=watch
@@ -420,11 +409,8 @@ def test_records_of_two_sequences_with_one_name_are_kept_apart(tmp_path):
 def test_campaign_one_worker_and_two_give_equal_bits_and_no_times(tmp_path):
     one = report.run(NAMES, ["pgs", "direct"], CAMPAIGN)
     two = report.run(NAMES, ["pgs", "direct"], CAMPAIGN, workers=2)
-    assert (
-        texts(one) == texts(two)
-        and select_cases(one).equals(select_cases(two))
-        and skipped(one) == skipped(two)
-    )
+    assert texts(one) == texts(two) and skipped(one) == skipped(two)
+    assert select_cases(one).equals(select_cases(two))
     found = rows_of(one)
     assert all(r.repetitions == 0 and math.isnan(r.time) and math.isnan(r.setup_time) for r in found)
     (r,) = (r for r in found if (r.case, r.solver, r.max_iter, r.order) == (NAMES[0], "pgs", 8, "given"))

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lavender.audit.page import ResultPage
+from lavender.audit.page import ResultPage, StepSizes, describe_exceedance
 from lavender.audit.settings import MERGE_NOTE, MujocoSetting
-from lavender.audit.step_sizes import StepSizes, describe_exceedance
-from lavender.audit.tune.measured import Measured
+from lavender.audit.tune.mujoco_settings import Measured
 from lavender.base.deadline import format_seconds
 from lavender.problem.derived import cached_property
 from lavender.report.figures import Curve, Figure

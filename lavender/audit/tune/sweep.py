@@ -4,7 +4,7 @@
     result.faster, result.closer; result.page.write("lavender-tune")
 
 Settings are chosen on the worlds with even numbers. The chosen settings are tested on the worlds with odd numbers,
-which are held back. `lavender.audit.tune.measured` describes the measurements. If less than the fraction
+which are held back. `lavender.audit.tune.mujoco_settings` describes the measurements. If less than the fraction
 `MIN_CONTACT_SHARE` of the steps has contact, only the present setting is measured and no setting is recommended.
 """
 
@@ -22,12 +22,18 @@ from typing import Any
 import numpy as np
 
 from lavender.audit.audit import hash_parameters
+from lavender.audit.page import StepSizes
 from lavender.audit.pieces import Judging
 from lavender.audit.settings import MujocoSetting
 from lavender.audit.simulated_worlds import Runs, can_any_geoms_collide, count_engine_warnings
-from lavender.audit.step_sizes import StepSizes
-from lavender.audit.tune.measured import Measured, Progress, make_unmeasured
-from lavender.audit.tune.mujoco_settings import Stage, list_first_settings, list_variants
+from lavender.audit.tune.mujoco_settings import (
+    Measured,
+    Progress,
+    Stage,
+    list_first_settings,
+    list_variants,
+    make_unmeasured,
+)  # fmt: skip
 from lavender.audit.tune.recommendation import Tuning
 from lavender.base.arrays import check_float, check_int
 from lavender.base.errors import InputError
@@ -49,22 +55,12 @@ JUDGED_FILE = "judged.npz"  # Errors of the settings judged, which a later call 
 
 
 def tune(
-    model: Any,
-    *,
-    worlds: int = 16,
-    steps: int = 200,
-    control: Control = "random",
-    seed: int = 0,
-    spread: float | None = None,
-    states: Any = None,
-    horizon: int = 10,
-    repeats: int = 5,
-    threshold: float = DEFAULT_THRESHOLD,
-    max_velocity_error: float | None = None,
-    folder: str | os.PathLike[str] | None = None,
-    reuse: bool = True,
+    model: Any, *, worlds: int = 16, steps: int = 200, control: Control = "random", seed: int = 0,
+    spread: float | None = None, states: Any = None, horizon: int = 10, repeats: int = 5,
+    threshold: float = DEFAULT_THRESHOLD, max_velocity_error: float | None = None,
+    folder: str | os.PathLike[str] | None = None, reuse: bool = True,
     watch: Callable[[Event], None] | None = None,
-) -> Tuning:
+) -> Tuning:  # fmt: skip
     """Measure settings of MuJoCo on worlds of a model.
 
     Parameters
@@ -167,16 +163,9 @@ class JudgedSettings:
 
 
 def _run_tuning(
-    runs: Runs,
-    spread: float | None,
-    horizon: int,
-    repeats: int,
-    threshold: float,
-    can_touch: bool,
-    error_limit: float | None,
-    judged: JudgedSettings,
-    watch: Callable[[Event], None] | None,
-) -> Tuning:
+    runs: Runs, spread: float | None, horizon: int, repeats: int, threshold: float, can_touch: bool,
+    error_limit: float | None, judged: JudgedSettings, watch: Callable[[Event], None] | None,
+) -> Tuning:  # fmt: skip
     """Measure settings on the worlds with even numbers, and the chosen settings on the others.
 
     The parameters are described in `tune`; `can_touch` states whether bodies of the model can collide.
