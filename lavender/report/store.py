@@ -126,7 +126,10 @@ class Store:
         InputError
             The disk is full (earlier rows are stored), or the file was removed.
         """
-        line = json.dumps(to_jsonable(row), allow_nan=False)
+        plain = (str, int, bool)
+        line = json.dumps(
+            {k: v if type(v) in plain else to_jsonable(v) for k, v in row.items()}, allow_nan=False
+        )
         try:
             self.file.write(line + "\n")
             self.file.flush()

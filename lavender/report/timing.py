@@ -147,9 +147,9 @@ def _import_solver_code(solver: str) -> None:
 
 
 @cache
-def _get_thread_pools(solver: str) -> Any:
-    """Return the controller of the BLAS and OpenMP libraries that are loaded with a solver."""
-    # The search takes some milliseconds: do it once per solver, after its own libraries and SciPy's are loaded.
+def _get_thread_pools(code: tuple[str, ...]) -> Any:
+    """Return the controller of the BLAS and OpenMP libraries that are loaded with a solver of this code."""
+    # The search takes some 20 ms: do it once for each package, after its own libraries and SciPy's are loaded.
     require_packages("a timed measurement", "threadpoolctl")
     from threadpoolctl import ThreadpoolController
 
@@ -160,7 +160,9 @@ def _get_thread_pools(solver: str) -> Any:
 @contextmanager
 def limit_to_one_thread(solver: str = "") -> Iterator[None]:
     """Limit BLAS and OpenMP to one thread, including the libraries that are loaded when `solver` is imported."""
-    with _get_thread_pools(solver).limit(limits=1):
+    spec = registry.specs().get(solver)
+    code = () if spec is None else (*spec.requires, *(() if spec.builtin else (solver,)))
+    with _get_thread_pools(code).limit(limits=1):
         yield
 
 
