@@ -70,9 +70,7 @@ SAVE_INTERVAL = 60.0  # [s] Results of complete worlds are written to `folder` a
 # The states before a world diverges by less than this number of steps are not kept as states with contact: their speeds
 # belong to the divergence, and `slip` simulates settings for 25 steps.
 DIVERGENCE_MARGIN = 25
-AUDIT_BUSY_CONSEQUENCE = (
-    "The audit took longer than on an idle machine; its errors do not depend on the load."
-)
+AUDIT_BUSY_CONSEQUENCE = "The audit took longer than otherwise; its errors do not depend on the load."
 
 
 def audit(
@@ -176,7 +174,7 @@ def audit(
     if engine in CLAIM_ENGINES:
         if control != "random":
             raise InputError(
-                f"control needs a model of MuJoCo; a scene of {engine} sets its own controls: leave it out"
+                f"control needs a model of MuJoCo; scenes of {engine} set their own: leave it out"
             )
         start = {"states": states, "spread": SPREADS[0] if spread is None else spread, "seed": seed}
         n = DEFAULT_JOINT_WORLDS if worlds is None else worlds
@@ -294,10 +292,10 @@ def _audit_model(
     busy = machine.make_busy_warning(loads, os.cpu_count() or 1, AUDIT_BUSY_CONSEQUENCE, own=processes + 1)
     result.notes += [busy] if busy else []
     first_lost = {d.world: d.step for d in result.divergences}
-    result.contact_states[:] = sorted(
-        (s for s in result.contact_states if s.step < first_lost.get(s.world, np.inf) - DIVERGENCE_MARGIN),
-        key=lambda entry: entry[:2],
-    )
+    states = sorted(result.contact_states, key=lambda entry: entry[:2])
+    result.contact_states[:] = [
+        s for s in states if s.step < first_lost.get(s.world, np.inf) - DIVERGENCE_MARGIN
+    ]
     return result
 
 
@@ -347,9 +345,8 @@ def _make_empty_audit(runs: Runs, engine: str, common: dict[str, Any], *notes: s
     result = Audit.with_size(runs, engine, can_touch=can_touch, notes=list(filter(None, notes)), **common)
     if runs.against is not None:
         name, model = runs.against
-        result.against = Audit.with_size(
-            replace(runs, name=name, model=model, against=None), engine, **common
-        )
+        other = replace(runs, name=name, model=model, against=None)
+        result.against = Audit.with_size(other, engine, **common)
     return result
 
 
@@ -453,7 +450,7 @@ def _audit_frames(frames: Iterable[Frame], judging: Judging) -> Iterator[Piece]:
         diverged = np.zeros(n, bool) if diverged is None else diverged
         if n != len(diverged):
             raise InputError(
-                f"step {k} has {n} worlds, and the first step {len(diverged)}; all steps need the same number of worlds"
+                f"step {k} has {n} worlds, and the first step {len(diverged)}; equal numbers are needed"
             )
 
         def state_of(i: int, state: Any = frame.state) -> dict[str, Any]:
@@ -463,11 +460,8 @@ def _audit_frames(frames: Iterable[Frame], judging: Judging) -> Iterator[Piece]:
         piece = judge_steps(frame, judging, np.arange(n), np.full(n, k), state_of)
         lost = (piece.verdict == NOT_JUDGED) & ~diverged
         finite = [all(np.isfinite(x[i]).all() for x in frame.state.values()) for i in range(n)]
-        divergences = [
-            Divergence(
-                i, k, "forces or acceleration" if finite[i] else "state before the step", not finite[i]
-            )
-            for i in np.flatnonzero(lost).tolist()
-        ]
+        causes = ("state before the step", "forces or acceleration")
+        lost_worlds = np.flatnonzero(lost).tolist()
+        divergences = [Divergence(i, k, causes[finite[i]], not finite[i]) for i in lost_worlds]
         diverged |= lost
         yield piece._replace(divergences=divergences)

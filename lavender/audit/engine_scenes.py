@@ -216,11 +216,9 @@ class NewtonScene:
 
     def convert(self) -> EngineStep:
         """Return the problems of the last step, the engine's impulses and claims."""
-        return (
-            from_kamino(self.solver)
-            if self.engine == "kamino"
-            else from_newton_mujoco(self.solver, self.velocity)
-        )
+        if self.engine == "kamino":
+            return from_kamino(self.solver)
+        return from_newton_mujoco(self.solver, self.velocity)
 
     def get_state(self) -> EngineState:
         """Return the state of all worlds by the names of newton.State, in arrays (n, ...).

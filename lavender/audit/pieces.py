@@ -141,9 +141,8 @@ def judge_steps(
     residuals = residual_many(
         batch, frame.impulse, precision=judging.precision, threshold=judging.threshold, errors="status"
     )
-    numbers = np.array(
-        [residuals.velocity_error, residuals.impulse_error, residuals.relative, residuals.roundoff_floor]
-    )
+    errors = residuals.velocity_error, residuals.impulse_error, residuals.relative, residuals.roundoff_floor
+    numbers = np.array(errors)
     verdicts = residuals.verdict
     verdict = np.full(len(verdicts), NOT_JUDGED, np.int8)
     measured = np.isfinite(numbers[0])

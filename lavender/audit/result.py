@@ -44,13 +44,9 @@ MAX_CURVE_POINTS = 60  # Largest number of points of a curve over time.
 N_SHOWN_WORLDS = 5  # Up to this many numbers of worlds are written in a sentence.
 #: Outcomes of a step of an engine that claims that its solve converged, or that it did not.
 OUTCOMES = (
-    "claimed and right",
-    "claimed and wrong",
-    "not claimed but right",
-    "not claimed and wrong",
-    "claimed with numbers that are not finite",
-    "not claimed, not finite",
-)
+    "claimed and right", "claimed and wrong", "not claimed but right", "not claimed and wrong",
+    "claimed with numbers that are not finite", "not claimed, not finite",
+)  # fmt: skip
 ERRORS_NOTE = (
     "Errors of the worst row of each judged step; in rad/s if the row is angular. At its floor: rounding explains the "
     "error, in the engine's precision. Close enough: no row has a larger error than the threshold. Stopped before "
@@ -155,9 +151,8 @@ class Audit:
         rows, contacts = np.zeros((2, *shape), int)
         numbers = np.full((len(WORST_ROW_ERRORS), *shape), np.nan)
         claims = np.full(shape, -1, np.int8) if has_claims else None
-        return cls(
-            runs, engine, numbers, np.full(shape, -1, np.int8), rows, contacts, converged=claims, **more
-        )
+        verdict = np.full(shape, -1, np.int8)
+        return cls(runs, engine, numbers, verdict, rows, contacts, converged=claims, **more)
 
     def add_piece(self, piece: Piece, keep: int | None) -> None:
         """Add the results of judged steps, and keep the worst (`Judging.keep`)."""
@@ -310,9 +305,8 @@ class Audit:
         parts = []
         if self.divergences:
             first = min(d.step for d in self.divergences)
-            parts.append(
-                f"{format_count(self.n_diverged, 'world')} diverged, in step {first} at the earliest"
-            )
+            worlds = format_count(self.n_diverged, "world")
+            parts.append(f"{worlds} diverged, in step {first} at the earliest")
         if lost := int((self.verdict == NOT_JUDGED).sum()):
             parts.append(f"{format_count(lost, 'step')} not judged: numbers not finite or above 1e10")
         if self.error_limit is not None:
@@ -333,9 +327,7 @@ class Audit:
         """Sentences with consequences and remedies, below the tables of a terminal."""
         lines = [self._compare_in_words(), self._describe_divergences()]
         if not self.judged_sizes.has_enough_contact:
-            lines.append(
-                "Too few steps have contact to rate the solver: start from other states with --states."
-            )
+            lines.append("Too few steps have contact to rate the solver: start from other states (--states).")
         if self.n_dropped:
             lines.append(
                 f"The engine had no memory for {self.n_dropped} constraint rows and dropped them: its answers solve "
@@ -461,9 +453,8 @@ class Audit:
         both = self.is_judged & self.against.is_judged
         for prefix, one in (("", self), ("against ", self.against)):
             if both.any():
-                columns[f"{prefix}{one.runs.name} [m/s]"] = np.quantile(
-                    one.numbers[0][both], QUANTILES, method="higher"
-                )
+                errors = one.numbers[0][both]
+                columns[f"{prefix}{one.runs.name} [m/s]"] = np.quantile(errors, QUANTILES, method="higher")
         return _make_frame(columns if both.any() else {})
 
     @property
@@ -478,9 +469,8 @@ class Audit:
             for name, q in (("median", 0.5), ("99 %", 0.99), ("worst", 1.0))
             if known
         ]
-        return Figure(
-            "over-time", "Errors of all worlds", "step", "velocity error [m/s]", curves, x_log=False
-        )
+        y_title = "velocity error [m/s]"
+        return Figure("over-time", "Errors of all worlds", "step", y_title, curves, x_log=False)
 
     # -- files ---------------------------------------------------------------------------------------------
 
@@ -533,11 +523,8 @@ class Audit:
             verdict = records["verdict"]
             is_complete, is_begun = (verdict >= 0).all(axis=1), (verdict >= 0).any(axis=1)
             # A world that was judged in part has counts that its repetition would add again.
-            if (
-                facts["key"] != self.key
-                or verdict.shape != self.verdict.shape
-                or (is_begun != is_complete).any()
-            ):
+            is_same = facts["key"] == self.key and verdict.shape == self.verdict.shape
+            if not is_same or (is_begun != is_complete).any():
                 return False
             worst = []
             with np.load(folder / "states.npz", allow_pickle=False) as file:

@@ -50,13 +50,8 @@ START_FIELDS = ("qpos", "qvel", "act", "qacc_warmstart", "mocap_pos", "mocap_qua
 ACCELERATION_FIELDS = ("qacc_smooth", "qfrc_smooth", "qacc")  # Arrays of each step for `from_efc`.
 STEP_FIELDS = ("qpos", "qvel", "act", "ctrl", "qacc_warmstart")  # Arrays on which a step depends.
 # mjtConstraint -> name of a block that is not a contact.
-BLOCK_KINDS = {
-    0: "equality",
-    1: "friction loss",
-    2: "friction loss",
-    3: "limit of a joint",
-    4: "limit of a tendon",
-}
+BLOCK_KINDS = {0: "equality", 1: "friction loss", 2: "friction loss", 3: "limit of a joint",
+               4: "limit of a tendon"}  # fmt: skip
 PYRAMIDAL_CONTACT = 6  # Value of mjtConstraint of an edge of a pyramidal contact.
 MIN_WARP_ROWS = 256  # Smallest number of rows per world for which MuJoCo Warp allocates memory.
 SLEEP_NOTE = (
@@ -304,9 +299,8 @@ class Frame(NamedTuple):
         if contacts is None:
             contacts = np.zeros(len(batch), int)
             for i in range(len(batch)):
-                with contextlib.suppress(
-                    InputError
-                ):  # A world with numbers that are not finite is not judged.
+                # A world with numbers that are not finite is not judged.
+                with contextlib.suppress(InputError):
                     contacts[i] = count_contacts(batch[i])
         dropped = step.claims.residuals.get("dropped_rows", np.zeros(1))
         claims = np.asarray(step.claims.converged, bool), int(np.sum(dropped))
@@ -318,9 +312,7 @@ def count_engine_warnings(mj: Any) -> Iterator[Counter[str]]:
     """Count MuJoCo's warnings by their first sentence instead of printing them, with N for each number."""
     counts: Counter[str] = Counter()
     handler = mj.get_mju_user_warning()
-    mj.set_mju_user_warning(
-        lambda message: counts.update([WARNING_NUMBER.sub("N", message.partition(". ")[0])])
-    )
+    mj.set_mju_user_warning(lambda text: counts.update([WARNING_NUMBER.sub("N", text.partition(". ")[0])]))
     try:
         yield counts
     finally:
@@ -358,11 +350,8 @@ def simulate_world(runs: Runs, world: int) -> tuple[FloatArray, Divergence | Non
 
 def has_diverged(mj: Any, data: Any) -> bool:
     """Whether MuJoCo has reset the simulation because its numbers were not finite or above mjMAXVAL."""
-    kinds = mj.mjtWarning
-    return any(
-        data.warning[int(k)].number
-        for k in (kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL, kinds.mjWARN_BADQACC)
-    )
+    names = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
+    return any(data.warning[int(getattr(mj.mjtWarning, name))].number for name in names)
 
 
 def _find_cause_of_reset(
@@ -409,11 +398,11 @@ def iterate_frames(engine: str, runs: Runs, njmax: int | None = None) -> Iterato
     start_arrays = {name: np.array([getattr(d, name) for d in starts], np.float32) for name in names}
     not_accepted = f"engine {engine!r} does not accept {runs.name}"
     try:
-        step: Any = (
-            _make_mjx_stepper(mj, model, start_arrays)
-            if engine == "mjx"
-            else WarpWorlds(mj, model, start_arrays, njmax)
-        )
+        step: Any
+        if engine == "mjx":
+            step = _make_mjx_stepper(mj, model, start_arrays)
+        else:
+            step = WarpWorlds(mj, model, start_arrays, njmax)
     except ImportError as error:
         package = {"mjx": "mujoco-mjx", "mujoco_warp": "mujoco-warp"}[engine]
         raise InputError(f"engine {engine!r} cannot be imported ({error}): pip install {package}") from None
@@ -423,9 +412,7 @@ def iterate_frames(engine: str, runs: Runs, njmax: int | None = None) -> Iterato
         ctrl = np.array([drive(d, k) for drive, d in zip(drives, starts, strict=True)], np.float32)
         try:
             arrays = step(ctrl)
-        except (
-            NotImplementedError
-        ) as error:  # MJX raises it in the first step, for example for an integrator.
+        except NotImplementedError as error:  # By MJX in the first step, for example for an integrator.
             raise InputError(f"{not_accepted}: {error}") from None
         yield make_frame(mj, model, *arrays)._replace(n_dropped=getattr(step, "n_dropped", 0))
 
@@ -453,12 +440,8 @@ def make_frame(mj: Any, model: Any, state: Any, efc: Any, mass: Any, contact: An
     problems = from_efc(**problem_arrays, timestep=dt, contacts=(world_of, address, dim, friction))
     problems.batch.names_of = _make_block_namer(mj, model, problems.batch, efc["type"], contact)
     assert problems.impulse is not None
-    return Frame(
-        problems.batch,
-        problems.impulse,
-        state,
-        *_count_rows_and_contacts(efc["J"], extra.get("nefc"), world_of, address),
-    )
+    sizes = _count_rows_and_contacts(efc["J"], extra.get("nefc"), world_of, address)
+    return Frame(problems.batch, problems.impulse, state, *sizes)
 
 
 def _count_rows_and_contacts(

@@ -43,12 +43,9 @@ if TYPE_CHECKING:
 
 #: {variant: cause of its difference from the next variant}, in the order of replacement.
 CAUSES = {
-    "engine": "unfinished solving",
-    "solved": "shape of the cone",
-    "disk": "softness of friction",
-    "hard": "convex relaxation",
-    "coulomb": "sliding at the friction limit",
-}
+    "engine": "unfinished solving", "solved": "shape of the cone", "disk": "softness of friction",
+    "hard": "convex relaxation", "coulomb": "sliding at the friction limit",
+}  # fmt: skip
 # [m/s] Slip below this speed is not explained. It is far below the speeds at which objects slip out of a gripper, and
 # above the velocity error of solutions to a relative residual of 1e-9.
 MIN_EXPLAINED_SLIP = 1e-6
@@ -211,17 +208,13 @@ class SlipExplanation:
             elif slip["cause"] == CAUSES["coulomb"] and has_force:
                 lines.append("The load along the surface is above mu times the normal force.")
         if not has_force:
-            lines.append(
-                "The engine's answer has no normal force at this contact, and therefore no friction."
-            )
+            no_force = "has no normal force at this contact, and therefore no friction"
+            lines.append(f"The engine's answer {no_force}.")
         elif use is not None:
             share = f"{100.0 * use:.0f} % of mu times the normal force"
             lines.append(f"In the engine's answer its friction force is {share}.")
-        return lines + [
-            f"Variant {v.name!r}: {v.note}."
-            for v in self.variants
-            if v.note.startswith(("not", UNDEFINED_LAW))
-        ]
+        noted = [v for v in self.variants if v.note.startswith(("not", UNDEFINED_LAW))]
+        return lines + [f"Variant {v.name!r}: {v.note}." for v in noted]
 
     @property
     def advice(self) -> list[str]:
@@ -240,10 +233,8 @@ class SlipExplanation:
         if not before > MIN_EXPLAINED_SLIP:
             mean, limit = f"{format_size(before)} m/s as it is", f"{MIN_EXPLAINED_SLIP:g} m/s"
             return [f"No setting is needed: the mean slip {time} is {mean}; up to {limit} count as no slip."]
-        helpful = [
-            r for r in self.remedies[1:]
-            if r.diverged_step < 0 and get_slip(r) <= MAX_REMAINING_SLIP * before
-        ]  # fmt: skip
+        stable = [r for r in self.remedies[1:] if r.diverged_step < 0]
+        helpful = [r for r in stable if get_slip(r) <= MAX_REMAINING_SLIP * before]
         if not helpful:
             return [f"None of these settings reduces the slip {time} by more than 10 %."]
         head = f"Settings that help (mean slip {time}, {format_size(before)} m/s as it is):"
@@ -298,11 +289,10 @@ def explain_slip(
             f"disk has velocities of shape {free.shape} and problem of shape {own_free.shape}; both must "
             "describe the same step of the same model"
         )
-    surface = (
-        find_surface_velocity(measured)
-        if surface_velocity is None
-        else as_array("surface_velocity", surface_velocity, (measured.m,), unit="m/s")
-    )
+    if surface_velocity is None:
+        surface = find_surface_velocity(measured)
+    else:
+        surface = as_array("surface_velocity", surface_velocity, (measured.m,), unit="m/s")
 
     def slip(changed: Problem, impulse: FloatArray) -> tuple[FloatArray, ...]:
         return compute_slip(measured, blocks, changed.velocity(impulse).ravel(), surface)
@@ -345,10 +335,8 @@ def compute_slip(
     """Return the tangential velocity of each contact minus the surface's (tangents,) [m/s]."""
     jacobian, cones = problem.jacobian.tocsr(), problem.cones
     starts = [int(cones.ptr[k]) + 1 for k in blocks]
-    rows_of_contacts = [
-        slice(start, start + min(2, int(cones.n_tangents[k])))
-        for start, k in zip(starts, blocks, strict=True)
-    ]
+    counts = [min(2, int(cones.n_tangents[k])) for k in blocks]
+    rows_of_contacts = [slice(start, start + n) for start, n in zip(starts, counts, strict=True)]
     return tuple(jacobian[rows] @ velocity - surface[rows] for rows in rows_of_contacts)
 
 
@@ -356,9 +344,7 @@ def _choose_contacts(problem: Problem, contacts: Any) -> list[int]:
     """Return the indices of the chosen contacts."""
     sliding = np.flatnonzero(problem.cones.n_tangents > 0).tolist()
     if not sliding:
-        raise InputError(
-            "the problem has no contact with tangents: no contact can slide (give disk= for pyramids)"
-        )
+        raise InputError("the problem has no contact with tangents; give disk= for pyramids")
     if contacts is None:
         return sliding
     chosen: list[int] = []

@@ -83,7 +83,7 @@ class SlipOfStates:
         left_out = f"{format_count(n, 'state')} of {self.n_states} {are} left out, the first is state {first}"
         return [
             *notes,
-            f"{left_out}: the simulation diverges up to the explained step, and MuJoCo restarts it.",
+            f"{left_out}: MuJoCo restarts the simulation, which diverges up to the explained step.",
         ]
 
 
@@ -216,9 +216,8 @@ def _simulate_remedies(
     remedies: list[Remedy] = []
     for k, (text, changed) in enumerate(settings):
         if watch is not None:
-            watch(
-                Event(k, len(settings), format_count(len(chosen), "state"), "", phase="simulating settings")
-            )
+            states = format_count(len(chosen), "state")
+            watch(Event(k, len(settings), states, "", phase="simulating settings"))
         results = [_simulate_slip(mj, changed, state, pair) for state in chosen]
         steps = [step for *_, step in results]
         if k == 0 and min(steps) < 0:

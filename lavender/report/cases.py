@@ -115,11 +115,9 @@ def resolve_sources(sources: Source | Iterable[Source], sequences: bool | None =
     """
     if sequences is not None:
         check_bool("sequences", sequences)
-    sources = (
-        [sources]
-        if isinstance(sources, Source)
-        else check_sequence("cases", sources, "files, folders, names or problems")
-    )
+    if isinstance(sources, Source):
+        sources = [sources]
+    sources = check_sequence("cases", sources, "files, folders, names or problems")
     items = [] if sources else [_make_item_of_problem(case.problem, case.name) for case in suite.default()]
     visited: set[Path] = set()  # Folders that were searched: a link may lead back to one of them.
     for source in sources:  # Inner folders are added at the end.
@@ -206,11 +204,9 @@ def list_steps_in_folder(folder: str | Path) -> list[Item]:
     numbered = [m.groups() for p in paths if (m := re.fullmatch(r"(.*?)(\d+)", p.stem)) and not has_worlds]
     series = [prefix for prefix, n in Counter(prefix for prefix, _ in numbered).items() if n > 1]
     unlisted = [p.name for p in paths if lines and p.name not in lines]
-    reason = (
-        f"{unlisted[0]} is not listed in its {ENGINE}, or the recording was killed before that"
-        if unlisted
-        else ""
-    )
+    reason = ""
+    if unlisted:
+        reason = f"{unlisted[0]} is not listed in its {ENGINE}, or the recording was killed before that"
     if len(numbered) > len({(prefix, int(number)) for prefix, number in numbered}):
         reason = "two files have the same number"
     elif len(series) > 1:
@@ -366,8 +362,7 @@ def _make_item_of_file(path: Path) -> Item:
             raise InputError(f"{path} is not a file; a problem ({', '.join(SUFFIXES)}) is needed")
         if not path.exists() and (reason := _read_unrecorded_steps(path.parent).get(path)):
             raise InputError(
-                f"{path} was not written, because this step could not be recorded ({reason}): choose "
-                "another step"
+                f"{path} was not written, as its step was not recorded ({reason}): choose another"
             )
         return io.load(path)
 

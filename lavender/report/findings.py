@@ -125,11 +125,10 @@ class Report(tables.Contents):
     def sections(self) -> dict[str, Section]:
         """The tables by name, in their order; tables without rows are left out."""
         names = CAMPAIGN_SECTIONS if self.is_campaign else tuple(SECTIONS)
-        made = [
-            Section(title, [make(self)], note, name=name)
-            for name, (title, note, make) in SECTIONS.items()
-            if name in names and len(self.frame)
-        ]
+        made = []
+        for name, (title, note, make) in SECTIONS.items():
+            if name in names and len(self.frame):
+                made.append(Section(title, [make(self)], note, name=name))
         if len(self.newest):
             made += [self._compare_with_earlier_run()] if self.earlier is not None else []
             note = "The zero impulse solves these cases. They are left out of all rankings."
@@ -348,20 +347,17 @@ def list_diagnostics(report: Report) -> list[tuple[str, str]]:
 
 def _group_by_reason(skips: pd.DataFrame) -> dict[str, pd.DataFrame]:
     """Group skips by their reason without the name of the case."""
-    reasons = [
-        reason.removeprefix("did not load: ").removeprefix(f"{case}: ")
-        for case, reason in zip(skips["case"], skips["reason"], strict=True)
-    ]
+    pairs = zip(skips["case"], skips["reason"], strict=True)
+    reasons = [text.removeprefix("did not load: ").removeprefix(f"{case}: ") for case, text in pairs]
     return {str(reason): same for reason, same in skips.groupby(reasons, sort=False)}
 
 
 def list_skip_reasons(skips: pd.DataFrame) -> list[str]:
     """Return each different reason of some skips; if it holds for several cases, with their number."""
-    counts = {
-        reason: (same["case"].nunique(), same["reason"].iloc[0])
-        for reason, same in _group_by_reason(skips).items()
-    }
-    return [first if n == 1 else f"{reason} ({n} cases)" for reason, (n, first) in counts.items()]
+    groups = [
+        (r, same["case"].nunique(), same["reason"].iloc[0]) for r, same in _group_by_reason(skips).items()
+    ]
+    return [first if n == 1 else f"{reason} ({n} cases)" for reason, n, first in groups]
 
 
 def list_cases_not_loaded(report: Report) -> list[tuple[str, str]]:

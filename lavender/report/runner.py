@@ -409,10 +409,8 @@ class Runner:
             spent, made = spent + _get_elapsed_time(row), made + 1
         if made < len(tasks):
             target = describe_target(call.mode, call.tol, call.max_iter)
-            reason = (
-                f"stopped after {made} of {len(tasks)} steps, which took more than the pass limit of {limit:.3g} s "
-                "together (--sequence-time-limit)"
-            )
+            took = f"which took more than the pass limit of {limit:.3g} s together (--sequence-time-limit)"
+            reason = f"stopped after {made} of {len(tasks)} steps, {took}"
             self.add_skip(f"{problems[0].sequence}, {target}, {call.start}", spec.name, reason)
 
     def measure_step(

@@ -137,10 +137,8 @@ class Store:
                 os.fsync(self.file.fileno())
                 self._synced = time.monotonic()
                 if not self._real.exists():
-                    raise InputError(
-                        f"{self.path} was removed, with its contents, while it was being written: run the "
-                        "command again in another folder"
-                    )
+                    advice = "run the command again in another folder"
+                    raise InputError(f"{self.path} was removed while it was being written: {advice}")
         except OSError as error:
             raise InputError(
                 f"cannot write {self.path} ({error.strerror or error}): free disk space and run the same command "
@@ -335,14 +333,9 @@ def select_skips(lines: DataFrame) -> DataFrame:
     `sequence` is the sequence of a step that did not load.
     """
     skips = _keep_last(convert_columns(lines, "skip", SKIP_COLUMNS), ("run", "case", "solver"))
-    loaded = convert_columns(lines, "case", {"run": "", "case": ""}).drop_duplicates(keep="last")
-    last = {(run, case): i for run, case, i in zip(loaded["run"], loaded["case"], loaded.index, strict=True)}
-    is_open = [
-        bool(solver) or last.get((run, case), -1) < i
-        for run, case, solver, i in zip(
-            skips["run"], skips["case"], skips["solver"], skips.index, strict=True
-        )
-    ]
+    loaded = convert_columns(lines, "case", {"run": "", "case": ""})
+    last = dict(zip(zip(loaded["run"], loaded["case"], strict=True), loaded.index, strict=True))
+    is_open = [bool(r.solver) or last.get((r.run, r.case), -1) < r.Index for r in skips.itertuples()]
     return skips.loc[skips.index[np.array(is_open, bool)]].astype(object)
 
 

@@ -383,11 +383,8 @@ class Contents:
             runs = self.ranked_runs
             reached = runs[(runs["tol"] <= tolerance) & (runs["relative"] <= tolerance)].fillna({"time": 0.0})
             times = reached.groupby(["solver", "case"], observed=True)["time"].min().unstack()
-            names = {
-                "index": sorted(map(str, runs["solver"].unique())),
-                "columns": list(runs["case"].unique()),
-            }
-            self._times[tolerance] = times.reindex(**names)
+            solvers, cases = sorted(map(str, runs["solver"].unique())), list(runs["case"].unique())
+            self._times[tolerance] = times.reindex(index=solvers, columns=cases)
         return self._times[tolerance]
 
     @cached_property
@@ -457,14 +454,9 @@ def tabulate_times(report: Contents) -> Frame:
         order = rank_solvers(report, report.tolerance, cases).index
         parts: Row = {"law": law, "solver": order, "cases": len(cases)}
         for tolerance in report.tolerances:
-            ranking, target = (
-                rank_solvers(report, tolerance, cases).loc[order],
-                f"to {format_tolerance(tolerance)}",
-            )
-            parts |= {
-                f"solved {target}": ranking["solved"].array,
-                f"time {target} [s]": ranking["mean"].array,
-            }
+            target, ranking = f"to {format_tolerance(tolerance)}", rank_solvers(report, tolerance, cases)
+            for head, name in ((f"solved {target}", "solved"), (f"time {target} [s]", "mean")):
+                parts[head] = ranking.loc[order, name].array
         tables.append(pd.DataFrame(parts))
     table = pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
     return table.drop(columns=[c for c in table if c.startswith("time")]) if report.is_campaign else table
@@ -703,10 +695,8 @@ def tabulate_changes(report: Contents) -> Frame:
     drift = both.groupby("case")[["calibration_time_x", "calibration_time_y"]].median()
     drift = (drift["calibration_time_y"] / drift["calibration_time_x"]).fillna(1.0)
     for r in both.itertuples():
-        before, after = (
-            t if x <= r.tol else math.inf
-            for t, x in ((r.time_x * drift[r.case], r.relative_x), (r.time_y, r.relative_y))
-        )
+        before = r.time_x * drift[r.case] if r.relative_x <= r.tol else math.inf
+        after = r.time_y if r.relative_y <= r.tol else math.inf
         spread = 2.0 * (max(r.time_median_x / r.time_x, r.time_median_y / r.time_y) - 1.0)
         noise = 1.0 + max(MAX_NOISE, spread if math.isfinite(spread) else 0.0)
         if before != after and not before / noise <= after <= before * noise:

@@ -62,13 +62,8 @@ MUJOCO = (
     Field("impratio", (1.0, 10.0), "stiffness of friction over that of normal contact"),
     Field("noslip_iterations", (0, 3, 10), "sweeps of friction after the solve"),
 )
-CONVERGED_OPTIONS = {
-    "solver": "Newton",
-    "iterations": 300,
-    "tolerance": 0.0,
-    "ls_iterations": 100,
-    "ls_tolerance": 1e-4,
-}
+CONVERGED_OPTIONS = {"solver": "Newton", "iterations": 300, "tolerance": 0.0, "ls_iterations": 100,
+                     "ls_tolerance": 1e-4}  # fmt: skip
 
 
 def get_default_options(mj: Any) -> dict[str, Any]:
@@ -178,16 +173,11 @@ class Stage:
                 mj.mj_setState(model, data, state, kind)
                 controls.append(np.array(data.ctrl))
             starts.append(states[::horizon])
-        configured = cls(
-            mj,
-            model,
-            np.concatenate(starts),
-            np.reshape(controls, (len(controls) // horizon, horizon, model.nu)),
-        )
+        shape = (len(controls) // horizon, horizon, model.nu)
+        configured = cls(mj, model, np.concatenate(starts), np.reshape(controls, shape))
+        converged = MujocoSetting.from_options(mj, model, **CONVERGED_OPTIONS).apply_to(mj, model)
         try:
-            configured.ends = configured.run_stretches(
-                MujocoSetting.from_options(mj, model, **CONVERGED_OPTIONS).apply_to(mj, model)
-            )[1]
+            configured.ends = configured.run_stretches(converged)[1]
         except mj.FatalError as error:
             raise InputError(f"{runs.name}: MuJoCo raised an error, {error}") from None
         return configured
@@ -233,9 +223,8 @@ class Stage:
         try:
             ends = self.run_stretches(model, states)[1]
             for i in range(0, len(states), MAX_PROBLEMS_IN_MEMORY):
-                batch, impulse = from_mujoco_many(
-                    judge, states[i : i + MAX_PROBLEMS_IN_MEMORY], errors="status"
-                )
+                some = states[i : i + MAX_PROBLEMS_IN_MEMORY]
+                batch, impulse = from_mujoco_many(judge, some, errors="status")
                 errors.append(residual_many(batch, impulse, errors="status").velocity_error)
                 rows.append(batch.row_counts)
                 contacts.append(batch.contact_counts)
@@ -245,9 +234,8 @@ class Stage:
         if np.isnan(distance).any():
             return result
         sizes: dict[str, Any] = {"rows": np.concatenate(rows), "contacts": np.concatenate(contacts)}
-        return replace(
-            result, error=np.nan_to_num(np.concatenate(errors), nan=np.inf), motion=distance, **sizes
-        )
+        error = np.nan_to_num(np.concatenate(errors), nan=np.inf)
+        return replace(result, error=error, motion=distance, **sizes)
 
     def prepare_timing(self, setting: MujocoSetting) -> Callable[[], FloatArray]:
         """Return a function that runs all stretches and returns the time of each step."""
@@ -266,9 +254,8 @@ class Stage:
                 # Compare medians over the steps, so that an interrupted step does not exclude a setting.
                 if round_index and np.median(m.times) > MAX_TIME_RATIO * np.median(settings[0].times):
                     continue
-                progress.begin_measurement(
-                    "timing", f"round {round_index + 1} of {repeats}, {m.setting.name}"
-                )
+                text = f"round {round_index + 1} of {repeats}, {m.setting.name}"
+                progress.begin_measurement("timing", text)
                 m.times = np.minimum(m.times, run())
 
 
@@ -278,10 +265,8 @@ def list_first_settings(mj: Any, model: Any) -> list[MujocoSetting]:
     Settings that change the problem are last.
     """
     enough = {"iterations": max(100, int(model.opt.iterations))}
-    tried = [
-        enough | x if "tolerance" in x else x
-        for x in ({**f.fixed, f.name: x} for f in MUJOCO for x in f.values)
-    ]
+    tried = [{**f.fixed, f.name: x} for f in MUJOCO for x in f.values]
+    tried = [enough | x if "tolerance" in x else x for x in tried]
     own = MujocoSetting.from_options(mj, model)
     default = replace(MujocoSetting.from_options(mj, model, **get_default_options(mj)), is_default=True)
     return list(dict.fromkeys([own, default, *(MujocoSetting.from_options(mj, model, **x) for x in tried)]))

@@ -102,18 +102,14 @@ class Tuning:
         returned, and of these the one with the largest iteration limit: a limit that no step reaches takes no time.
         """
         now, threshold = self.present_result, self.threshold
-        good = [
-            m
-            for m in self._same_problem
-            if m.worst_error <= max(now.worst_error, threshold)
-            and m.mean_step_time < (1.0 - TIME_NOISE_FRACTION) * now.mean_step_time
-            and self._is_accurate_enough(m)
-        ]
-        return min(
-            self._list_ties(good),
-            key=lambda m: (max(float(m.error.max()), threshold), -m.setting.iterations, m.mean_step_time),
-            default=None,
-        )
+        limit = (1.0 - TIME_NOISE_FRACTION) * now.mean_step_time
+        good = [m for m in self._same_problem if m.mean_step_time < limit and self._is_accurate_enough(m)]
+        good = [m for m in good if m.worst_error <= max(now.worst_error, threshold)]
+
+        def rank(m: Measured) -> tuple[float, float, float]:
+            return max(float(m.error.max()), threshold), -m.setting.iterations, m.mean_step_time
+
+        return min(self._list_ties(good), key=rank, default=None)
 
     @staticmethod
     def _list_ties(settings: list[Measured]) -> list[Measured]:
@@ -131,12 +127,8 @@ class Tuning:
         now = self.present_result
         if self.faster is not None and self.faster.worst_error <= self.threshold:
             return None
-        good = [
-            m
-            for m in self._same_problem
-            if m.mean_step_time <= (1.0 + TIME_NOISE_FRACTION) * now.mean_step_time
-            and self._is_accurate_enough(m)
-        ]
+        limit = (1.0 + TIME_NOISE_FRACTION) * now.mean_step_time
+        good = [m for m in self._same_problem if m.mean_step_time <= limit and self._is_accurate_enough(m)]
         best = min(good, key=lambda m: m.worst_error)
         return best if best.worst_error < now.worst_error > self.threshold else None
 
@@ -156,9 +148,8 @@ class Tuning:
         now = self.present_result
         good = [m for m in self._same_problem if self._compute_largest_error(m) <= self.error_limit]
         ties = self._list_ties(good)
-        return (
-            now if any(m is now for m in ties) else min(ties, key=self._compute_largest_error, default=None)
-        )
+        best = min(ties, key=self._compute_largest_error, default=None)
+        return now if any(m is now for m in ties) else best
 
     @property
     def most_accurate(self) -> Measured:
@@ -210,11 +201,8 @@ class Tuning:
             return []
         none = f"none of {len(self._same_problem)} settings"
         small = min(m.worst_error for m in (self.present_result, self.faster) if m is not None)
-        closer = (
-            f"not needed, {format_size(small)} m/s is within {self.threshold:g}"
-            if small <= self.threshold
-            else none
-        )
+        within = f"not needed, {format_size(small)} m/s is within {self.threshold:g}"
+        closer = within if small <= self.threshold else none
         lines = self._format_limit_choice()
         for description, m, reason, gains, max_ratio in (
             ("as accurate as now, faster", self.faster, none, "mean_step_time", 1.0 - TIME_NOISE_FRACTION),
@@ -270,9 +258,7 @@ class Tuning:
             if self.error_limit is not None:
                 sentences.append("The line for the error limit was chosen on all worlds.")
             if self.reason_provisional:
-                sentences.append(
-                    f"The lines are provisional, because {self.reason_provisional}: measure again."
-                )
+                sentences.append(f"They are provisional, because {self.reason_provisional}: measure again.")
             if len(self.held) > 1 and self.n_held_worlds:
                 sentences.append(describe_exceedance(self.n_held_worlds))
             sentences.append(MERGE_NOTE)
@@ -295,15 +281,9 @@ class Tuning:
 
         now = self.present_result.mean_step_time
         rows = [
-            (
-                m.setting.short_name,
-                f"{m.mean_step_time / now:.2f}",
-                m.worst_error,
-                float(m.error.max()),
-                m.worst_motion,
-            )
+            (m.setting.short_name, f"{m.mean_step_time / now:.2f}", m.worst_error, float(m.error.max()), m.worst_motion)
             for m in settings
-        ]
+        ]  # fmt: skip
         heads = ["setting", "relative time", "error 99 % [m/s]", "largest error [m/s]", "motion [m]"]
         return pd.DataFrame(rows, columns=heads)
 
@@ -332,10 +312,8 @@ class Tuning:
         solvers = dict.fromkeys(m.solver for m in self.measured)
         by = {s: [m for m in self._same_problem if m.solver == s] for s in solvers}
         parts = [curve(s, settings, points=True) for s, settings in by.items() if settings]
-        parts += [
-            curve("fastest for its error", self.pareto_front, unmarked=True),
-            curve("model's own setting", [self.present_result], points=True),
-        ]
+        parts.append(curve("fastest for its error", self.pareto_front, unmarked=True))
+        parts.append(curve("model's own setting", [self.present_result], points=True))
         return Figure("time-and-error", Path(self.model).name, "time of a step [s]",
                       "error that 1 % of the steps exceed [m/s]", tuple(parts), x_log=True)  # fmt: skip
 

@@ -212,9 +212,8 @@ def _run_tuning(
         first_stage = Stage.from_stretches_of_runs(replace(runs, steps=horizon), range(1), horizon)
         measure_early(first_stage, first_stage.judge_setting(MujocoSetting()))
         runs, note = runs.choose_spread(spread)
-        stage, held_back = (
-            Stage.from_stretches_of_runs(runs, range(i, runs.worlds, 2), horizon) for i in (0, 1)
-        )
+        halves = [range(i, runs.worlds, 2) for i in (0, 1)]
+        stage, held_back = (Stage.from_stretches_of_runs(runs, half, horizon) for half in halves)
         own, first_settings = MujocoSetting(), list_first_settings(runs.mj, runs.model)
         n_variants = len(list_variants(runs.mj, runs.model, own)) * EXPECTED_VARIED_SETTINGS
         n_first, n_trial = len(first_settings), min(N_TRIAL_ROUNDS, repeats)
@@ -238,11 +237,8 @@ def _run_tuning(
             return make_result(False)
         measured += judge(stage, first_settings[1:])
         stage.time_settings(measured, n_trial, progress)
-        near = [
-            m.setting
-            for m in make_result(False).pareto_front
-            if m.mean_step_time <= MAX_VARIED_TIME_RATIO * measured[0].mean_step_time
-        ]
+        limit = MAX_VARIED_TIME_RATIO * measured[0].mean_step_time
+        near = [m.setting for m in make_result(False).pareto_front if m.mean_step_time <= limit]
         known = {m.setting for m in measured}
         more = dict.fromkeys(
             x for s in [own, *near] for x in list_variants(runs.mj, runs.model, s) if x not in known
