@@ -20,9 +20,9 @@ from lavender_ext.batch.many import bind_types, solve_compiled
 NO_STAGE_MESSAGE = "the time limit was over before its turn: the start"
 
 
-def choose_call_deadline(problem: Problem, deadline: Deadline | None) -> Deadline | None:
+def choose_call_deadline(problem: Problem, deadline: Deadline) -> Deadline:
     """Return the deadline of the compiled call: of a problem that `auto` may continue, a part of the time."""
-    left = None if deadline is None else deadline.get_remaining_seconds()
+    left = deadline.get_remaining_seconds()
     if left is None or len(problem.b) <= SMALL_ROWS:
         return deadline
     return Deadline(DECISIONS.time_share * left)
@@ -45,7 +45,7 @@ def solve_small(
         made.
     """
     begin = perf_counter()
-    own = choose_call_deadline(problem, deadline)
+    own = None if deadline is None else choose_call_deadline(problem, deadline)
     solution, judged, counts, start = solve_compiled(problem, spec, impulse, tol, own)
     if solution is not None:
         return solution, None

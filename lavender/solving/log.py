@@ -185,7 +185,8 @@ class SolveLog:
         status = self.status
         if self.timed_out and status in (Status.STALLED, Status.NUMERICAL_ERROR):
             status = Status.TIME_LIMIT
-        no_work = NO_TIME_MESSAGE if self.budget > 0 else "no iterations were allowed"
+        no_work = NO_TIME_MESSAGE if self.deadline.is_set else "no solver ran"
+        no_work = no_work if self.budget > 0 else "no iterations were allowed"
         no_work = NO_WORK_MESSAGES.get(status, no_work)
         messages = [
             describe_stages(self.stages) or ("" if self.failure else no_work),

@@ -114,8 +114,10 @@ class Loop:
         """Run `max_iter` iterations in total, or fewer if the solver, the clock, the callback or Ctrl-C ends them."""
         # Assume 1 ns per unit of work for the first chunk, with a limit for solvers in Python; later chunks are
         # measured.
-        first = FIRST_CHUNK_ITERATIONS if self.deadline is None else FIRST_LIMITED_ITERATIONS
-        chunk = min(first, max(1, int(1e9 * self._choose_chunk_time()) // max(1, self.problem.metric.work)))
+        seconds, first = CHUNK_TIME, FIRST_CHUNK_ITERATIONS
+        if self.deadline is not None:
+            seconds, first = self._choose_chunk_time(), FIRST_LIMITED_ITERATIONS
+        chunk = min(first, max(1, int(1e9 * seconds) // max(1, self.problem.metric.work)))
         records = self.records is not None or self.callback is not None
         claim, deadline = EMPTY_CLAIM, self.deadline
         try:

@@ -115,8 +115,9 @@ def run_newton_method(
 
     def count_work() -> list[int]:
         """Return the counts of this call."""
-        now = method.counts if is_over_velocities else [method.done]
-        return [x - y for x, y in zip(now, begin, strict=True)]
+        if not is_over_velocities:
+            return [method.done - begin[0]]
+        return [x - y for x, y in zip(method.counts, begin, strict=True)]
 
     try:
         while True:
