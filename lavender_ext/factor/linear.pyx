@@ -283,6 +283,8 @@ cdef int32_t factor_linear_system_matrix(linear_t* f) noexcept nogil:
         f.factored = CHOLESKY
         lost = factor_tree_matrix(f.n, f.lptr, f.lidx, f.matrix, f.diagonal, f.scale, f.tiny, f.deadline)
         f.pivots.small, f.pivots.first_small = lost >= 0, lost
+    if is_late(f):
+        f.factored = NO_FACTOR                          # A part of the factor was not written.
     return f.pivots.small
 
 
@@ -578,7 +580,7 @@ cdef class LinearSystem:
         with nogil:
             lost = factor_linear_system_matrix(&self.f)
         if is_late(&self.f):
-            self.f.factored, lost = NO_FACTOR, -1
+            lost = -1
         if self.python.interrupt.stopped:
             self.f.factored = NO_FACTOR
         self.python.raise_error()

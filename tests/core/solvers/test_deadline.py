@@ -98,6 +98,34 @@ def readings(clock):
     return made
 
 
+@pytest.mark.parametrize("lu", [False, True])
+def test_factorisation_that_the_deadline_ends_leaves_no_factor(lu, readings):
+    """The exchanges of rows that L U did not reach were not written; a solve with them crashed."""
+    matrix = lattice(15)
+    system = LinearSystem((matrix.indptr.astype(np.int32), matrix.indices.astype(np.int32)))
+    assert system.factor(matrix.data, None, 0.0, 1e-13, lu, deadline=Deadline(2.5)) == -1
+    assert np.isinf(system.solve(np.ones(15**3))).all()
+    assert system.factor(matrix.data, None, 0.0, 1e-13, lu) == 0
+    np.testing.assert_allclose(matrix @ system.solve(np.ones(15**3)), 1.0, rtol=1e-9)
+
+
+@pytest.mark.parametrize("form", ["bodies", "rows", "velocities"])
+def test_newton_whose_deadline_passes_inside_a_factorisation_returns_a_finite_impulse(form, readings):
+    problem = fresh(suite.case("granularF(n=6)").problem)
+    if form == "velocities":
+        problem = FORMS["J and M"](problem)
+    for limit in np.arange(1.5, 40.0, 3.0):
+        impulse, deadline = problem.start(), Deadline(limit)
+        if form == "velocities":
+            status = general.run_newton_steps(
+                problem, general.prepare_islands(problem), impulse, 9, 1e-9, deadline
+            ).status
+        else:
+            system = make_system(problem, "velocity" if form == "bodies" else "impulse")
+            status = general.run_newton_method(problem, system.solve, impulse, 9, 1e-9, deadline, 1).status
+        assert status is lv.Status.TIME_LIMIT and np.isfinite(impulse).all()
+
+
 def list_problems():
     """Yield small problems of every law and form."""
     for law in ("coulomb", "cone"):
