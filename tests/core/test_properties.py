@@ -670,6 +670,18 @@ def test_sweeps_without_tolerance_make_exactly_the_requested_iterations(name):
         assert stopped.status is lv.Status.INTERRUPTED and calls == [0, 1]
 
 
+@pytest.mark.parametrize("speed", [1e4, 1.0, 1e-3])
+def test_solution_to_a_velocity_error_is_converged_exactly_if_it_meets_it(speed):
+    (a, b), statuses = spd(8, seed=1), set()
+    problem = lv.Problem.lcp(a, speed * np.abs(b))
+    for n in range(1, 80):
+        solution = lv.solve(problem, "pgs", velocity_tol=1e-3, max_iter=n)
+        statuses.add(solution.status.name)
+        is_met = solution.residual.velocity <= 1e-3
+        assert solution.success == is_met == (solution.status is lv.Status.CONVERGED), f"{n}: {solution}"
+    assert statuses >= ({"CONVERGED"} if speed < 1.0 else {"MAX_ITERATIONS"})
+
+
 @pytest.mark.parametrize("seed", range(2))
 def test_solution_that_meets_tol_at_its_iteration_limit_is_converged(seed):
     problem = random_contact_problem(seed)
