@@ -14,14 +14,14 @@ by the same sweep backwards. The returned iterate is always the result y of a sw
 (2) and its safeguards are implemented in accelerate/mixing.pxd. The first `convex` iterations may sweep under the cone law,
 which has the same solution as Coulomb's law if all contacts stick. If `convex` is AUTOMATIC and there are MIN_CONVEX_ROWS rows,
 anderson sweeps FIRST_LAW_TEST times under Coulomb's law, unless it starts from zero, then under the cone law. At doubling
-numbers of iterations it compares the steps f of one sweep under each law, and returns to Coulomb's law for good if
+numbers of iterations it compares the steps f of one sweep of exact blocks under each law, and returns to Coulomb's law for good if
 
     |f_cone| < 0.5 |f_coulomb|,  |f_coulomb| > 0.8 |f_coulomb of the test before|     contacts slip at the cone solution  (4)
     |f_coulomb| < 0.95 |f_cone|   (0.15 |f_cone| at the first test)                   Coulomb's law is no harder          (5)
 
 Measured: at the first test, |f_coulomb| / |f_cone| is 0.22 to 0.75 in piles that stick, 0.01 to 0.13 in piles of balls that slip,
 0.34 to 0.6 in pyramids, and below 0.02 after a warm start with slip. Later, |f_coulomb| falls by 0.01 to 0.6 from test to test
-in piles that stick, by 0.85 to 1 in pyramids that slip, and is 0.83 to 0.93 times |f_cone| in towers and walls.
+in piles that stick, by 0.85 to 1 in pyramids that slip, and is 1.02 to 1.2 times |f_cone| in towers and walls.
 """
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t, uint64_t
@@ -133,13 +133,13 @@ cdef inline void extrapolate_nesterov(double* y, double* x, double* p, double be
         x[i] = q
 
 
-cdef inline double compute_sweep_step(acceleration_t* c, const blocks_t* p, bint exact, const double* lam) noexcept nogil:
-    """Return |f| of one sweep from lam (m) under the law of p. The velocities are those of lam before and afterwards."""
+cdef inline double compute_sweep_step(acceleration_t* c, const blocks_t* p, const double* lam) noexcept nogil:
+    """Return |f| of one sweep of exact blocks from lam (m) under the law of p. The velocities remain those of lam."""
     cdef int32_t i
     cdef double* x = c.work
     for i in range(p.n_rows):
         x[i] = lam[i]
-    sweep_over_form(c.sweeps, p, exact, x, False)
+    sweep_over_form(c.sweeps, p, True, x, False)
     compute_sweep_velocities(c.sweeps, lam)
     return sqrt(subtract_and_weighted_norm(p.d, x, lam, p.n_rows))
 
@@ -147,8 +147,8 @@ cdef inline double compute_sweep_step(acceleration_t* c, const blocks_t* p, bint
 cdef inline void test_law(acceleration_t* c, const mixing_t* mixing, const double* lam) noexcept nogil:
     """Compare both laws at lam (m) [N s]: begin the iterations under the cone law, or end them if (4) or (5) holds."""
     cdef bint is_first = c.iterations == c.convex_begin, slips
-    cdef double coulomb = compute_sweep_step(c, c.sweeps.blocks, c.sweeps.exact, lam)
-    cdef double cone = compute_sweep_step(c, &c.cone, True, lam)
+    cdef double coulomb = compute_sweep_step(c, c.sweeps.blocks, lam)
+    cdef double cone = compute_sweep_step(c, &c.cone, lam)
     slips = not is_first and cone < 0.5 * coulomb and coulomb > 0.8 * c.last_coulomb_step
     if slips or coulomb < (0.15 if is_first else 0.95) * cone:
         c.convex = c.iterations
