@@ -11,10 +11,10 @@
 3. If rows are nearly dependent and 1 and 2 fail: an interior point on the augmented system of the bodies, then
    proximal damped Newton.
 4. Coulomb friction: proximal damped Newton on the Alart-Curnier map, and interior points on De Saxce's form of the
-   law, in which the convex problem changes with every step. If these stall and few contacts slide at the solution of
-   the convex law, convex problems with a fixed shift follow from there (`lavender_ext/newton/shifted.pxd`). Otherwise,
-   or if they stall too, a path of smoothed problems (Chen, Mangasarian 1996) is followed, each step by the coordinate
-   that changes fastest (Rheinboldt 1986), through folds at which contacts change from stick to slip.
+   law, in which the convex problem changes with every step. If these stall near a solution, or if few contacts slide at
+   the solution of the convex law, proximal points of this form follow from there (`lavender_ext/newton/flow.pxd`).
+   Otherwise, or if they stall too, a path of smoothed problems (Chen, Mangasarian 1996) is followed, each step by the
+   coordinate that changes fastest (Rheinboldt 1986), through folds at which contacts change from stick to slip.
 
 Problems in generalised coordinates are first solved over their velocities (`newton_systems/general.py`), without
 forming A. Unless rows far outnumber velocities, this kernel runs method 4 over a dense A under Coulomb's law, and

@@ -3,7 +3,7 @@
     start            if the start is a solution, nothing runs
     compiled call    one call for small problems, for small islands with friction, and for J and M if Newton's method
                      is estimated to cost no more than the first sweeps (`small.py`); attempted once
-    large problems   under Coulomb's law, from `relaxed_rows` rows on, four stages come first (of J and M, if the
+    large problems   under Coulomb's law, from `relaxed_rows` rows on, five stages come first (of J and M, if the
                      velocities belong to free bodies). They solve the convex relaxation, which has the same
                      solution if no contact slips, and judge each iterate under Coulomb's law. After each stage, only
                      the islands that it has not solved continue
@@ -14,17 +14,21 @@
                      3. `admm` from zero, up to 0.4 times that cost and 600 iterations, if this pays for 150
                      4. the interior points of `newton` on the relaxation, until their residual of the relaxation is
                         below `slip_ratio` times Coulomb's: contacts slip
+                     5. `admm` from the relaxation's solution, which stage 4 then computes, if its residual on Coulomb's
+                        law is at most `trial_residual`: `trial_iterations` at a time, while two more such turns are
+                        predicted to solve the problem
+                     The alternation follows
     sweeps           `anderson`, unless the problem is linear or large: `first_sweeps` sweeps. Sweeping continues up to
                      the cost of the cheapest factorising solver, unless more sweeps are predicted to be needed
     factorisations   `newton` (over velocities, bodies or rows of A), and for bounded rows of a matrix `direct`, the
-                     cheapest first, each up to `budget_ratio` times its estimated cost, on large problems with friction
-                     a quarter more
+                     cheapest first, each up to `budget_ratio` times its estimated cost
     certificate      a search for a proof that no solution exists: for J and M from the smallest violation of the
                      constraints, for other problems under Coulomb's law by a linear program
     alternation      the factorising solvers, `admm` and sweeps, each continued where it stopped, with doubled
                      work in each round, until no solver improves the residual in two rounds or the total cost exceeds
-                     `total_ratio` times the cost of the cheapest. On large problems with friction, a round begins with
-                     a tenth of a turn of `admm`, which continues while one more is predicted to solve the problem
+                     `total_ratio` times the cost of the cheapest. On large problems with friction, `newton` begins with
+                     `turn_factorisations`, each solver starts from the best impulse of the others, `newton` with Euler
+                     steps (`lavender_ext/newton/flow.pxd`), and sweeps do not run
     end              a search for a certificate by a linear program, if none was tried before (`certify.py`)
 
 Linear problems given by a matrix, and others with a narrow band as A, start with `direct`. A program with a singular P
@@ -88,12 +92,11 @@ RELAXED_BUDGET_RATIO = 2.0
 # number of iterations, if it pays for the smallest. Without a factor, an iteration costs about as much as three sweeps.
 ADMM_FRACTION, SWEEPS_PER_ADMM_ITERATION = 0.4, 3.0
 MIN_ADMM_ITERATIONS, MAX_ADMM_ITERATIONS = 150.0, 600.0
-# On large problems with friction, the first turn of the factorising solvers is longer by this factor: the paths of
-# many heaps end between 1 and 1.25 times the budget of other problems.
-LARGE_BUDGET_FACTOR = 1.25
-# On large problems with friction, `admm` runs before the factorising solvers of a round, for this fraction of the cost
-# of a turn. It ends many solves from the best impulse of a path; 1 delays what a second turn of `newton` solves.
-EARLY_ADMM_FRACTION = 0.1
+# `admm` continues from the solution of the relaxation while at most this number of further turns are predicted to
+# solve the problem.
+MAX_TRIALS = 2
+# The relaxation is solved if its residual is below this multiple of Coulomb's.
+SOLVED_RELAXATION_RATIO = 1e-5
 # Largest number of rounds of alternation; the limit of the total cost ends most solves earlier.
 MAX_ALTERNATIONS = 12
 # The compiled call is only made if at least this many iterations are allowed; it usually needs fewer.
@@ -212,6 +215,7 @@ class Newton(Step):
     """
 
     started_from_zero = is_second_start = has_stalled = False
+    best = inf  # Smallest residual of all stages when this step ended.
 
     def run(self, n: float) -> None:
         """Run at most n iterations, with a second start from zero and over rows of A if the method stalls."""
@@ -233,11 +237,14 @@ class Newton(Step):
         if not self.state.begun:
             self.impulse = log.problem.start() if self.is_second_start else log.impulse.copy()
             self.started_from_zero = self.started_from_zero or not (self.impulse - log.problem.start()).any()
+        elif log.best < self.best and starts_relaxed(log.problem) and self.state.system is not None:
+            self.state.system.solve.continue_from_better_point(log.impulse, n)
         claim = self.solver.advance(
             self.state, self.impulse, n, log.tol, log.time_left, log.remaining_iterations
         )
         self.has_stalled = claim.status is Status.STALLED
         self.store_iterate_in_log(claim.judged)
+        self.best = log.best
         return claim
 
 
@@ -266,7 +273,11 @@ class RelaxedNewton(Step):
                 break
             system.solve.write_interior_impulse(trial)
             log.judge_and_store_best(trial)
-            if log.best <= log.tol or log.compare_with_relaxation(trial) < DECISIONS.slip_ratio:
+            ratio, residual = log.compare_with_relaxation(trial)
+            if log.best <= log.tol or (ratio < DECISIONS.slip_ratio and residual > DECISIONS.trial_residual):
+                break
+            if ratio < SOLVED_RELAXATION_RATIO:
+                log.relaxed = trial
                 break
         return replace(claim, iterations=done, work=work)
 
@@ -275,11 +286,16 @@ class Iterations(Step):
     """A resumable solver, which runs in chunks between checks of the clock and Ctrl-C."""
 
     time_fraction = 1.0  # Fraction of the remaining time that a stage may use.
+    restarts = False  # Whether a stage starts from the best impulse if another solver has found a better one.
+
+    def __init__(self, name: str, log: SolveLog) -> None:
+        super().__init__(name, log)
+        self.restarts = name == "admm" and starts_relaxed(log.problem)
 
     def advance(self, n: int) -> Claim:
         """Run at most n iterations and offer the last and the best iterate to the log."""
         log, left = self.log, self.log.deadline.get_remaining_seconds()
-        if self.state is None:
+        if self.state is None or (self.restarts and log.best < self.state.best[0]):
             self.prepare_and_set_start()
         deadline = None
         if left is not None:
@@ -303,8 +319,12 @@ class Iterations(Step):
         """Do nothing: the loop has made the records."""
 
     def prepare_and_set_start(self) -> None:
-        """Prepare the solver and start from the best impulse of the log, or from zero."""
-        start = self.log.problem._start if self.name == "admm from zero" else self.log.impulse
+        """Prepare the solver and start from the best impulse of the log, zero, or the relaxation's solution."""
+        log, start = self.log, self.log.impulse
+        if self.name == "admm from zero":
+            start = log.problem._start
+        elif self.name == "admm" and self.state is None and log.relaxed is not None:
+            start = log.relaxed
         self.state, self.impulse = self.solver.prepare(self.log.problem), start.copy()
 
     def run_loop(self, loop: Loop, n: int) -> Claim:
@@ -585,7 +605,7 @@ class DecisionTree:
             yield Stage("direct", n, ratio * self.direct, "a narrow band: before any analysis")
         elif not (relaxed or self.factorises_first):
             yield self.sweeps(first, "the first sweeps, before any analysis")
-        if not self.factorises_first and first < self.newton < inf:
+        if not relaxed and not self.factorises_first and first < self.newton < inf:
             why = f"up to {format_seconds(1e-9 * self.newton)}, as much as {next(iter(self.solver_costs))} costs"
             yield self.sweeps(self.newton - first, why, self.newton)
         if p.generalized is not None and not np.all(p.compliance):
@@ -593,7 +613,10 @@ class DecisionTree:
             # The certificate's smallest violation is computed over velocities.
             cost = self.newton if self.newton_state is None else self.newton_state.cost
             yield Stage("certificate", 1.0, cost, "whether the least violation proves that there is none")
-        for stage in self.iterate_factorising_stages(LARGE_BUDGET_FACTOR * ratio if relaxed else ratio):
+        if relaxed:
+            yield from self.iterate_alternating_stages()
+            return
+        for stage in self.iterate_factorising_stages(ratio):
             if not (pivots_first and stage.solver == "direct"):  # It has had this budget.
                 yield stage
         if self.law == "coulomb" and p.generalized is None and ratio * self.unit >= RATES["linear program"]:
@@ -624,6 +647,9 @@ class DecisionTree:
         if self.first_stage <= 4:
             n, why = RELAXED_BUDGET_RATIO * state.steps, "exact if no contact slips"
             yield Stage("newton on the relaxation", n, state.cost, why, position=4)
+        if self.log is None or self.log.relaxed is not None:
+            n, why = DECISIONS.trial_iterations, "from the relaxation, while it is predicted to end soon"
+            yield from self.repeat_while_converging(Stage("admm", n, n * self.relaxed_sweep, why), MAX_TRIALS)
 
     def iterate_factorising_stages(self, times: float) -> Iterator[Stage]:
         """Yield stages of the factorising solvers; each may cost `times` the estimated cost of the cheapest of them."""
@@ -636,9 +662,12 @@ class DecisionTree:
     def iterate_alternating_stages(self) -> Iterator[Stage]:
         """Yield all solvers in rounds with doubled work, until no solver improves the residual in two rounds."""
         self.remaining_cost = DECISIONS.total_ratio * self.unit
+        times = DECISIONS.budget_ratio
+        if starts_relaxed(self.problem):
+            times = DECISIONS.turn_factorisations / DECISIONS.factorisations
         for k in range(MAX_ALTERNATIONS):
             before = self.best
-            for stage in self.iterate_one_round(2.0**k):
+            for stage in self.iterate_one_round(times * 2.0**k):
                 if self.remaining_cost < 1.0:  # Less than 1 ns remains.
                     return
                 fraction = min(1.0, self.remaining_cost / stage.cost)
@@ -648,18 +677,20 @@ class DecisionTree:
                 return
 
     def iterate_one_round(self, times: float) -> Iterator[Stage]:
-        """Yield one round, in which each solver may cost `times` the first budget of the factorising solvers."""
-        times *= DECISIONS.budget_ratio
+        """Yield one round, in which each solver may cost `times` the cheapest factorising solver."""
         p, cost, setup = self.problem, times * self.unit, 0.0
-        why = f"in turn, {times:g} times the cheapest factorising solver's cost"
+        why = f"in turn, {times:.3g} times the cheapest factorising solver's cost"
+        if starts_relaxed(p):
+            yield from (self.factorisation(name, cost, why) for name in self.solver_costs)
+            # An iteration costs as much as a sweep under the cone law.
+            n = ADMM_FRACTION * cost / self.relaxed_sweep
+            yield from self.repeat_while_converging(Stage("admm", n, ADMM_FRACTION * cost, why))
+            return
         n = 0.5 * cost / self.sweep  # An iteration of `admm` costs as much as two sweeps.
         if p.generalized is not None:
             # `admm` forms and factors A of J and M. Its set-up cost does not depend on cached data.
             setup = estimate_formation_cost(p, False)
             setup += estimate_first_factor_cost(p.m, float(p.metric.entries_of_matrix))
-        if setup <= cost and starts_relaxed(p):
-            fraction = EARLY_ADMM_FRACTION
-            yield from self.repeat_while_converging(Stage("admm", fraction * n, fraction * cost, why))
         yield from (self.factorisation(name, cost, why) for name in self.solver_costs)
         if setup <= cost:
             yield from self.repeat_while_converging(Stage("admm", n, cost, why))
@@ -668,15 +699,17 @@ class DecisionTree:
             yield self.sweeps(cost, why)
             self.sweeps_failed = self.best >= before
 
-    def repeat_while_converging(self, stage: Stage) -> Iterator[Stage]:
-        """Yield a stage. On large problems with friction, repeat it while one more turn is predicted to reach tol."""
+    def repeat_while_converging(self, stage: Stage, max_more: int = 1) -> Iterator[Stage]:
+        """Yield a stage. On large problems with friction, repeat it while it is predicted to converge.
+
+        It is repeated while `max_more` further stages of the same gain reach tol.
+        """
         is_converging = True
         while is_converging:
             before = self.best
             yield stage
-            # One more turn of the same gain reaches tol.
             gains = starts_relaxed(self.problem) and self.best < before
-            is_converging = gains and self.best**2 <= self.log.tol * before
+            is_converging = gains and self.best * (self.best / before) ** max_more <= self.log.tol
 
     def factorisation(self, name: str, cost: float, why: str) -> Stage:
         """Return the stage of a factorising solver with the budget `cost` [ns]."""

@@ -57,6 +57,8 @@ class SolveLog:
         self.judged: Any = None
         # Impulse (m,) [N s] with the best impulse of each island, until one impulse meets tol in all islands.
         self.result = problem._start
+        # Last impulse (m,) [N s] of the interior points on the convex relaxation, or None.
+        self.relaxed: FloatArray | None = None
         self.stages: list[SolverStage] = []
         self.work: dict[str, int] = {}
         self.iterations = 0
@@ -93,15 +95,17 @@ class SolveLog:
         if self.best > self.tol and not is_known:
             self.result = combine_best_islands(self.problem, self.result, (impulse,), self.tol)
 
-    def compare_with_relaxation(self, impulse: FloatArray) -> float:
-        """Return the residual of an impulse (m,) [N s] on the convex relaxation divided by that on Coulomb's law.
+    def compare_with_relaxation(self, impulse: FloatArray) -> tuple[float, float]:
+        """Return (ratio, residual) of an impulse (m,) [N s], the largest of all islands that are not solved.
 
-        The ratio is the largest of all islands that are not solved; 0 if all are solved.
+        The ratio is the residual on the convex relaxation divided by that on Coulomb's law. The residual is relative,
+        on Coulomb's law. Both are 0 if all islands are solved.
         """
         problems = self.problem, get_relaxation(self.problem)
         exact, relaxed = (residuals_by_island(p.metric, impulse)[1] for p in problems)
         unsolved = exact[:, 0] > self.tol
-        return float((relaxed[unsolved, 1] / exact[unsolved, 1]).max(initial=0.0))
+        ratio = float((relaxed[unsolved, 1] / exact[unsolved, 1]).max(initial=0.0))
+        return ratio, float(exact[unsolved, 0].max(initial=0.0))
 
     def record_stage(self, name: str, claim: Claim, before: float) -> None:
         """Record a stage that has ended; the relative residual before it was `before`."""

@@ -75,7 +75,7 @@ cdef inline double early_slip_speed() noexcept nogil:
 cdef inline double max_early_sliding_fraction() noexcept nogil:
     """Return the fraction of contacts that slide fast above which an interior point of the convex law ends under Coulomb's law.
 
-    Below `early_slip_residual`, piles that shifted Newton solves have up to 2 %; balls in motion 15 % and more.
+    Below `early_slip_residual`, piles that Euler steps from it solve have up to 2 %; balls in motion 15 % and more.
     """
     return 0.1
 

@@ -11,13 +11,14 @@
                                               if joints are rigid
                     CONVEX_DAMPED_NEWTON      proximal damped Newton; its direction may prove     CONVEX_END
                                               that there is no solution
-    Coulomb's       START_SHIFTED             shifted Newton, if the start solves the convex law  START_DAMPED_NEWTON
+    Coulomb's       START_FLOW                Euler steps, if the start solves the convex law     START_DAMPED_NEWTON
                     START_DAMPED_NEWTON       proximal damped Newton from the start               FIRST_DE_SAXCE
-                    FIRST_DE_SAXCE            De Saxce's interior point, 0.95 of phi's derivative CONVEX_POINT
-                    CONVEX_POINT              interior point of the convex law, judged under      FIRST_SHIFTED
+                    FIRST_DE_SAXCE            De Saxce's interior point, 0.95 of phi's derivative FIRST_FLOW
+                    FIRST_FLOW                Euler steps, if this point is near a solution       CONVEX_POINT
+                    CONVEX_POINT              interior point of the convex law, judged under      CONVEX_FLOW
                                               Coulomb's law, unless the start solves it; ends
                                               if many contacts slide
-                    FIRST_SHIFTED             shifted Newton from it, if few contacts slide       FIRST_PATH
+                    CONVEX_FLOW               Euler steps from it, if few contacts slide          FIRST_PATH
                     FIRST_PATH                path of smoothed problems, unless joints are rigid  SECOND_DE_SAXCE
                     SECOND_DE_SAXCE           De Saxce's interior point with 0.7 of it            AUGMENTED_DE_SAXCE
                     AUGMENTED_DE_SAXCE        De Saxce's on the augmented system, if joints are   MORE_PATHS
@@ -31,6 +32,9 @@ tests/sim/engine/test_engine_newton.py:
     SECOND_CONE_WEIGHT   pyramid(k=30, friction="coulomb") under the cone law, to 1e-9
     THIRD_CONE_WEIGHT    pyramid(k=6, mass_ratio=1e6, friction="coulomb", sliding=0.5) under the cone law, to 1e-8
     AUGMENTED_INTERIOR_POINT, AUGMENTED_DE_SAXCE    Scene("bridge", friction=0.5), step 99, to 1e-8
+    FIRST_FLOW           pyramidF(k=14), to 1e-6 within 360 factorisations
+
+A host that has a better point begins Euler steps from it with `continue_from_better_point`.
 
 Every state ends the solve as soon as the best point is within tol or at the round-off limit, a certificate is proven,
 or the budget is spent. De Saxce's interior point has states of its own:
@@ -48,7 +52,7 @@ from lavender_ext.core.block_types cimport CONE, COULOMB
 from lavender_ext.core.start cimport is_zero_impulse
 from lavender_ext.judge.score cimport relative_residual
 from lavender_ext.newton.cones cimport has_lower_bound, has_upper_bound
-from lavender_ext.newton.shifted cimport begin_shifted_newton, step_shifted_newton
+from lavender_ext.newton.flow cimport begin_flow, step_flow
 from lavender_ext.newton.path cimport N_PATHS, begin_path, step_path
 from lavender_ext.newton.active_set cimport begin_active_set, step_active_set
 from lavender_ext.newton.damped_newton cimport (begin_damped_newton, begin_damped_newton_stretches,
@@ -56,9 +60,9 @@ from lavender_ext.newton.damped_newton cimport (begin_damped_newton, begin_dampe
 from lavender_ext.newton.interior_phases cimport (augmented_shift, begin_interior_steps, begin_interior_with_newton,
                                                   compute_sliding_fraction, step_augmented_newton, step_interior_point,
                                                   step_interior_with_newton)
-from lavender_ext.newton.run cimport (ACTIVE_SET, AUGMENTED_NEWTON, DAMPED_NEWTON, DAMPED_STRETCHES, DE_SAXCE, INTERIOR_POINT,
+from lavender_ext.newton.run cimport (ACTIVE_SET, AUGMENTED_NEWTON, DAMPED_NEWTON, DAMPED_STRETCHES, DE_SAXCE, FLOW, INTERIOR_POINT,
                                       INTERIOR_WITH_NEWTON, MAX_INNER_STEPS, N_COUNTED, N_REFINEMENTS, UNLIMITED,
-                                      PLAN_CONVEX, PLAN_COULOMB, SHIFTED_NEWTON, begin_separate_best, convex_residual,
+                                      PLAN_CONVEX, PLAN_COULOMB, begin_separate_best, convex_residual,
                                       compute_slack, copy_vector, de_saxce_t, end_separate_best, is_at_roundoff,
                                       is_budget_spent, is_finished, is_over, newton_t, pop_phase, push_phase, restore_best_of_all,
                                       restore_best_before_phase, judge_and_keep_best_point, store_earlier_best, write_unknown)
@@ -79,17 +83,18 @@ cdef enum:                      # states of PLAN_CONVEX
     CONVEX_END = 8
 
 cdef enum:                      # states of PLAN_COULOMB
-    START_SHIFTED = 0
+    START_FLOW = 0
     START_DAMPED_NEWTON = 1
     FIRST_DE_SAXCE = 2
-    CONVEX_POINT = 3
-    FIRST_SHIFTED = 4
-    FIRST_PATH = 5
-    SECOND_DE_SAXCE = 6
-    AUGMENTED_DE_SAXCE = 7
-    MORE_PATHS = 8
-    COULOMB_DAMPED_NEWTON = 9
-    COULOMB_END = 10
+    FIRST_FLOW = 3
+    CONVEX_POINT = 4
+    CONVEX_FLOW = 5
+    FIRST_PATH = 6
+    SECOND_DE_SAXCE = 7
+    AUGMENTED_DE_SAXCE = 8
+    MORE_PATHS = 9
+    COULOMB_DAMPED_NEWTON = 10
+    COULOMB_END = 11
 
 cdef enum:                      # states of DE_SAXCE
     DE_SAXCE_INTERIOR = 0
@@ -100,9 +105,12 @@ cdef enum:                      # states of DE_SAXCE
 cdef enum:
     POINT_REFINEMENTS = 3       # Refinements of an interior point's first z with the factor of its weighted system.
     EXACT_POINT_REFINEMENTS = 20    # Refinements of linear rows with a factor of nearly no weight, which is less exact.
-    MIN_SHIFTED_ROWS = 300      # With fewer rows the paths cost less than the convex point.
-    START_SHIFTED_FACTORISATIONS = 40   # Budget of shifted Newton from the start; many piles take fewer than 30.
-    FIRST_SHIFTED_FACTORISATIONS = 300  # Its budget before the paths; piles that it solves take up to 240.
+    MIN_CONVEX_ROWS = 300      # With fewer rows the paths cost less than the convex point.
+    CONVEX_START_FACTORISATIONS = 40   # Budget of Euler steps from a convex start; many piles take fewer than 30.
+    CONVEX_FLOW_FACTORISATIONS = 300  # Its budget before the paths; piles that it solves take up to 240.
+    MIN_FLOW_ROWS = 900         # With fewer rows the paths take few factorisations.
+    FLOW_PATIENCE = 60          # Euler steps from a near point end if so many factorisations do not halve the residual.
+    FIRST_FLOW_FACTORISATIONS = 200     # Budget of Euler steps; walls and pyramids that they solve take up to 200.
     START_FACTORISATIONS = 8    # First stretch of damped Newton; a start near a solution gains within it.
     FIRST_END_INNER_STEPS = 10
     FIRST_END_FACTORISATIONS = 15   # Factorisations of the first damped Newton phase after De Saxce's interior point.
@@ -126,11 +134,21 @@ cdef inline double far_from_end() noexcept nogil:
 
 
 cdef inline double max_sliding_fraction() noexcept nogil:
-    """Return the fraction of sliding contacts above which the paths come before shifted Newton.
+    """Return the fraction of sliding contacts above which the paths come before Euler steps from the convex point.
 
     Of piles of balls that it solves up to 4 % slide at the convex point; of towers, walls and pyramids 7 % to 80 %.
     """
     return 0.05
+
+
+cdef inline double max_start_residual() noexcept nogil:
+    """Return the residual of the start above which damped Newton from it gains nothing on large problems."""
+    return 1e-2
+
+
+cdef inline double max_flow_residual() noexcept nogil:
+    """Return the residual of De Saxce's point above which the paths come before Euler steps, as on heaps."""
+    return 1e-3
 
 
 cdef inline double max_start_residual_ratio() noexcept nogil:
@@ -335,13 +353,13 @@ cdef inline void enter_next_de_saxce_state(newton_t* n) noexcept nogil:
         begin_damped_newton_after_de_saxce(n, min(best, 1e-7), SECOND_END_FACTORISATIONS, SECOND_END_FACTORISATIONS)
 
 
-cdef inline bint is_shifted_possible(const newton_t* n) noexcept nogil:
-    """Return whether shifted Newton may run: H is symmetric, and the problem is large."""
-    return n.s.symmetric and n.s.e.m >= MIN_SHIFTED_ROWS
+cdef inline bint has_convex_law(const newton_t* n) noexcept nogil:
+    """Return whether the convex point may be computed: H is symmetric, and the problem is large."""
+    return n.s.symmetric and n.s.e.m >= MIN_CONVEX_ROWS
 
 
 cdef inline bint slides_mostly(newton_t* n, const double* z) noexcept nogil:
-    """Return whether too many contacts slide at z, a solution of the convex law, for shifted Newton before the paths."""
+    """Return whether too many contacts slide at z, a solution of the convex law, for Euler steps before the paths."""
     return compute_sliding_fraction(n, z, 1e-6) > max_sliding_fraction()
 
 
@@ -349,33 +367,37 @@ cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
     """Enter the next state of Coulomb's law."""
     cdef int32_t state = n.stage
     n.stage = state + 1
-    if state != START_SHIFTED and is_over(n):
+    if state != START_FLOW and is_over(n):
         state = COULOMB_END
-    if state == START_SHIFTED:
+    if state == START_FLOW:
         if not n.is_cold:
             multiply_system_matrix(&n.s, n.best_z, n.hz)
-            if is_shifted_possible(n) and convex_residual(n, n.best_z, n.hz) < 0.01 * n.best:
+            if has_convex_law(n) and convex_residual(n, n.best_z, n.hz) < 0.01 * n.best:
                 n.has_convex_start = 1
                 copy_vector(n, n.saved_z, n.best_z)
                 n.mostly_slides = slides_mostly(n, n.saved_z)
                 if not n.mostly_slides:
-                    begin_shifted_newton(n, n.best_z, START_SHIFTED_FACTORISATIONS)
+                    begin_flow(n, n.best_z, CONVEX_START_FACTORISATIONS, CONVEX_START_FACTORISATIONS)
     elif state == START_DAMPED_NEWTON:
-        begin_damped_newton(n, n.best_z, COULOMB, start_alpha(), START_FACTORISATIONS)
-        begin_damped_newton_stretches(n, START_FACTORISATIONS, 2.0 * max_start_residual_ratio() * n.best)
+        if n.s.e.m < MIN_FLOW_ROWS or n.best < max_start_residual():
+            begin_damped_newton(n, n.best_z, COULOMB, start_alpha(), START_FACTORISATIONS)
+            begin_damped_newton_stretches(n, START_FACTORISATIONS, 2.0 * max_start_residual_ratio() * n.best)
     elif state == FIRST_DE_SAXCE:
         begin_de_saxce(n, first_derivative_fraction(), far_from_end())
+    elif state == FIRST_FLOW:
+        if n.s.e.m >= MIN_FLOW_ROWS and n.best < max_flow_residual() and not n.flow.has_run:
+            begin_flow(n, n.best_z, FIRST_FLOW_FACTORISATIONS, FLOW_PATIENCE)
     elif state == CONVEX_POINT:
-        if not n.has_convex_start and is_shifted_possible(n):
+        if not n.has_convex_start and has_convex_law(n):
             begin_interior_point(n, compute_proximal_weight(), 0.0)
             begin_interior_steps(n, False)
-    elif state == FIRST_SHIFTED:
-        if not n.has_convex_start and is_shifted_possible(n):
+    elif state == CONVEX_FLOW:
+        if not n.has_convex_start and has_convex_law(n):
             n.has_convex_start = 1
             copy_vector(n, n.saved_z, n.progress.best_z)
             n.mostly_slides = n.mostly_slides or slides_mostly(n, n.saved_z)
         if n.has_convex_start and not n.mostly_slides:
-            begin_shifted_newton(n, n.saved_z, FIRST_SHIFTED_FACTORISATIONS)
+            begin_flow(n, n.saved_z, CONVEX_FLOW_FACTORISATIONS, CONVEX_FLOW_FACTORISATIONS)
     elif state == FIRST_PATH:
         if not has_rigid_joints(n):
             begin_path(n)
@@ -393,6 +415,13 @@ cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
         push_damped_newton(n, UNLIMITED)
     else:
         pop_phase(n)
+
+
+cdef inline void continue_from_better_point(newton_t* n, const double* lam, int32_t limit) noexcept nogil:
+    """Begin Euler steps from lam (rows), for at most `limit` factorisations; the present phase continues after them."""
+    write_unknown(n, lam, n.da)
+    judge_and_keep_best_point(n, n.da)
+    begin_flow(n, n.da, limit, FLOW_PATIENCE)
 
 
 # -- start and step ----------------------------------------------------------------------------------------------------
@@ -417,8 +446,8 @@ cdef inline void step_phase(newton_t* n) noexcept nogil:
         step_augmented_newton(n)
     elif phase == DAMPED_NEWTON:
         step_damped_newton(n)
-    elif phase == SHIFTED_NEWTON:
-        step_shifted_newton(n)
+    elif phase == FLOW:
+        step_flow(n)
     elif phase == DAMPED_STRETCHES:
         continue_damped_newton_stretches(n)
     else:
@@ -431,6 +460,7 @@ cdef inline void start_newton_solve(newton_t* n, const double* lam) noexcept nog
     cdef bint has_cones = n.s.e.n < n.s.e.m
     n.stop = n.needs_check = n.proven = n.has_saved_best = n.depth = n.path.paths = 0
     n.has_convex_start = n.mostly_slides = 0
+    n.flow.has_run = 0
     n.s.augmented = n.s.factorisations = 0
     for i in range(N_COUNTED):
         n.counts[i] = 0

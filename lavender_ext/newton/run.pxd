@@ -34,7 +34,7 @@ cdef enum:                      # phases
     DAMPED_NEWTON = 7           # damped_newton.pxd
     DAMPED_STRETCHES = 8
     PATH = 9                    # path.pxd
-    SHIFTED_NEWTON = 10         # shifted.pxd
+    FLOW = 10                   # flow.pxd
 
 cdef enum:                      # counters
     N_ACTIVE_SET = 0
@@ -46,7 +46,7 @@ cdef enum:                      # counters
     N_AUGMENTED_DE_SAXCE = 6
     N_AUGMENTED_NEWTON = 7
     N_PATH = 8
-    N_SHIFTED = 9
+    N_FLOW = 9
     N_COUNTED = 10
 
 cdef enum:
@@ -174,23 +174,19 @@ cdef struct path_t:             # a path of smoothed problems
     int32_t last                # factorisations at which the path ends
 
 
-cdef struct shifted_t:          # convex problems with a fixed shift
-    double* z                   # the point of (1)
+cdef struct flow_t:             # implicit Euler steps of the proximal flow
+    double* z
     double* hz                  # H z
     double* centre              # c
-    double* shift               # phi, 0 except on the normals of contacts
-    double* step                # last update of phi
-    double* centre_step         # last update of c
-    double* next                # scratch
+    double* saved_z             # z at the end of the last solved step
     double eps                  # proximal weight
-    double tolerance            # |F| in the norm of H at which (1) is solved
-    double lowest               # smallest change of c and phi, up to a factor of two
+    double move                 # eps |Pi_K(u) - c| of the last evaluation
     double trial_residual       # damped Newton is tried below this relative residual
-    double history[5]           # changes of phi by the last updates
-    int32_t inner_steps
-    int32_t free_updates        # updates in a row without a factorisation
-    int32_t updates
+    double lowest               # lowest residual, up to a factor of two
+    int32_t inner_steps         # Newton steps of this Euler step
+    int32_t has_run             # Euler steps have run in this solve
     int32_t since               # factorisations at the last such progress
+    int32_t patience            # the phase ends if so many factorisations do not halve the residual
     int32_t last                # factorisations at which the phase ends
 
 
@@ -245,7 +241,7 @@ cdef struct newton_t:           # bound to its workspace; it must not move
     stretches_t stretches
     de_saxce_t de_saxce
     path_t path
-    shifted_t shifted
+    flow_t flow
 
 
 # -- workspace -------------------------------------------------------------------------------------------------------
@@ -295,14 +291,13 @@ cdef inline void bind_vectors(newton_t* n, int64_t m, arena_t* a) noexcept nogil
 
 
 cdef inline void bind_coulomb_vectors(newton_t* n, int64_t m, arena_t* a) noexcept nogil:
-    """Take the vectors (m) of paths and of shifted Newton, which set them before they read them."""
+    """Take the vectors (m) of paths and of Euler steps, which set them before they read them."""
     cdef path_t* p = &n.path
-    cdef shifted_t* s = &n.shifted
+    cdef flow_t* f = &n.flow
     p.z, p.t, p.b = take_doubles(a, m), take_doubles(a, m), take_doubles(a, m)
     p.saved_z[0], p.saved_z[1] = take_doubles(a, m), take_doubles(a, m)
     p.saved_t[0], p.saved_t[1] = take_doubles(a, m), take_doubles(a, m)
-    s.z, s.hz, s.centre, s.shift = take_doubles(a, m), take_doubles(a, m), take_doubles(a, m), take_doubles(a, m)
-    s.step, s.centre_step, s.next = take_doubles(a, m), take_doubles(a, m), take_doubles(a, m)
+    f.z, f.hz, f.centre, f.saved_z = take_doubles(a, m), take_doubles(a, m), take_doubles(a, m), take_doubles(a, m)
 
 
 cdef inline void bind_values(newton_t* n, int64_t small, bint clear, arena_t* a) noexcept nogil:

@@ -336,7 +336,7 @@ def test_newton_pile_slides_shifted_newton_has_the_bits_of_the_package(library):
     wanted, factorisations = run_compiled_newton(given, 1e-6, 100)
     solver = library.open(library.problem(given), library.options("newton"))
     result = solver.run(100, 1e-6)
-    # Without shifted Newton, 300 factorisations do not suffice.
+    # Without Euler steps, 300 factorisations do not suffice.
     assert result.outcome == 1 and result.verdict.relative <= 1e-6
     assert (solver.impulse().tobytes(), result.iterations) == (wanted.tobytes(), factorisations)
 

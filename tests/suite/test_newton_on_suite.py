@@ -11,6 +11,7 @@ from lavender.judge.solution import Status
 from lavender.solvers.newton import Newton, NewtonState
 from lavender.solvers.newton_systems.systems import make_system
 from lavender.suite import box_stack
+from lavender_ext.newton.solve import COUNTED
 
 
 @pytest.mark.parametrize(("ratio", "speed"), [(1.0, 0.5), (1e3, 0.0), (1e3, 0.5), (1e6, 0.5)])
@@ -111,10 +112,10 @@ def run_newton_claim(problem, budget=300, impulse=None):
     return Newton().run(NewtonState(problem, system), impulse, budget, 1e-6), impulse
 
 
-def test_shifted_newton_pile_slides_solves_coulomb_and_shifted_cone_law():
+def test_euler_steps_pile_slides_solves_coulomb_and_shifted_cone_law():
     problem = suite.case(SLIDING_PILE).problem
     claim, impulse = run_newton_claim(problem)
-    assert claim.status is Status.CONVERGED and "shifted Newton" in claim.message, claim
+    assert claim.status is Status.CONVERGED and "Euler step" in claim.message, claim
     assert claim.iterations < 100, claim  # The paths alone take more than 300.
     assert lv.residual(problem, impulse).relative <= 1e-6
     # De Saxce: with the normals lowered by mu |v_t| the impulse solves the cone law.
@@ -130,24 +131,24 @@ def test_shifted_newton_pile_slides_solves_coulomb_and_shifted_cone_law():
     assert lv.residual(shifted, impulse).relative <= 1e-5
 
 
-def test_shifted_newton_start_solves_cone_law_begins_there():
+def test_euler_steps_start_solves_cone_law_begins_there():
     problem = suite.case(SLIDING_PILE).problem
     convex = lv.solve(problem.relaxed("cone"), "newton", tol=1e-8).impulse
     claim, impulse = run_newton_claim(problem, impulse=convex)
     assert claim.status is Status.CONVERGED and lv.residual(problem, impulse).relative <= 1e-6
     # Neither the phases of other starts nor the interior point of the cone law run.
-    assert "shifted Newton" in claim.message and "De Saxce" not in claim.message, claim
+    assert "Euler step" in claim.message and "De Saxce" not in claim.message, claim
     assert "interior point" not in claim.message, claim
 
 
-def test_shifted_newton_most_contacts_slide_other_phases_come_first():
+def test_euler_steps_most_contacts_slide_other_phases_come_first():
     problem = suite.case("pyramidF(k=8, sliding=0.5)").problem
     convex = lv.solve(problem.relaxed("cone"), "newton", tol=1e-8).impulse
     claim, _ = run_newton_claim(problem, impulse=convex)
-    assert claim.status is Status.CONVERGED and "shifted Newton" not in claim.message, claim
+    assert claim.status is Status.CONVERGED and "Euler step" not in claim.message, claim
 
 
-def test_shifted_newton_asymmetric_matrix_is_left_to_other_phases():
+def test_euler_steps_asymmetric_matrix_is_left_to_other_phases():
     problem = suite.case(SLIDING_PILE).problem
     matrix = as_matrix(problem).delassus().toarray()
     skew = np.random.default_rng(1).normal(size=matrix.shape) * 1e-7 * matrix.diagonal().mean()
@@ -156,4 +157,25 @@ def test_shifted_newton_asymmetric_matrix_is_left_to_other_phases():
     convex = lv.solve(problem.relaxed("cone"), "newton", tol=1e-8).impulse
     for given_problem, runs in ((symmetric, True), (asymmetric, False)):
         claim, _ = run_newton_claim(given_problem, budget=12, impulse=convex)
-        assert ("shifted Newton" in claim.message) == runs, claim
+        assert ("Euler step" in claim.message) == runs, claim
+
+
+def test_newton_pyramid_with_slip_needs_euler_steps():
+    """Without Euler steps, 360 factorisations end at 9e-6."""
+    problem = lv.suite.case("pyramidF(k=14)").problem
+    solution = lv.solve(problem, "newton", tol=1e-6, max_iter=150)
+    assert solution.success and "Euler steps" in solution.message
+    assert lv.residual(problem, solution.impulse).relative <= 1e-6
+
+
+def test_newton_better_point_is_continued_by_euler_steps():
+    problem = lv.suite.case("pyramidF(k=14)").problem
+    near = lv.solve(problem, "newton", tol=1e-4).impulse
+    newton = Newton()
+    state, impulse = newton.prepare(problem), problem.start()
+    newton.advance(state, impulse, 10, 1e-6)
+    assert lv.residual(problem, impulse).relative > 1e-3  # Far from a solution
+    state.system.solve.continue_from_better_point(near, 60)
+    claim = newton.advance(state, impulse, 60, 1e-6)
+    assert claim.status is Status.CONVERGED and lv.residual(problem, impulse).relative <= 1e-6
+    assert state.system.solve.counts[COUNTED.index("Euler steps")] > 0

@@ -66,12 +66,13 @@ def test_auto_solves_a_resting_pile_by_its_relaxation():
     assert {stage.solver for stage in solution.stages} == {"anderson"}
 
 
-def test_auto_stops_interior_points_on_the_relaxation_when_contacts_slip():
+def test_auto_admm_from_relaxation_solves_pyramid_with_slip():
     problem = lv.suite.case("pyramidF(k=10)").problem  # The relaxation has the residual 6e-2 under Coulomb's law.
     solution = lv.solve(problem, "auto", tol=1e-6)
     work = {stage.solver: stage.work for stage in solution.stages}
     assert solution.success and lv.residual(problem, solution.impulse).relative <= 1e-6
-    assert work["newton on the relaxation"]["factorisations"] < 15  # 20 solve the relaxation to 1e-8.
+    # 20 solve the relaxation to 1e-8; `newton` on Coulomb's law, which is not needed, takes more than 100.
+    assert work["newton on the relaxation"]["factorisations"] <= 24 and "newton" not in work
 
 
 def test_auto_continues_only_with_islands_that_the_relaxation_has_not_solved():

@@ -111,7 +111,7 @@ def problems():
         for _ in range(5):
             simulation.step()
         yield simulation.constraint_problem()
-    yield lv.suite.case("granularF(n=4, sliding=2, seed=10)").problem  # `newton` needs shifted Newton.
+    yield lv.suite.case("granularF(n=4, sliding=2, seed=10)").problem  # `newton` needs Euler steps.
 
 
 def record(folder, steps=STEPS, scenes=SCENES):
