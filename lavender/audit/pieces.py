@@ -101,6 +101,9 @@ class Piece(NamedTuple):
     contact_states : sequence of StepState
     n_dropped : int
         Number of constraint rows for which the engine had no memory.
+    by_motion : (int, float, float)
+        Number of steps that were judged by the acceleration, because forces lost digits; largest number of lost digits;
+        largest velocity error of these steps [m/s].
     against : Piece, optional
         Results of the other model on the same states.
     """
@@ -118,6 +121,7 @@ class Piece(NamedTuple):
     engine_warnings: Mapping[str, int] = MappingProxyType({})
     contact_states: Sequence[StepState] = ()
     n_dropped: int = 0
+    by_motion: tuple[int, float, float] = (0, 0.0, 0.0)
     against: Piece | None = None
 
     @classmethod
@@ -163,9 +167,12 @@ def judge_steps(
     with_contact = np.flatnonzero(contacts > 0)
     n = min(len(with_contact), int(np.ceil(judging.contact_share * len(world))))
     chosen = with_contact[np.arange(n) * len(with_contact) // max(n, 1)]
+    answers = [x for i, x in batch.engine_answers.items() if verdict[i] != NOT_JUDGED]
     return Piece(
         world, step, numbers, verdict=verdict, rows=rows, contacts=contacts, worst=worst,
         where=[(i, CONTACT_NUMBER.sub(r"\1 ", one.worst_name).strip()) for i, one in judged.items()],
         contact_states=[StepState(int(world[i]), int(step[i]), state_of(i)) for i in chosen.tolist()],
         converged=frame.converged, n_dropped=frame.n_dropped,
+        by_motion=(len(answers), max((x.lost_digits for x in answers), default=0.0),
+                   max((x.velocity for x in answers), default=0.0)),
     )  # fmt: skip

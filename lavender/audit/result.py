@@ -117,6 +117,8 @@ class Audit:
         States before steps with contact, if the audit keeps them; in the order of worlds and steps.
     n_dropped : int
         Number of constraint rows for which the engine had no memory.
+    by_motion : (int, float, float)
+        As for `Piece`.
     against : Audit, optional
         Result of another model on the same states.
     key : str
@@ -141,6 +143,7 @@ class Audit:
     engine_warnings: Counter[str] = field(default_factory=Counter)
     contact_states: list[StepState] = field(default_factory=list)
     n_dropped: int = 0
+    by_motion: tuple[int, float, float] = (0, 0.0, 0.0)
     against: Audit | None = None
     key: str = ""
 
@@ -170,6 +173,8 @@ class Audit:
         self.engine_warnings.update(piece.engine_warnings)
         self.divergences[:] = sorted([*self.divergences, *piece.divergences])
         self.n_dropped += piece.n_dropped
+        (n, *own), (more, *new) = self.by_motion, piece.by_motion
+        self.by_motion = n + more, max(own[0], new[0]), max(own[1], new[1])
         if self.against is not None and piece.against is not None:
             self.against.add_piece(piece.against, keep)
 
@@ -332,6 +337,13 @@ class Audit:
             lines.append(
                 f"The engine had no memory for {self.n_dropped} constraint rows and dropped them: its answers solve "
                 "problems without these rows. Allocate more with --njmax."
+            )
+        n_by_motion, digits, error = self.by_motion
+        if n_by_motion:
+            lines.append(
+                f"In {format_count(n_by_motion, 'step')} the forces lose up to {digits:.0f} of their digits, because R "
+                "of a row is far below the diagonal of J M^-1 J^T. These steps are judged by the acceleration: the "
+                f"motion is exact to {format_size(error)} m/s."
             )
         if self.engine_warnings:
             counted = self.engine_warnings.most_common()

@@ -25,6 +25,7 @@ from lavender.base.arrays import (
     resolve_index,
 )
 from lavender.base.errors import InputError
+from lavender.judge.residuals import EngineAnswer
 from lavender.problem import FRICTION_LAWS, Problem
 from lavender.problem.cones import Cones
 from lavender.problem.generalized import MAX_ASYMMETRY, MAX_ASYMMETRY_FLOAT32
@@ -159,6 +160,7 @@ class Batch(Sequence[Problem]):
         compliance = 0.0 if compliance is None else compliance
         soft, at["soft"], _ = _flatten("compliance", compliance, n, row_shape, sizes)
         self._arrays: Any = (jac, mass, free, goal, soft, self._flatten_mu(mu))
+        self.engine_answers: dict[int, EngineAnswer] = {}  # Accelerations that `residual` judges, by world.
 
     # Function that returns the names of a world's blocks.
     names_of: Callable[[int], Sequence[str]] | None = None
@@ -249,10 +251,13 @@ class Batch(Sequence[Problem]):
         world = dict(zip(WORLD.names, self.at[i].item(), strict=True))  # type: ignore[arg-type]
         jac, mass, free, target, compliance, mu = (self._get_array_of_world(world, k) for k in range(6))
         cones = self._get_cones_of_world(i, None if mu is None else as_array("mu", mu, (None,)))
-        return Problem.from_jacobian(
+        problem = Problem.from_jacobian(
             jac, mass, free, target=target, cones=cones, compliance=compliance, friction=self.friction,
             precision=self.precision, names=None if self.names_of is None else self.names_of(i),
         )  # fmt: skip
+        if i in self.engine_answers:
+            problem.__dict__["engine_answer"] = self.engine_answers[i]
+        return problem
 
     def _get_array_of_world(self, world: dict[str, int], which: int) -> Any:
         """Return an array of a world (0: J, 1: M, 2: v*, 3: target, 4: compliance, 5: mu), or None."""

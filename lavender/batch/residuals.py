@@ -343,8 +343,11 @@ def residual_many(
     residuals._process_worlds(
         lambda hand: int(hand.judge_worlds(TOL, is_single_precision)), judge_single, threads, errors
     )
+    answers = worlds.engine_answers if type(worlds) is Batch else {}
     for i, precision in enumerate(precisions):  # For a list of problems, the compiled loop assumes float64.
-        if precision == "float32" and not is_single_precision and i not in residuals.faults:
+        is_float32 = precision == "float32" and not is_single_precision
+        is_engine = i in answers if type(worlds) is Batch else "engine_answer" in worlds[i].__dict__
+        if (is_float32 or is_engine) and i not in residuals.faults:
             judge_single(i)
     return residuals
 

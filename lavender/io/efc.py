@@ -37,6 +37,7 @@ from lavender.io import mujoco as single
 from lavender.io.mujoco_discrete import MASS_TOLERANCE, compute_discrete_matrix
 from lavender.io.mujoco_memory import CHANGED_ADVICE, read_step
 from lavender.io.start_states import can_sleep
+from lavender.io.stiff_rows import judge_stiff_worlds
 from lavender.problem import FRICTION_LAWS
 from lavender.problem.cones import ROW, Cones, get_block_kinds
 from lavender.problem.generalized import Compressed
@@ -201,20 +202,26 @@ def from_efc(
     if scale is not None:
         jac = jac * scale[:, :, None].astype(jac.dtype)
         target, compliance = target * scale, compliance * scale * scale
-    batch = Batch(
-        jac, mass, free, target=target, cones=cones, compliance=compliance, friction=friction, count=count
-    )
-    batch.precision = precision
+
+    def make_batch(soft: FloatArray) -> Batch:
+        batch = Batch(
+            jac, mass, free, target=target, cones=cones, compliance=soft, friction=friction, count=count
+        )
+        batch.precision = precision
+        return batch
+
     if efc_force is None:
-        return Imported(batch, None)
+        return Imported(judge_stiff_worlds(make_batch, compliance), None)
     force = as_array("efc_force", efc_force, (n, m), finite=False)
-    lam = np.where(used_rows, dt * force, 0.0)
+    lam, change = np.where(used_rows, dt * force, 0.0), None
     lam = lam if scale is None else lam / scale
     if qacc is not None:
         acceleration = as_array("qacc", qacc, (n, nv), finite=False)
         lam[~(np.abs(acceleration) <= MAX_ACCELERATION).all(axis=1)] = np.nan
+        change = dt * (acceleration - smooth)
         if nefc is None:
             _warn_of_old_forces(jac, inv_compliance, aref, row_type, force, acceleration)
+    batch = judge_stiff_worlds(make_batch, compliance, lam, change)
     return Imported(batch, lam if convert is None else convert(lam))
 
 
@@ -275,7 +282,7 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
             "mjSTATE_PHYSICS, mjSTATE_FULLPHYSICS and mjSTATE_INTEGRATION of the model"
         )
     n, nv, dt = len(values), model.nv, float(model.opt.timestep)
-    free, smooth = np.full((n, nv), np.nan), np.zeros((n, nv))
+    free, smooth, acceleration = np.full((n, nv), np.nan), np.zeros((n, nv)), np.full((n, nv), np.nan)
     mass = np.zeros((n, len(model.M_colind)))
     mass[:, model.M_rowadr + model.M_rownnz - 1] = 1.0  # States that are not finite keep the identity as M.
     triangle = model.M_colind, np.append(model.M_rowadr, len(model.M_colind))
@@ -305,6 +312,7 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
                 mj.mj_mulJacVec(model, data, data.efc_vel, data.qvel)
             step.read(data)
             free[i], smooth[i], mass[i] = data.qvel, data.qacc_smooth, data.M
+            acceleration[i] = data.qacc
             if not all_finite(data.qacc):
                 if errors == "raise":
                     raise InputError(f"state {i}: {single.DIVERGED_TEXT}")
@@ -341,9 +349,14 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
     if is_frictionless.any():
         cones = Cones(block_ptr, np.where(is_frictionless, ROW, kind), *bounds)
     free += dt * smooth
-    batch = Batch(
-        jac, triangles, free, target=target, cones=cones, compliance=compliance, friction="cone", row_ptr=ptr
-    )
+
+    def make_batch(soft: FloatArray) -> Batch:
+        return Batch(
+            jac, triangles, free, target=target, cones=cones, compliance=soft, friction="cone", row_ptr=ptr
+        )
+
+    change = None if model.opt.noslip_iterations else dt * (acceleration - smooth)
+    batch = judge_stiff_worlds(make_batch, compliance, lam, change)
 
     blocks_of_worlds = dict(zip(order, blocks_of_states, strict=True))
 

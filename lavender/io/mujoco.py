@@ -26,6 +26,7 @@ the error of `impulse`.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -35,6 +36,7 @@ from lavender.base.errors import CapabilityError, InputError
 from lavender.base.lazy_import import sparse as sp
 from lavender.io.mujoco_discrete import MASS_TOLERANCE, compute_discrete_matrix
 from lavender.io.mujoco_memory import CHANGED_ADVICE, OTHER_MODEL_ADVICE, read_step
+from lavender.io.stiff_rows import MAX_EXAMINED_COMPLIANCE, find_engine_answer, raise_compliance
 from lavender.problem import Names, Problem
 from lavender.problem.cones import Cones
 from lavender.problem.generalized import Generalized
@@ -109,6 +111,13 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
             compliance = _compute_compliance(data) * get_row_scales(blocks) * get_row_scales(blocks)
     general = Generalized.from_compressed_rows(jac, mass, v_free, like=kept.operator)
     operator = kept.operator = general.operator
+    if step.m and compliance.min() < MAX_EXAMINED_COMPLIANCE:
+        if change is not None:
+            b = mark_read_only(b - dt * general.velocity_of(change))
+            general = general.with_jacobian(v_free=v_free + dt * change)
+        return _make_stiff_problem(
+            step, data, name, change, _make_fields(kept.mj, model, blocks, b, compliance, general)
+        )
     rest = kept.mj, model, blocks, b, compliance, general
     if is_regular and change is None and not operator.has_entry_above(MAX_SAFE_ENTRY):
         view = make_generalized_data(blocks, b, operator, compliance, LAWS["cone"])
@@ -118,6 +127,21 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
         b = mark_read_only(b - dt * general.velocity_of(change))
         general = general.with_jacobian(v_free=v_free + dt * change)
     return Problem(**_make_fields(*rest[:3], b, compliance, general), friction="cone", name=name, copy=False)
+
+
+def _make_stiff_problem(step: Step, data: Any, name: str, change: Any, fields: dict[str, Any]) -> Problem:
+    """Build a problem with rows of a small R, and judge MuJoCo's acceleration; see `lavender.io.stiff_rows`."""
+    problem, compliance = Problem(**fields, friction="cone", name=name, copy=False), fields["compliance"]
+    raised = raise_compliance(problem)
+    if raised is not None:
+        problem = replace(problem, compliance=raised)
+    if not step.has_noslip:
+        scale = get_row_scales(make_blocks(step, data))
+        smooth = data.qacc_smooth + (0.0 if change is None else change)
+        force = _scale_force(step, data, scale)
+        answer = find_engine_answer(problem, compliance, force, step.dt * (data.qacc - smooth))
+        problem.__dict__["engine_answer"] = answer
+    return problem
 
 
 def _make_fields(
@@ -139,9 +163,14 @@ def impulse(model: Any, data: Any) -> FloatArray:
 
     With `noslip_iterations`, it is not a solution of the problem.
     """
-    scale = scaling(model, data)
-    force = _get_timestep(read_step(model, data)) * data.efc_force
-    return np.divide(force, scale, out=np.zeros(len(scale)), where=scale != 0.0)
+    step = read_step(model, data)
+    _get_timestep(step)
+    return _scale_force(step, data, get_row_scales(make_blocks(step, data)))
+
+
+def _scale_force(step: Step, data: Any, scale: FloatArray) -> FloatArray:
+    """Return dt efc_force (m,) [N s] divided by the factors of the rows."""
+    return np.divide(step.dt * data.efc_force, scale, out=np.zeros(len(scale)), where=scale != 0.0)
 
 
 def scaling(model: Any, data: Any) -> FloatArray:

@@ -108,6 +108,23 @@ class Rounding:
         return f"impulse {self.impulse:.1e}, data {self.data:.1e}{more}"
 
 
+class EngineAnswer(NamedTuple):
+    """Error of an engine's acceleration, for an impulse that has lost its digits (`lavender.io.stiff_rows`).
+
+    `residual` returns it for `impulse` (m,) [N s], compared number by number. The other fields are those of `Residual`.
+    """
+
+    impulse: FloatArray
+    relative: float
+    energy: float
+    velocity: float
+    roundoff_floor: float
+    worst_row: int
+    error: FloatArray
+    slack: FloatArray
+    lost_digits: float
+
+
 class Islands(NamedTuple):
     """Errors of n islands: sets of blocks that share no moving body, tree of M or entry of A with other blocks.
 
@@ -167,6 +184,8 @@ class Residual:
         With float32: contributions to the floor.
     threshold : float, m/s
         Largest velocity error of an answer with the verdict "close enough".
+    lost_digits : float
+        Decimal digits that an engine's forces have lost, if its acceleration was judged in their place; else 0.
     """
 
     relative: float
@@ -186,6 +205,7 @@ class Residual:
     precision: str = "float64"
     rounding: Rounding | None = None
     threshold: float = DEFAULT_THRESHOLD
+    lost_digits: float = 0.0
     # Relative residual before the refinement for an ill-conditioned M.
     _float64_relative: float = field(default=math.nan, repr=False)
 
@@ -285,6 +305,8 @@ class Residual:
     def __str__(self) -> str:
         worst = f", worst {self.worst_name} ({self.velocity:.2g} m/s)" if self.worst_row >= 0 else ""
         text = f"relative {self.relative:.2e}, energy {self.energy:.2e} sqrt(J){worst}, floor {self.roundoff_floor:.1e}"
+        if self.lost_digits:
+            text += f"; the forces lose {self.lost_digits:.0f} digits, the motion is exact to {self.velocity:.1e} m/s"
         if self.rounding is None:
             return text
         return f"{text} of {self.precision} ({self.rounding}): {self.verdict_in_words}"
@@ -484,9 +506,24 @@ def residual(
     if tol != TOL and not (type(tol) is float and tol >= 0.0):
         tol = check_float("tol", tol, low=0.0)
     result = refine_residual(problem, judge_impulse(problem, impulse), tol)
+    answer: EngineAnswer | None = problem.__dict__.get("engine_answer")
+    is_engine = False
+    if answer is not None and np.array_equal(answer.impulse, impulse):
+        is_engine = True
+        result = _apply_engine_answer(result, answer, precision)
     if type(threshold) is not float or threshold != DEFAULT_THRESHOLD:
         result = replace(result, threshold=check_float("threshold", threshold, low=0.0))
-    return result if precision == "float64" else _apply_float32_floor(problem, result, impulse)
+    return result if precision == "float64" or is_engine else _apply_float32_floor(problem, result, impulse)
+
+
+def _apply_engine_answer(result: Residual, answer: EngineAnswer, precision: str) -> Residual:
+    """Replace the errors of an engine's forces by those of its acceleration."""
+    fields = answer._asdict()
+    del fields["impulse"]
+    is_rounding = _is_explained_by_rounding(answer.relative, answer.roundoff_floor, precision)
+    limit = MAX_EXCUSED_RESIDUAL if precision == "float64" else 1.0
+    above = 0.0 if is_rounding and answer.relative <= limit else answer.relative
+    return replace(result, **fields, above_floor=above, worst_island=-1, precision=precision)
 
 
 def convert_residual_from_disk(problem: Problem, of_disk: Residual) -> Residual:
