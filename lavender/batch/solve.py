@@ -149,7 +149,8 @@ class Solutions(WorldResults, Sequence[Solution]):
     def _is_solved(self) -> np.ndarray:
         if self.velocity_tol is not None:
             return self._get_column("speed") <= self.velocity_tol
-        return self._get_column("relative") <= self.tol
+        floor = self._get_column("roundoff_floor") if self.tol > 0.0 else 0.0
+        return np.maximum(self._get_column("relative"), floor) <= self.tol
 
     @property
     def ptr(self) -> np.ndarray:

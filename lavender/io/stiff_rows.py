@@ -121,8 +121,9 @@ def find_engine_answer(
     if not speeds[0].max() < residual(problem, impulse, "float64").velocity:
         return None
     return EngineAnswer(
-        impulse.copy(), relative, energies[0], float(speeds[0].max()), floor, int(speeds[0].argmax()),
-        mark_read_only(error), mark_read_only(slack), float(-np.log10(ratio)),
+        impulse=impulse.copy(), relative=relative, energy=energies[0], velocity=float(speeds[0].max()),
+        roundoff_floor=floor, worst_row=int(speeds[0].argmax()), error=mark_read_only(error),
+        slack=mark_read_only(slack), lost_digits=float(-np.log10(ratio)),
     )  # fmt: skip
 
 

@@ -9,7 +9,7 @@ row's velocity, in `lavender_ext/core/block.pxd`). Then
     relative  max(E / E0, V / V0)                    [-]     E0, V0: E, V of the zero impulse, lambda = Pi(0)
     floor     relative residual of the slack error 2^-53 (|A| |lambda| + |b|), which rounding lambda to float64
               causes; no solver can guarantee less than about twice the floor
-    success   relative <= tol
+    success   relative <= tol and floor <= tol
 
 Each island (blocks connected through moving bodies, trees of M or entries of A) has its own E, V, E0 and V0, so bodies
 that never meet do not change each other's verdict; the relative residual and the floor belong to the worst island.

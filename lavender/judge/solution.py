@@ -369,7 +369,7 @@ class Solution:
 
     @property
     def success(self) -> bool:
-        """Whether the judge's relative residual is at most `tol`, or its velocity error at most `velocity_tol`.
+        """Whether the judge's relative residual and its floor are at most `tol`, or the velocity error `velocity_tol`.
 
         Of a quadratic program: whether its status is CONVERGED, which is so if `program_error` is at most `tol`.
         """
@@ -377,7 +377,8 @@ class Solution:
             return self.status is CONVERGED
         if self.velocity_tol is not None:
             return self.residual.velocity <= self.velocity_tol
-        return self.residual.relative <= self.tol
+        judged = self.residual
+        return judged.relative <= self.tol and (judged.roundoff_floor <= self.tol or self.tol == 0.0)
 
     def convert_from_disk(self, problem: Problem) -> Solution:
         """Convert the solution of `problem.disk` to one of `problem`, which has ellipses."""

@@ -46,7 +46,7 @@ from lavender.problem import Problem
 from lavender.problem.cones import project_impulse
 from lavender.solvers.registry import SolverSpec, list_not_resumable
 from lavender_ext.core.checks import make_instance
-from lavender_ext.judge.measure import Judged, all_finite
+from lavender_ext.judge.measure import Judged, all_finite, project_on_bounds_of
 
 # A lower bound of every solution's impulse is reported only if it is at least this multiple of sum |b_i| / d_i, the
 # impulse that the rows would need one by one. Smaller bounds also hold for well-posed problems. Rows that contradict
@@ -100,6 +100,7 @@ def _hides_b(run: FinishedRun, judged: Residual) -> bool:
 
 
 _ILL_CONDITIONED = "M is ill-conditioned: residuals below {floor:.1e} are rounding errors of float64"
+_HIDDEN = "rounding to float64 alone can cause a relative residual of {floor:.1e}"
 _FORMED = "its test was met only on A as it was formed, not on the given data"
 # The rules are applied in order, each to the status that the rules before it have left. `_float64_relative` is the
 # residual before its refinement for an ill-conditioned M.
@@ -115,6 +116,8 @@ RULES = (
     Rule((CONVERGED, STALLED), lambda run, r: r.above_floor <= run.tol < r.relative, ROUNDOFF_LIMIT),
     # The impulse is a solution to tol, even if no exact solution exists.
     Rule((INFEASIBLE,), lambda run, r: r.relative <= run.tol, CONVERGED, "the impulse meets tol nevertheless"),
+    Rule((CONVERGED,), lambda run, r: r.relative <= run.tol < r.roundoff_floor, ROUNDOFF_LIMIT, _HIDDEN),
+    Rule((CONVERGED,), lambda run, r: run.tol < min(r.relative, r.roundoff_floor), STALLED, _HIDDEN),
 )  # fmt: skip
 
 
@@ -130,11 +133,17 @@ def finish(run: FinishedRun) -> Solution:
             impulse = combine_best_islands(problem, problem._start, (impulse,), tol, by_energy=True)
     # Solvers work in float64, whatever the precision of the data.
     judged = reuse_or_judge_impulse(problem, impulse, claim.judged).refine(tol)
+    inside = project_on_bounds_of(problem.metric, impulse)
+    if inside is not impulse and (run.spec.builtin or judged.relative <= tol):
+        projected = reuse_or_judge_impulse(problem, inside).refine(tol)
+        if projected.relative <= tol or not judged.relative <= tol:
+            impulse, judged = inside, projected
     if claim is not run.claim or impulse is not run.impulse:
         run = run._replace(claim=claim, impulse=impulse)
     impulse.setflags(write=False)
     values = {"impulse": impulse, "tol": tol, "setup_time": run.setup_time, "solve_time": run.solve_time}
-    if claim.status is CONVERGED and judged.relative <= tol and not run.refutation:
+    is_met = judged.relative <= tol and (judged.roundoff_floor <= tol or tol == 0.0)
+    if claim.status is CONVERGED and is_met and not run.refutation:
         # The other fields are computed when one of them is first read.
         late = make_residual, (problem, judged)
         values |= {"status": CONVERGED, "_late_residual": late, "_rest": (make_fields, (run, judged))}

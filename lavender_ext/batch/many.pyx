@@ -257,7 +257,7 @@ def solve_compiled(problem, spec, impulse, tol, deadline=None):
             judged, counts = solve_new_generalized_problem(view, first, tol, small.limits, deadline)
     else:
         judged, counts = small.solve_and_judge(problem, first, tol, deadline)
-    if judged is not None and (<Judged>judged).relative <= <double>tol:
+    if judged is not None and (<Judged>judged).relative <= <double>tol and (<Judged>judged).roundoff_floor <= <double>tol:
         kept = first if first is None or impulse is None else first.copy()      # The caller may change the array later.
         solution = make_instance(Solution, {
             "impulse": (<Judged>judged).impulse, "status": CONVERGED, "tol": tol, "setup_time": 0.0,

@@ -20,7 +20,7 @@ from lavender_ext.core.problem cimport (DERIVED, bind_derived_row_arrays, comput
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.driver.driver cimport NEWTON
 from lavender_ext.factor.factors cimport has_wide
-from lavender_ext.judge.best cimport project_on_bounds
+from lavender_ext.judge.best cimport is_within_bounds, project_on_bounds
 from lavender_ext.judge.measure cimport (refine_reported_view, residual_above_floor, set_zero_impulse, relative_floor_of_score,
                                          score_given_generalized_slack, judge_zero_impulse,
                                          relative_residual_of_score, count_judge_scratch)
@@ -212,10 +212,18 @@ cdef inline void solve_task(task_t* j, workspace_t* workspace, workspace_t* isla
     j.is_late = has_passed(j.deadline, 0.0)
     if code != REACHED and not j.is_late:
         return
-    if not grow_workspace_to(workspace, 0, judge_task_workspace_size(j)):
+    if not grow_workspace_to(workspace, 0, judge_task_workspace_size(j) + m):
         return
-    judge_task(j, tol, workspace.real)
-    j.solved = j.relative <= tol
+    judge_task(j, tol, workspace.real + m)
+    if not is_within_bounds(&j.p, j.lam):               # Project the result, unless that breaks tol.
+        code = j.relative <= tol
+        memcpy(workspace.real, j.lam, m * sizeof(double))
+        project_on_bounds(&j.p, j.lam)
+        judge_task(j, tol, workspace.real + m)
+        if code and not j.relative <= tol:
+            memcpy(j.lam, workspace.real, m * sizeof(double))
+            judge_task(j, tol, workspace.real + m)
+    j.solved = j.relative <= tol and j.floor <= tol
 
 
 cdef inline bint derive_row_numbers_from_matrix(task_t* j, workspace_t* workspace) noexcept nogil:
@@ -320,4 +328,4 @@ cdef inline int32_t solve_small_task(task_t* j, task_workspaces_t* workspaces, c
     j.push = workspaces.call.work.real + (j.p.n_rows if code == RESULT_IS_START else 0)
     if code != RESULT_IS_START and code != RESULT_SOLVED:
         return TRIED
-    return LEFT if not s.relative <= tol else STARTED if code == RESULT_IS_START else READY
+    return LEFT if not (s.relative <= tol and s.floor <= tol) else STARTED if code == RESULT_IS_START else READY

@@ -104,6 +104,27 @@ cdef inline void project_on_bounds(const blocks_t* p, double* lam) noexcept nogi
                 lam[k] = clip(lam[k], -bound, bound) if q.size[g] == 1 else lam[k] * (bound / size)
 
 
+cdef inline bint is_within_bounds(const blocks_t* p, const double* lam) noexcept nogil:
+    """Return whether `project_on_bounds` leaves lam (m) unchanged."""
+    cdef int32_t i, g, k, j
+    cdef friction_components_t q
+    for i in range(p.n_blocks):
+        j = p.ptr[i]
+        for k in range(j, p.ptr[i + 1] if has_independent_rows(p, i) else j):
+            if lam[k] < p.lower[k] or lam[k] > p.upper[k]:
+                return False
+        if has_independent_rows(p, i):
+            continue
+        if lam[j] < 0.0:
+            return False
+        get_friction_components(p, i, &q)
+        for g in range(0 if is_round_cone_contact(p, i) else q.n):
+            if euclidean_norm(lam + j + q.first[g], q.size[g]) > (
+                    1.0 + 8.0 * unit_roundoff()) * q.friction_coefficient[g] * lam[j]:
+                return False
+    return True
+
+
 # -- objectives -------------------------------------------------------------------------------------------------------
 
 

@@ -14,7 +14,7 @@ from lavender_ext.core.problem cimport Data, Workspace, allocate_bytes
 from lavender_ext.core.velocity cimport compute_velocity_change
 from lavender_ext.core.view cimport generalized_t, view_t
 from lavender_ext.judge.best cimport (best_workspace_size, best_t, bind_best, count_islands, copy_score_without_islands,
-                                      project_on_bounds, store_better_islands, store_start)
+                                      is_within_bounds, project_on_bounds, store_better_islands, store_start)
 from lavender_ext.judge.forms cimport (compute_csr_slack, judge_impulse_over_bodies, judge_impulse_over_csr,
                                        judge_impulse_over_generalized, score_generalized_slack)
 from lavender_ext.judge.measure cimport (residual_above_floor, set_zero_impulse, relative_floor_of_score,
@@ -423,6 +423,17 @@ def combine_best_islands(Data p, impulse, list impulses, double tol, bint by_ene
         else:
             store_better_islands(&best, &v, lam, w, tol)
     return np.array(x[:m]), start
+
+
+def project_on_bounds_of(Data p, impulse):
+    """Return the projection of an impulse (m,) [N s] on its bounds, or the impulse itself if it is within them."""
+    cdef const double* lam = as_double_pointer(impulse, p.blocks.n_rows)
+    cdef double[::1] inside
+    if p.blocks.n_rows == 0 or is_within_bounds(&p.blocks, lam):
+        return impulse
+    projected = inside = np.array(impulse)
+    project_on_bounds(&p.blocks, &inside[0])
+    return projected
 
 
 def write_velocity_change(Data p, const double[::1] lam, double[:, ::1] v):

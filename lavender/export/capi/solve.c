@@ -333,6 +333,8 @@ static int32_t run(lav_solver *s, const lav_budget *requested, lav_result *out) 
           : first <= budget->tol && (out->outcome == LAV_CONVERGED || out->outcome == LAV_STALLED
                                      || out->outcome == LAV_MAX_ITERATIONS || out->outcome == LAV_TIME_LIMIT)))
     out->outcome = judge_score_is_at_floor(out->verdict.relative, out->verdict.floor) ? LAV_ROUNDOFF_LIMIT : LAV_STALLED;
+  if (out->outcome == LAV_CONVERGED && budget->tol > 0.0 && out->verdict.floor > budget->tol) /* Rounding alone can exceed tol. */
+    out->outcome = out->verdict.relative <= budget->tol ? LAV_ROUNDOFF_LIMIT : LAV_STALLED;
   if (out->verdict.velocity <= budget->velocity_tol && budget->velocity_tol > 0.0 /* `tol` was stricter than needed. */
       && (out->outcome == LAV_MAX_ITERATIONS || out->outcome == LAV_TIME_LIMIT || out->outcome == LAV_STALLED))
     out->outcome = LAV_CONVERGED;
