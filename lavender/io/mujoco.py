@@ -176,8 +176,8 @@ def _scale_force(step: Step, data: Any, scale: FloatArray) -> FloatArray:
 def scaling(model: Any, data: Any) -> FloatArray:
     """Return the factor of each row (m,): row of the problem = factor times MuJoCo's row.
 
-    The factor is friction[j] / friction[0] on tangents of an elliptic cone and 1 on all other rows. Impulses are
-    MuJoCo's divided by the factor.
+    The factor is friction[j] / friction[0] on tangents of an elliptic cone, 2 / torquescale on rotation rows of a weld,
+    which are then angular velocities in rad/s, and 1 on all other rows. Impulses are MuJoCo's divided by the factor.
     """
     step = read_step(model, data)
     _get_timestep(step)

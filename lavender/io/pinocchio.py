@@ -38,6 +38,8 @@ ANCHORS = {"PointAnchorConstraintModel", "FrameAnchorConstraintModel"}
 ROTATION_TOLERANCE = 1e-6
 # Largest accepted difference of M a and tau - h, relative to |M| |a| + |tau - h| [-]. Above it, aba used another M.
 ACCELERATION_TOLERANCE = 1e-9
+# Largest accepted relative difference of a constraint's own time step from dt [-].
+TIME_STEP_TOLERANCE = 1e-9
 
 
 def from_pinocchio(
@@ -162,6 +164,12 @@ def _convert_constraints(
     for i, (wrapped_model, wrapped_data) in enumerate(pairs):
         model_of = _unwrap_constraint(wrapped_model)
         _check_constraint(i, model, model_of, _unwrap_constraint(wrapped_data))
+        own = model_of.getTimeStep() if hasattr(model_of, "getTimeStep") else dt
+        if not abs(own - dt) <= TIME_STEP_TOLERANCE * dt:
+            raise InputError(
+                f"constraint {i}, a {type(model_of).__name__}, has a time step of {own:g} s, and dt is {dt:g} s: "
+                f"Pinocchio's impulses would be bounded for {own:g} s. Call setTimeStep({dt:g}) on the constraint model"
+            )
         with wrap_engine_errors("Pinocchio", OTHER_MODEL_ADVICE):
             data_of = model_of.createData()  # Data of the caller could have the sizes of another model.
             model_of.calc(model, data, data_of)

@@ -6,7 +6,7 @@ violates its target, or if the estimated cost is above the limit.
 """
 from libc.stdint cimport int32_t, int64_t
 from libc.math cimport INFINITY, NAN, fabs, sqrt
-from libc.string cimport memset
+from libc.string cimport memcpy, memset
 
 from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles, take_integers
 from lavender_ext.core.assemble cimport lav_form_delassus_matrix, lav_list_blocks_of_bodies

@@ -4,6 +4,8 @@ Arrays have MuJoCo's layout: efc_type, efc_id (m), contact dim (c), friction (c,
 tangent rows of a contact with different coefficients f are scaled by f_j / f_0, so that mu = f_0 bounds them all:
 
     |(lambda_1 / f_0, ..., lambda_n / f_n)| <= lambda_n   <=>   |lambda'| <= f_0 lambda_n,   lambda'_j = lambda_j f_0 / f_j   (1)
+
+The rotation rows of a weld are torquescale / 2 times an angular velocity; scaled by 2 / torquescale, their unit is rad/s.
 """
 from libc.math cimport INFINITY, fabs, sqrt
 from libc.stdint cimport int32_t, int64_t, uint64_t
@@ -39,6 +41,8 @@ cdef enum:
     FIRST_ROW_ARRAY = 8                                 # Each row has entries in the arrays from efc_J to efc_id.
     END_ROW_ARRAY = 18
     N_ARRAYS = 22
+    WELD = 1                                            # value of mjtEq
+    TORQUE_SCALE = 10                                   # index in eq_data of a weld
 
 cdef object new = np.empty, I4 = np.dtype(np.int32), ALIGNED_OFFSETS = 8 * np.arange(N_ARRAYS)
 
@@ -49,7 +53,9 @@ ctypedef struct step_t:
     ints efc_type, efc_id, efc_J_rownnz, efc_J_rowadr, efc_J_colind
     const char* contact
     Py_ssize_t dim, geom, friction, stride              # [bytes] offsets in a contact, and its size
-    ints M_rowadr, M_rownnz, M_colind, dof_bodyid, body_parentid
+    ints M_rowadr, M_rownnz, M_colind, dof_bodyid, body_parentid, eq_type
+    doubles eq_data
+    int32_t eq_size                                     # numbers of eq_data of each equality
     int32_t m, contacts, n, mass_entries, bodies        # numbers of rows, contacts, velocities, entries of M, and bodies
     int64_t jac_entries
     double dt                                           # [s] time step
@@ -80,8 +86,10 @@ cdef class Step:
         p.mass_entries, p.bodies = len(model.M_colind), model.nbody
         p.dim, p.geom, p.friction, p.stride = cache.contact_layout
         for i, (name, size) in enumerate((("M_rowadr", p.n), ("M_rownnz", p.n), ("M_colind", p.mass_entries),
-                                          ("dof_bodyid", p.n), ("body_parentid", p.bodies))):
+                                          ("dof_bodyid", p.n), ("body_parentid", p.bodies), ("eq_type", model.neq))):
             (<int32_t**>&p.M_rowadr)[i] = as_int_pointer(getattr(model, name), size)
+        p.eq_size = model.eq_data.shape[1]
+        p.eq_data = as_double_pointer(model.eq_data.reshape(-1), model.neq * p.eq_size)
         for i, size in enumerate((model.neq, p.n, model.ntendon, model.njnt, model.ntendon)):
             self.type_limits[i] = size
 
@@ -127,7 +135,7 @@ def make_blocks(Step step, int32_t max_equality_rows):
     cdef double* lower = <double*>p.lower
     cdef double* scale = <double*>p.rolling + m
     cdef uint64_t* key = <uint64_t*>(scale + m)
-    cdef double low, high, mu
+    cdef double low, high, mu, angle_factor
     cdef uint64_t first_key
     cdef const double* friction
     memcpy(copied, s.efc_type, m * sizeof(int32_t))
@@ -173,8 +181,11 @@ def make_blocks(Step step, int32_t max_equality_rows):
                 mu = friction[0]
         if i + count * size > m:
             return i
+        angle_factor = 1.0                              # of the rotation rows of a weld
+        if type_ == EQUALITY and s.eq_type[of] == WELD and s.eq_data[of * s.eq_size + TORQUE_SCALE] > 0.0:
+            angle_factor = 2.0 / s.eq_data[of * s.eq_size + TORQUE_SCALE]
         for j in range(count * size):
-            lower[i + j], (<double*>p.upper)[i + j], scale[i + j] = low, high, 1.0
+            lower[i + j], (<double*>p.upper)[i + j], scale[i + j] = low, high, angle_factor if j >= 3 else 1.0
             if friction != NULL and j > 0:
                 lower[i + j], scale[i + j] = -INFINITY, friction[j - 1] / mu if mu > 0.0 else 0.0
         for j in range(count):

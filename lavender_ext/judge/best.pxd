@@ -7,14 +7,18 @@
 
     f = 1/2 lam.A lam - b.lam = 1/2 lam.(w - b)
 
-An island that one iterate has solved keeps it. An iterate does not count if it is not finite, if it is so large that rounding of
-its slack may hide a thousandth of b, or, of a symmetric A, if its f is above that of the default zero impulse. If rounding may
-explain the difference of two f, E decides. Without a solution f falls without end. E therefore decides, and the zero impulse
-counts, in a problem that is proven to have none (`by_energy`), and if a long run ends with r > 1 in an island in which no
-bounded row, such as a motor, still runs up to a bound.
+An island that one iterate has solved keeps it.
 
-An island that its start does not solve begins at the zero impulse if that has a lower f, and A is symmetric, or solves it. The
-zero impulse then counts, too.
+Which iterates count. Three kinds do not: an iterate that is not finite; an iterate so large that rounding of its slack may hide a
+thousandth of b; and, if A is symmetric, an iterate with a larger f than the default zero impulse.
+
+When E decides. E decides if rounding may explain the difference of two f. E also decides in a problem without a solution, because
+f then falls without end, and there the zero impulse counts. A problem counts as one without a solution if this is proven
+(`by_energy`), or if an island diverges or has a residual above 1 after 64 sweeps. The second case does not apply while a bounded
+row, such as a motor, still runs up to a bound.
+
+Where an island begins. A start that does not meet tol is replaced by the zero impulse in two cases: if A is symmetric and the zero
+impulse has the lower f, or if the zero impulse solves the island. The zero impulse then counts.
 """
 from libc.math cimport INFINITY, fabs
 from libc.stdint cimport int32_t, int64_t

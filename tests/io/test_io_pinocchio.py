@@ -30,10 +30,19 @@ def robot(seed=0):
     models = [
         anchor, contact, pin.JointLimitConstraintModel(model, [arm]), pin.JointFrictionConstraintModel(model, [arm]),
     ]  # fmt: skip
+    set_time_step(models, 0.01)
     return model, models, q, 0.3 * rng.normal(size=model.nv)
 
 
+def set_time_step(models, dt):
+    """Set the time step of joint friction, which is 1 s as built by Pinocchio 4.1."""
+    for model in models:
+        if hasattr(model, "setTimeStep"):
+            model.setTimeStep(dt)
+
+
 def problem_of(model, models, q, v, dt=0.01, **more):
+    set_time_step(models, dt)
     return lv.io.from_pinocchio(
         model, model.createData(), models, [m.createData() for m in models], dt, q=q, v=v, **more
     )
@@ -272,3 +281,12 @@ def test_from_pinocchio_acceleration_level_gives_the_constrained_acceleration(ki
 
     np.testing.assert_allclose(accelerate("acceleration"), exact, atol=1e-8 * np.abs(exact).max())
     assert np.abs(accelerate("velocity") - exact).max() > 1e-3 * np.abs(exact).max()  # Its error does not depend on dt.
+
+
+def test_from_pinocchio_friction_with_another_time_step_names_set_time_step():
+    model, models, q, v = robot()
+    if not hasattr(models[3], "setTimeStep"):
+        pytest.skip("this version of Pinocchio has no time step of joint friction")
+    models[3].setTimeStep(1.0)
+    with pytest.raises(lv.InputError, match=r"time step of 1 s, and dt is 0.01 s: .* setTimeStep\(0.01\)"):
+        lv.io.from_pinocchio(model, model.createData(), models, [m.createData() for m in models], 0.01, q=q, v=v)
