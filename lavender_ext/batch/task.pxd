@@ -325,7 +325,7 @@ cdef inline int32_t solve_small_task(task_t* j, task_workspaces_t* workspaces, c
         return LEFT
     code = solve_small(&s, rules, j.lam, j.cold, tol, j.deadline, j.slack_error, &workspaces.call, j.counts)
     copy_small_judgement(j, &s)
-    j.push = workspaces.call.work.real + (j.p.n_rows if code == RESULT_IS_START else 0)
+    j.push = workspaces.call.work.real + j.p.n_rows
     if code != RESULT_IS_START and code != RESULT_SOLVED:
         return TRIED
     return LEFT if not (s.relative <= tol and s.floor <= tol) else STARTED if code == RESULT_IS_START else READY

@@ -33,7 +33,7 @@ from lavender_ext.small.friction cimport friction_run_t, subproblem_t, solve_sub
 from lavender_ext.small.limits cimport has_only_free_rows
 from lavender_ext.driver.host cimport free_workspace, grow_workspace_to
 from lavender_ext.small.workspace cimport fits_workspace, grow_workspace_to_arena
-from lavender_ext.judge.best cimport project_on_bounds
+from lavender_ext.judge.best cimport is_within_bounds, project_on_bounds
 from lavender_ext.judge.measure cimport (set_zero_impulse, relative_floor_of_score, judge_view, make_judged,
                                          relative_residual_of_score, count_judge_scratch)
 from lavender_ext.judge.score cimport make_empty_score
@@ -105,6 +105,22 @@ cdef void judge_small_impulse(small_problem_t* s, const double* lam, double* bot
     judge_view(&s.v, lam, both, both + m, scratch, True, &s.score)
     s.floor = relative_floor_of_score(&s.score, s.zero_residual[0], s.zero_residual[1])
     s.relative = relative_residual_of_score(&s.score, both, m, s.zero_residual[0], s.zero_residual[1])
+
+
+cdef void judge_result_within_bounds(small_problem_t* s, double* own, double tol, double* both, double* scratch) noexcept nogil:
+    """Judge the result own (m) after its projection on the bounds, unless that breaks tol; scratch: m more than `judge_view`."""
+    cdef int32_t m = s.v.p.n_rows
+    cdef bint is_met
+    judge_small_impulse(s, own, both, scratch + m)
+    if is_within_bounds(&s.v.p, own):
+        return
+    is_met = s.relative <= tol
+    memcpy(scratch, own, m * sizeof(double))
+    project_on_bounds(&s.v.p, own)
+    judge_small_impulse(s, own, both, scratch + m)
+    if is_met and not s.relative <= tol:
+        memcpy(own, scratch, m * sizeof(double))
+        judge_small_impulse(s, own, both, scratch + m)
 
 
 cdef bint set_start_of_small_problem(small_problem_t* s, const small_rules_t* rules, double* own, bint cold, double tol,
@@ -257,7 +273,7 @@ cdef int32_t solve_small(small_problem_t* s, const small_rules_t* rules, double*
         return RESULT_FAILED
     if not grow_workspace_to(&workspaces.work, 0, scratch):
         return RESULT_FAILED
-    judge_small_impulse(s, own, both, workspaces.work.real)
+    judge_result_within_bounds(s, own, tol, both, workspaces.work.real)
     return RESULT_SOLVED if s.pivots or s.relative <= tol or has_passed(deadline, 0.0) else RESULT_FAILED
 
 
@@ -549,7 +565,7 @@ cdef class Islands(Small):
         store_work_counts(&o, self.count, counts)
         if not good:
             return RESULT_FAILED
-        judge_small_impulse(s, own, both, workspaces.work.real)
+        judge_result_within_bounds(s, own, tol, both, workspaces.work.real)
         return RESULT_SOLVED if s.relative <= tol or has_passed(deadline, 0.0) else RESULT_FAILED
 
     cdef bint solve_islands(self, double* own, friction_run_t* o, workspace_t* r) except -1:
