@@ -43,9 +43,11 @@ MAX_RAISED_RATIO = 2.0**-10  # [-] Largest R / d of a raised row, which a row wi
 MAX_STIFF_RATIO = (
     1e-5  # [-] If R / d of all rows is larger, forces keep 11 of 16 digits and are judged themselves.
 )
-MAX_DENSE_ENTRIES = 1_000_000  # Entries of J above which the dense QR factorisation of (1) takes seconds.
-BOUNDARY_MARGIN = 2.0**5  # [unit round-offs] Friction within this part of its bound is on the boundary.
-UNIT_ROUNDOFF = {"float64": 2.0**-53, "float32": 2.0**-24}
+MAX_MOTION_ENTRIES = 1_000_000  # Entries of J above which the dense QR factorisation of (1) takes seconds.
+MAX_BOUNDARY_ROUNDOFFS = (
+    2.0**5
+)  # [unit round-offs] Friction within this part of its bound is on the boundary.
+ROUNDOFF_OF_PRECISION = {"float64": 2.0**-53, "float32": 2.0**-24}
 
 
 def raise_compliance(problem: Problem) -> FloatArray | None:
@@ -88,7 +90,7 @@ def find_engine_answer(
     if (
         not m
         or not is_usable
-        or m * general.nv > MAX_DENSE_ENTRIES
+        or m * general.nv > MAX_MOTION_ENTRIES
         or compliance.min() > MAX_EXAMINED_COMPLIANCE
     ):
         return None
@@ -111,7 +113,10 @@ def find_engine_answer(
         moved = moved + np.abs([general.solve(column) for column in columns]) @ (mass @ moved)
     terms = abs(general.jac) @ (moved + 2.0 * np.abs(general.v_free)) + np.abs(problem.b)
     terms += compliance * np.abs(impulse)
-    size = error, UNIT_ROUNDOFF[problem.precision] * terms / np.where(problem.d > 0.0, problem.d, np.inf)
+    size = (
+        error,
+        ROUNDOFF_OF_PRECISION[problem.precision] * terms / np.where(problem.d > 0.0, problem.d, np.inf),
+    )
     get_zero_impulse_reference(problem)
     energies = [float(np.sqrt(np.sum(problem.d * e * e))) for e in size]
     speeds = [problem.metric.weight * np.abs(e) for e in size]
@@ -169,7 +174,7 @@ def judge_stiff_worlds(
 def _find_boundary_normals(problem: Problem, impulse: FloatArray) -> dict[int, tuple[IntArray, FloatArray]]:
     """Return rows and outward normal of each friction component at its bound, by the component's first friction row."""
     cones, found = problem.cones, {}
-    margin = BOUNDARY_MARGIN * UNIT_ROUNDOFF[problem.precision]
+    margin = MAX_BOUNDARY_ROUNDOFFS * ROUNDOFF_OF_PRECISION[problem.precision]
     for block, rows in cones.friction_components():
         first, mu = cones.ptr[block], float(cones.friction_coefficient[rows[0]])
         size, bound = float(np.linalg.norm(impulse[rows])), mu * float(impulse[first])

@@ -10,7 +10,7 @@ import lavender as lv
 from lavender.io import mujoco as adapter
 
 # A lever whose centre of mass lies on its axle, so that MuJoCo's estimate of its translational inverse mass is 0.
-LEVER = """<mujoco><option timestep="0.002"/><worldbody>
+LEVER_MODEL = """<mujoco><option timestep="0.002"/><worldbody>
 <geom type="box" size=".01 .02 .02" pos=".12 .028 0" condim="{condim}"/>
 <geom type="box" size=".01 .02 .02" pos=".12 -.028 0" condim="{condim}"/>
 <body><joint name="axle" axis="0 0 1" damping="0.01"/><inertial pos="0 0 0" mass=".2" diaginertia="1e-4 1e-4 1e-4"/>
@@ -20,7 +20,7 @@ LEVER = """<mujoco><option timestep="0.002"/><worldbody>
 
 def iterate_pressed_states(condim):
     """Yield MuJoCo's model and data in each step in which the lever touches a stop."""
-    model = mj.MjModel.from_xml_string(LEVER.format(condim=condim))
+    model = mj.MjModel.from_xml_string(LEVER_MODEL.format(condim=condim))
     data = mj.MjData(model)
     data.ctrl[:] = 0.5
     for _ in range(10):

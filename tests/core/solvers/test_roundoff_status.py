@@ -5,7 +5,7 @@ import pytest
 
 import lavender as lv
 
-RNG_SEEDS = range(40)
+WIDE_SEEDS = range(40)
 
 
 def make_wide_problem(seed):
@@ -28,7 +28,7 @@ def make_wide_problem(seed):
 @pytest.mark.parametrize("tol", [1e-6, 1e-12, 1e-15])
 def test_status_converged_has_residual_and_floor_within_tol(solver, tol):
     seen = set()
-    problems = [make_wide_problem(seed) for seed in RNG_SEEDS]
+    problems = [make_wide_problem(seed) for seed in WIDE_SEEDS]
     for problem in problems:
         found = lv.solve(problem, solver, tol=tol)
         seen.add(found.status)
@@ -46,7 +46,7 @@ def test_status_converged_has_residual_and_floor_within_tol(solver, tol):
 
 
 def test_impulse_of_converged_solve_is_within_bounds():
-    for seed in RNG_SEEDS:
+    for seed in WIDE_SEEDS:
         problem = make_wide_problem(seed)
         cones = problem.cones
         for solver in ("auto", "newton"):
