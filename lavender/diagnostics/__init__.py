@@ -13,7 +13,7 @@ For a problem in J and M, (1) is checked if all contacts belong to free rigid bo
 coupled to no others, three of them with equal mass. A row of direction d then has J = (d, r x d) with the arm r.
 
 Thresholds are well outside the values that occur in the built-in suite, the scenes of the gallery, robots and recorded
-problems. If the numbers would be ordinary under another interpretation (M^-1 read as M), the diagnostic says so.
+problems. If the numbers would be ordinary under another interpretation (M^-1 read as M), the diagnostic names it.
 """
 
 from __future__ import annotations

@@ -406,7 +406,7 @@ def _list_program_solvers() -> str:
 
 
 def _suggest_alternative(law: str, laws: frozenset[str]) -> str:
-    """Return the part of an error message that says how to solve a problem of an unsupported law."""
+    """Return the part of an error message that explains how to solve a problem of an unsupported law."""
     if law == "coulomb" and "cone" in laws:
         return ": pass problem.relaxed('cone'), or use a solver for Coulomb friction"
     if law in ("coulomb", "cone") and "lcp" in laws:
@@ -543,7 +543,7 @@ def get(name: str) -> SolverSpec:
     UnknownName
         The solver does not exist; the message lists the nearest names.
     SolverUnavailable
-        Its package is not installed; the message says what to install.
+        Its package is not installed; the message names the package.
     """
     spec = registered.get(name) if isinstance(name, str) else None
     if spec is None and isinstance(name, str):

@@ -83,7 +83,7 @@ def solve(
     SolverUnavailable
         The solver's package is not installed.
     CapabilityError
-        The solver does not accept this problem or option; the message says why.
+        The solver does not accept this problem or option; the message has the reason.
     InputError
         `impulse`, `tol`, `velocity_tol`, `max_iter` or `time_limit` is not valid; `velocity_tol` and another `tol`.
     """
