@@ -32,7 +32,7 @@ def asymmetric():
 
 
 SWEPT = ["anderson", "anderson"]
-RELAXED = ["anderson", "anderson", "newton on the relaxation", "anderson", "newton"]
+RELAXED = ["anderson", "anderson", "newton on the relaxation", "admm", "newton"]
 RELAXED_OVER_A = [*SWEPT, "admm from zero", *RELAXED[2:]]
 # The first stages of `auto` for a problem of each kind.
 FIRST = {
@@ -197,12 +197,12 @@ def test_direct_gets_its_budget_on_a_narrow_band_once():
     assert [stage.solver for stage in stages] == ["direct", "newton"]
 
 
-def test_round_of_large_problem_with_friction_begins_with_part_of_a_turn_of_admm():
+def test_round_of_large_problem_with_friction_has_a_shorter_turn_of_admm_and_no_sweeps():
     problem = suite.case("pyramidF(k=12, sliding=0.5, mass_ratio=3)").problem
     assert starts_relaxed(problem)
     stages = list(DecisionTree(problem).iterate_one_round(1.0))
-    assert [stage.solver for stage in stages] == ["admm", "newton", "admm", "anderson"]
-    assert stages[0].cost < 0.5 * stages[2].cost and stages[2].cost == stages[1].cost
+    assert [stage.solver for stage in stages] == ["newton", "admm"]
+    assert 0.0 < stages[1].cost < 0.5 * stages[0].cost
     small = suite.case("pyramidF(k=6, sliding=0.5)").problem
     names = [stage.solver for stage in DecisionTree(small).iterate_one_round(1.0)]
     assert names[0] == "newton" and names[-1] == "anderson"
@@ -213,8 +213,8 @@ def test_round_of_large_problem_with_friction_begins_with_part_of_a_turn_of_admm
     [
         ([1e-2, 1e-2], 1),  # no gain
         ([1e-2, 1e-3], 1),  # three more turns of the same gain
-        ([1e-2, 1e-4, 3e-5], 2),  # one more turn, which gains too little
-        ([1e-2, 1e-4, 2e-6, 2e-6], 3),
+        ([1e-2, 0.9e-4, 3e-5], 2),  # one more turn, which gains too little
+        ([1e-2, 0.9e-4, 2e-6, 2e-6], 3),
     ],
 )
 def test_admm_turn_repeats_while_one_more_is_predicted_to_solve(residuals, turns):

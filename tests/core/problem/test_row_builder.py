@@ -358,7 +358,7 @@ def test_arrays_of_blocks_have_the_bits_of_single_calls(dimensions, seed):
     assert [first.names[0], *first.names] == [second.names[0], *second.names]
 
 
-@pytest.mark.parametrize(("length", "cause"), [(None, "coincide and length is None"), (0.0, "length is 0")])
+@pytest.mark.parametrize(("length", "cause"), [(None, "length is None"), (0.0, "length is 0")])
 def test_distance_of_length_zero_raises_and_recommends_ball(length, cause):
     builder = spatial(np.zeros((1, 6)), np.zeros((1, 3)))
     point = (0.0, 0.0, 1.0)
