@@ -49,7 +49,7 @@ def describe_answer(problem: Problem, impulse: Any, threshold: float) -> dict[st
         "rows": problem.m, "relative": judged.relative, "velocity": judged.velocity, "worst": judged.worst_name,
         "floor": judged.roundoff_floor, "verdict": judged.verdict, "precision": problem.precision,
         "threshold": threshold,
-    }  # fmt: skip
+    } | ({"lost_digits": judged.lost_digits} if judged.lost_digits else {})  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -220,7 +220,8 @@ def _complete_answer(folder: Path, answer: Row) -> Row | None:
     path, judged = folder / Path(str(answer.get("file"))).name, Row()
     with contextlib.suppress(ValueError, KeyError, TypeError, LavenderError, OSError):
         impulse = io.load_solution(path) if path.is_file() else None
-        if impulse is not None:
+        # The acceleration of a step whose forces lost digits was judged when the step was recorded; no file holds it.
+        if impulse is not None and not answer.get("lost_digits"):
             judged = describe_answer(
                 io.load(path), impulse, float(answer.get("threshold", DEFAULT_THRESHOLD))
             )

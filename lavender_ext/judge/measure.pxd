@@ -1,7 +1,7 @@
 """The judge for other modules: the pass is compiled once, in `measure.pyx`."""
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core cimport validate
+from lavender_ext.core.validate cimport all_finite as is_finite
 from lavender_ext.core.block_types cimport blocks_t, islands_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.start cimport clip_zero_to_row_bounds
@@ -56,7 +56,7 @@ cdef inline double relative_residual_of_score(const score_t* s, const double* w,
     if s.relative >= 0.0:
         return s.relative
     # A bound can hide an overflowed slack, which has no meaningful sign.
-    if m > 0 and not validate.all_finite(w, m):
+    if m > 0 and not is_finite(w, m):
         return 1.0 / 0.0
     if not s.finite:
         return relative_residual(1.0 / 0.0, 1.0 / 0.0, reference_energy, reference_velocity)

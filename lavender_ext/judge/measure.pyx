@@ -5,7 +5,7 @@ from libc.string cimport memcmp, memcpy
 
 import numpy as np
 
-from lavender_ext.core cimport validate
+from lavender_ext.core.validate cimport all_finite as is_finite
 from lavender_ext.core.arrays cimport as_double_pointer
 from lavender_ext.core.generalized cimport multiply_whitened_transpose
 from lavender_ext.core.islands cimport find_islands, island_workspace_integers, list_one_island
@@ -161,7 +161,7 @@ def judge_impulse(Data p, const double[::1] lam, double[::1] w, double[::1] e, b
     scratch = np.empty(count_judge_scratch(&v) + 1)
     with nogil:
         judge_view(&v, &lam[0], &w[0], &e[0], &scratch[0], floor, &s)
-    if not s.finite or not validate.all_finite(&w[0], p.blocks.n_rows):
+    if not s.finite or not is_finite(&w[0], p.blocks.n_rows):
         return np.inf, np.inf, np.inf, np.inf
     now = relative_residual_of_score(&s, &w[0], p.blocks.n_rows, p.reference_energy, p.reference_velocity)
     above = residual_above_floor(&s, now, relative_floor_of_score(&s, p.reference_energy, p.reference_velocity)) if floor else now
@@ -314,7 +314,7 @@ def combine_references(Data p, const int32_t[::1] rows):
 
 def all_finite(const double[::1] x):
     """Return whether x holds neither NaN nor infinity."""
-    return validate.all_finite(&x[0], x.shape[0]) if x.shape[0] else True
+    return is_finite(&x[0], x.shape[0]) if x.shape[0] else True
 
 
 def compute_rhs_energy(Data p):

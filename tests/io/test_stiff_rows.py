@@ -1,5 +1,6 @@
 """Rows of MuJoCo with R near 1e-15: the acceleration is judged, because the forces have no digits."""
 
+import json
 from fractions import Fraction
 
 import numpy as np
@@ -8,6 +9,8 @@ from mujoco_scene import mj
 
 import lavender as lv
 from lavender.io import mujoco as adapter
+from lavender.report.store import make_lines
+from lavender.report.tables import read_engine_answers
 
 # A lever whose centre of mass lies on its axle, so that MuJoCo's estimate of its translational inverse mass is 0.
 LEVER_MODEL = """<mujoco><option timestep="0.002"/><worldbody>
@@ -122,3 +125,13 @@ def test_auto_on_contradictory_stiff_rows_converges():
         exact = (compute_exact_acceleration(model, data) - data.qacc_smooth) * model.opt.timestep
         # The tolerance 1e-6 of velocities of about 10 rad/s.
         np.testing.assert_allclose(change, exact, atol=1e-4)
+
+
+def test_report_of_recorded_stiff_rows_keeps_the_error_of_the_acceleration(tmp_path):
+    with lv.io.Recorder(tmp_path / "lever", every=1, solver="mujoco") as recorder:
+        for model, data in iterate_pressed_states(1):
+            recorder.add(lv.io.from_mujoco(model, data), adapter.impulse(model, data))
+    lines = [json.loads(line) for line in (tmp_path / "lever" / "engine.jsonl").read_text().splitlines()]
+    answers = read_engine_answers([str(tmp_path / "lever")], make_lines([]))
+    assert any("lost_digits" in line for line in lines)
+    assert answers["relative"].tolist() == [line["relative"] for line in lines]
