@@ -37,7 +37,7 @@ class Status(str, Enum):
         return member
 
     CONVERGED = "CONVERGED", "the solver's own test at tol was met"
-    ROUNDOFF_LIMIT = "ROUNDOFF_LIMIT", "the residual or its round-off floor is above tol, within twice the floor"
+    ROUNDOFF_LIMIT = "ROUNDOFF_LIMIT", "the residual or its floor is above tol, within twice the floor"
     MAX_ITERATIONS = "MAX_ITERATIONS", "the iteration budget was used up"
     TIME_LIMIT = "TIME_LIMIT", "the time limit was reached"
     STALLED = "STALLED", "no further progress"

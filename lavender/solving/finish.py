@@ -46,15 +46,12 @@ from lavender.problem import Problem
 from lavender.problem.cones import project_impulse
 from lavender.solvers.registry import SolverSpec, list_not_resumable
 from lavender_ext.core.checks import make_instance
-from lavender_ext.judge.measure import Judged, all_finite, project_on_bounds_of
+from lavender_ext.judge.measure import Judged, all_finite, project_far_excess_of
 
 # A lower bound of every solution's impulse is reported only if it is at least this multiple of sum |b_i| / d_i, the
 # impulse that the rows would need one by one. Smaller bounds also hold for well-posed problems. Rows that contradict
 # each other up to a relative difference delta need about 1 / delta times that sum.
 CONTRADICTING_IMPULSE_RATIO = 100.0
-# [-] Impulses outside their bounds by a larger part of themselves are projected. The C library returns smaller excesses
-# of Newton's method unchanged, with the same bits.
-MAX_BOUND_EXCESS = 1e-6
 
 
 class FinishedRun(NamedTuple):
@@ -136,9 +133,8 @@ def finish(run: FinishedRun) -> Solution:
             impulse = combine_best_islands(problem, problem._start, (impulse,), tol, by_energy=True)
     # Solvers work in float64, whatever the precision of the data.
     judged = reuse_or_judge_impulse(problem, impulse, claim.judged).refine(tol)
-    inside = impulse if tol == 0.0 else project_on_bounds_of(problem.metric, impulse)
-    is_outside = inside is not impulse and not np.allclose(inside, impulse, rtol=MAX_BOUND_EXCESS, atol=0.0)
-    if is_outside and (run.spec.builtin or judged.relative <= tol):
+    inside = impulse if tol == 0.0 else project_far_excess_of(problem.metric, impulse)
+    if inside is not impulse and (run.spec.builtin or judged.relative <= tol):
         projected = reuse_or_judge_impulse(problem, inside).refine(tol)
         if projected.relative <= tol or not judged.relative <= tol:
             impulse, judged = inside, projected

@@ -20,7 +20,7 @@ from lavender_ext.core.problem cimport (DERIVED, bind_derived_row_arrays, comput
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.driver.driver cimport NEWTON
 from lavender_ext.factor.factors cimport has_wide
-from lavender_ext.judge.best cimport is_within_bounds, project_on_bounds
+from lavender_ext.judge.best cimport project_far_excess, project_on_bounds
 from lavender_ext.judge.measure cimport (refine_reported_view, residual_above_floor, set_zero_impulse, relative_floor_of_score,
                                          score_given_generalized_slack, judge_zero_impulse,
                                          relative_residual_of_score, count_judge_scratch)
@@ -215,10 +215,8 @@ cdef inline void solve_task(task_t* j, workspace_t* workspace, workspace_t* isla
     if not grow_workspace_to(workspace, 0, judge_task_workspace_size(j) + m):
         return
     judge_task(j, tol, workspace.real + m)
-    if not is_within_bounds(&j.p, j.lam):               # Project the result, unless that breaks tol.
-        code = j.relative <= tol
-        memcpy(workspace.real, j.lam, m * sizeof(double))
-        project_on_bounds(&j.p, j.lam)
+    code = j.relative <= tol
+    if project_far_excess(&j.p, j.lam, workspace.real):  # Unless that breaks tol.
         judge_task(j, tol, workspace.real + m)
         if code and not j.relative <= tol:
             memcpy(j.lam, workspace.real, m * sizeof(double))

@@ -129,6 +129,23 @@ cdef inline bint is_within_bounds(const blocks_t* p, const double* lam) noexcept
     return True
 
 
+cdef inline bint project_far_excess(const blocks_t* p, double* lam, double* before) noexcept nogil:
+    """Project lam (m) on its bounds if a number exceeds them by more than 1e-6 of itself; return whether it was.
+
+    Smaller excesses stay, as in the C library, with the same bits. before (m) is lam as it came.
+    """
+    cdef int32_t i
+    if is_within_bounds(p, lam):
+        return False
+    memcpy(before, lam, p.n_rows * sizeof(double))
+    project_on_bounds(p, lam)
+    for i in range(p.n_rows):
+        if fabs(lam[i] - before[i]) > 1e-6 * fabs(before[i]):
+            return True
+    memcpy(lam, before, p.n_rows * sizeof(double))
+    return False
+
+
 # -- objectives -------------------------------------------------------------------------------------------------------
 
 

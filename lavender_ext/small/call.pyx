@@ -33,7 +33,7 @@ from lavender_ext.small.friction cimport friction_run_t, subproblem_t, solve_sub
 from lavender_ext.small.limits cimport has_only_free_rows
 from lavender_ext.driver.host cimport free_workspace, grow_workspace_to
 from lavender_ext.small.workspace cimport fits_workspace, grow_workspace_to_arena
-from lavender_ext.judge.best cimport is_within_bounds, project_on_bounds
+from lavender_ext.judge.best cimport project_far_excess, project_on_bounds
 from lavender_ext.judge.measure cimport (set_zero_impulse, relative_floor_of_score, judge_view, make_judged,
                                          relative_residual_of_score, count_judge_scratch)
 from lavender_ext.judge.score cimport make_empty_score
@@ -108,15 +108,13 @@ cdef void judge_small_impulse(small_problem_t* s, const double* lam, double* bot
 
 
 cdef void judge_result_within_bounds(small_problem_t* s, double* own, double tol, double* both, double* scratch) noexcept nogil:
-    """Judge the result own (m) after its projection on the bounds, unless that breaks tol; scratch: m more than `judge_view`."""
+    """Judge the result own (m) after its projection (`project_far_excess`), unless that breaks tol; scratch: m more."""
     cdef int32_t m = s.v.p.n_rows
     cdef bint is_met
     judge_small_impulse(s, own, both, scratch + m)
-    if is_within_bounds(&s.v.p, own):
-        return
     is_met = s.relative <= tol
-    memcpy(scratch, own, m * sizeof(double))
-    project_on_bounds(&s.v.p, own)
+    if not project_far_excess(&s.v.p, own, scratch):
+        return
     judge_small_impulse(s, own, both, scratch + m)
     if is_met and not s.relative <= tol:
         memcpy(own, scratch, m * sizeof(double))
