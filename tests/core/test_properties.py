@@ -406,6 +406,24 @@ def test_registered_solver_that_worsens_its_start_returns_the_start(register):
     assert found.is_contradicted and found.status is not lv.Status.MAX_ITERATIONS
 
 
+@pytest.mark.parametrize("claimed", [lv.Status.CONVERGED, lv.Status.STALLED])
+def test_claim_at_the_round_off_floor_has_the_status_roundoff_limit(register, claimed):
+    class Ends:
+        def prepare(self, problem):
+            return problem
+
+        def run(self, state, impulse, max_iter, tol, time_limit=None):
+            return lv.Claim(claimed, 1)
+
+    register(lv.SolverSpec("ends", Ends, {"lcp", "coulomb", "cone"}, summary="of a test"))
+    problem = random_contact_problem(3)
+    start = project_impulse(problem.cones, lv.solve(problem, "newton", tol=1e-13).impulse)
+    floor = lv.residual(problem, start)
+    assert 0.0 < floor.relative and floor.above_floor == 0.0
+    found = lv.solve(problem, "ends", impulse=start, tol=0.5 * floor.relative)
+    assert found.status is lv.Status.ROUNDOFF_LIMIT
+
+
 def test_direct_with_a_factor_that_fails_at_last_returns_its_best_iterate(monkeypatch):
     """The steps of the first solves are a little too short and are refined, the third is wrong by far."""
     a = np.diag([1.0, -2.0, 3.0]) + 0.1
