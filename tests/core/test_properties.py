@@ -419,7 +419,7 @@ def test_claim_at_the_round_off_floor_has_the_status_roundoff_limit(register, cl
     problem = random_contact_problem(3)
     start = project_impulse(problem.cones, lv.solve(problem, "newton", tol=1e-13).impulse)
     floor = lv.residual(problem, start)
-    assert 0.0 < floor.relative and floor.above_floor == 0.0
+    assert floor.relative > 0.0 and floor.above_floor == 0.0
     found = lv.solve(problem, "ends", impulse=start, tol=0.5 * floor.relative)
     assert found.status is lv.Status.ROUNDOFF_LIMIT
 
