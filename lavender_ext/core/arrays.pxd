@@ -105,7 +105,9 @@ cdef inline const double* get_plain_matrix(object value, Py_ssize_t* m, Py_ssize
         for i in range(m[0] * n[0]):
             count += at[i] != 0.0
         nonzeros[0] = count
-    return NULL if has_invalid_number(at, m[0] * n[0]) else at
+    if has_invalid_number(at, m[0] * n[0]):
+        return NULL
+    return at
 
 
 cdef inline object make_read_only(object array):
