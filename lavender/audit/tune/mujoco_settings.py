@@ -26,6 +26,7 @@ import numpy as np
 from lavender.audit.audit import MAX_PROBLEMS_IN_MEMORY
 from lavender.audit.settings import OPTIONS, MujocoSetting, get_option_value
 from lavender.audit.simulated_worlds import Runs, has_diverged, simulate_world
+from lavender.audit.tune.measured import Measured, make_unmeasured
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.batch.residuals import residual_many
@@ -33,7 +34,6 @@ from lavender.io.efc import from_mujoco_many
 from lavender.report import machine
 from lavender.report.runner import Event
 
-ERROR_QUANTILE = 0.99  # Settings are compared by this quantile of the error over all steps.
 # Only the first round times a setting that takes more than this multiple of the present setting's time.
 MAX_TIME_RATIO = 2.0
 NOTHING: Mapping[str, Any] = MappingProxyType({})
@@ -72,45 +72,6 @@ def get_default_options(mj: Any) -> dict[str, Any]:
     return {name: get_option_value(mj, default, name) for name in OPTIONS}
 
 
-@dataclass(eq=False)
-class Measured:
-    """Results of one setting on some worlds.
-
-    Parameters
-    ----------
-    setting : MujocoSetting
-    solver : str
-    error : (steps,) m/s
-    motion : (stretches,) m
-    times : (steps,) s
-        Each time is the minimum of all repeats, which removes interruptions.
-    rows, contacts : (steps,) int
-    """
-
-    setting: MujocoSetting
-    solver: str
-    error: FloatArray = field(repr=False)
-    motion: FloatArray = field(repr=False)
-    times: FloatArray = field(repr=False)
-    rows: Any = field(default=(), repr=False)
-    contacts: Any = field(default=(), repr=False)
-
-    @property
-    def mean_step_time(self) -> float:
-        """Mean time of a step [s]; infinite if it was not timed."""
-        return float(self.times.mean())
-
-    @property
-    def worst_error(self) -> float:
-        """Error [m/s] that 1 % of the steps exceed."""
-        return float(np.quantile(self.error, ERROR_QUANTILE, method="higher"))
-
-    @property
-    def worst_motion(self) -> float:
-        """Distance [m] that 1 % of the stretches exceed."""
-        return float(np.quantile(self.motion, ERROR_QUANTILE, method="higher"))
-
-
 class Progress:
     """Number of measurements that are done and, estimated, to come.
 
@@ -133,12 +94,6 @@ class Progress:
             self.loads.append(machine.count_runnable_processes())
         self.done += 1
         self.expected -= 1
-
-
-def make_unmeasured(setting: MujocoSetting, solver: str) -> Measured:
-    """Build the result of a setting with which a world diverges: its error, motion and times are infinite."""
-    never = np.full(1, np.inf)
-    return Measured(setting, solver, never, never, never)
 
 
 @dataclass(eq=False)

@@ -11,7 +11,7 @@ import numpy as np
 
 from lavender.audit.page import ResultPage, StepSizes, describe_exceedance
 from lavender.audit.settings import MERGE_NOTE, MujocoSetting
-from lavender.audit.tune.mujoco_settings import Measured
+from lavender.audit.tune.measured import Measured
 from lavender.base.deadline import format_seconds
 from lavender.problem.derived import cached_property
 from lavender.report.figures import Curve, Figure

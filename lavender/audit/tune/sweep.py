@@ -26,14 +26,8 @@ from lavender.audit.page import StepSizes
 from lavender.audit.pieces import Judging
 from lavender.audit.settings import MujocoSetting
 from lavender.audit.simulated_worlds import Runs, can_any_geoms_collide, count_engine_warnings
-from lavender.audit.tune.mujoco_settings import (
-    Measured,
-    Progress,
-    Stage,
-    list_first_settings,
-    list_variants,
-    make_unmeasured,
-)  # fmt: skip
+from lavender.audit.tune.measured import Measured, make_unmeasured
+from lavender.audit.tune.mujoco_settings import Progress, Stage, list_first_settings, list_variants
 from lavender.audit.tune.recommendation import Tuning
 from lavender.base.arrays import check_float, check_int
 from lavender.base.errors import InputError
