@@ -34,8 +34,8 @@ from lavender.problem import Problem
 
 # [1/kg] If all compliances are larger, no row is examined. A common contact has 1e-3 to 1.
 MAX_EXAMINED_COMPLIANCE = 1e-4
-# [-] Smallest R / d of a problem. Float64 holds the impulses of contradictory rows to 2^-53 d / R of the velocities,
-# and the motion changes by R / d: 2e-6 and 6e-11.
+# [-] Smallest R / d of a problem. In float64, impulses of contradictory rows have an error of 2^-53 d / R = 2e-6 of
+# the velocities. The raised R changes the motion by R / d = 6e-11.
 MIN_COMPLIANCE_RATIO = 2.0**-34
 # [-] Rows with compliances up to this factor above the smallest one keep their weights against each other.
 MAX_COMPLIANCE_SPAN = 2.0**8
@@ -138,7 +138,7 @@ def judge_stiff_worlds(
     impulse: FloatArray | None = None,
     change: FloatArray | None = None,
 ) -> Batch:
-    """Make a batch from its compliances, with those of stiff rows raised, and judge the engine's accelerations.
+    """Raise the compliances of stiff rows of a batch, make the batch, and judge the engine's accelerations.
 
     Parameters
     ----------

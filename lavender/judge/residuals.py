@@ -111,7 +111,7 @@ class Rounding:
 class EngineAnswer(NamedTuple):
     """Error of an engine's acceleration, for an impulse that has lost its digits (`lavender.io.stiff_rows`).
 
-    `residual` returns it for `impulse` (m,) [N s], compared number by number. The other fields are those of `Residual`.
+    `residual` returns these errors if it gets exactly `impulse` (m,) [N s]. `Residual` describes the other fields.
     """
 
     impulse: FloatArray
@@ -517,7 +517,7 @@ def residual(
 
 
 def _apply_engine_answer(result: Residual, answer: EngineAnswer, precision: str) -> Residual:
-    """Replace the errors of an engine's forces by those of its acceleration."""
+    """Return a residual with the errors of an engine's acceleration in place of the errors of its forces."""
     fields = answer._asdict()
     del fields["impulse"]
     is_rounding = _is_explained_by_rounding(answer.relative, answer.roundoff_floor, precision)

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
 LONG_TABLES = ("cases", "failures", "runs", "skipped")  # Tables that are not written as LaTeX and Markdown.
 GROUPED_TABLES = ("runs", "sequences", "times")  # Tables that show equal first cells once on a terminal.
-# Largest number of lines of a short report, of which the command adds some: a blank line, page, reused runs, cases that
-# did not load.
+# Largest number of lines of a short report, and how many of these the command adds: a blank line, the page, reused runs
+# and cases that did not load.
 MAX_LINES, COMMAND_LINES = 25, 5
 # Largest number of warnings about cases that did not load, and of notes about crashed solvers.
 MAX_LEFT_OUT = 3

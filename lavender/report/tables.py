@@ -367,7 +367,7 @@ class Contents:
 
     @cached_property
     def has_runs(self) -> Frame:
-        """Whether each solver (row) has a run on each case (column) that rankings count."""
+        """Whether each solver (row) has a run on each case (column), of the runs that rankings compare."""
         runs = self.ranked_runs[["solver", "case"]].astype(str)
         return pd.crosstab(runs["solver"], runs["case"]) > 0
 
