@@ -369,7 +369,7 @@ class Solution:
 
     @property
     def success(self) -> bool:
-        """Whether relative residual and round-off floor are at most `tol`, or the velocity error at most `velocity_tol`.
+        """Whether relative residual and floor are at most `tol`, or the velocity error at most `velocity_tol`.
 
         Of a quadratic program: whether its status is CONVERGED, which is so if `program_error` is at most `tol`.
         """
