@@ -180,6 +180,18 @@ def test_ctrl_c_while_the_module_of_a_command_is_imported_ends_with_130(tmp_path
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="signals of POSIX")
+@pytest.mark.parametrize(("sent", "code"), [("SIGINT", 130), ("SIGTERM", 143)])
+def test_command_that_a_signal_stops_ends_with_the_code_of_that_signal(sent, code):
+    stop = f"""
+import signal
+from lavender.cli import main, solvers
+solvers.solvers.callback = lambda **words: signal.raise_signal(signal.{sent})
+main(["solvers"])
+"""
+    assert "lavender: stopped" in python("-c", stop, status=code).stderr
+
+
 @pytest.mark.parametrize("command", ["audit", "tune"])
 def test_ctrl_c_before_the_first_result_ends_with_130_and_a_reason(tmp_path, monkeypatch, capsys, command):
     pytest.importorskip("mujoco")

@@ -13,6 +13,7 @@ from random_problems import random_bodies_and_contacts, random_contact_problem, 
 import lavender as lv
 from lavender.base import deadline
 from lavender.external.forms import choose_program_form, get_program
+from lavender.external.proofs import find_ray
 from lavender.external.running import Answer, call_backend_until_accepted, classify_status
 from lavender.judge.certificates import check_certificate
 from lavender.problem.cones import project_impulse
@@ -274,15 +275,16 @@ class Steps:
     """A backend and its judge that return and accept given points, one after the other."""
 
     def __init__(self, statuses, accepted):
-        self.statuses, self.accepted, self.calls = statuses, iter(accepted), 0
+        self.statuses, self.accepted, self.calls, self.received = statuses, iter(accepted), 0, []
 
     def accepts(self, x, lam):
         return next(self.accepted)
 
     def __call__(self, scaled, start, limits, settings):
         self.calls += 1
-        x = np.full(scaled.n, float(self.calls))
-        return Answer(lv.Status[self.statuses[self.calls - 1]], f"call {self.calls}", x, np.zeros(len(scaled.t)))
+        self.received.append((int(np.sum(scaled.is_kept)) if scaled.is_kept is not None else "all", start, limits))
+        x, work = np.full(scaled.n, float(self.calls)), {"iterations": 30}
+        return Answer(lv.Status[self.statuses[self.calls - 1]], f"call {self.calls}", x, np.zeros(len(scaled.t)), work)
 
 
 @pytest.mark.parametrize(
@@ -300,6 +302,32 @@ def test_call_backend_until_accepted_returns_the_claim_of_the_best_call(statuses
     assert (steps.calls, found.message, found.status.name) == (len(accepted), f"call {best}", statuses[best - 1])
     np.testing.assert_array_equal(found.point[0], program.restore_point(np.full(2, float(best)), np.zeros(1))[0])
     assert found.work["backend_calls"] == steps.calls
+
+
+def test_second_call_of_a_backend_has_all_rows_a_smaller_tolerance_and_the_rest_of_the_budget():
+    program = get_program(lv.Problem.from_qp(4.0 * np.eye(2), [4.0, 1e-3], G=np.eye(2), h=[1.0, 1e9]).qp)
+    steps, start = Steps(["STALLED", "CONVERGED"], [False, True]), (np.array([3.0, 5.0]), np.array([7.0, 11.0]))
+    more = {"max_iter": 100, "tol": 1e-6, "deadline": deadline.NEVER, "settings": {}}
+    call_backend_until_accepted(program, steps, steps, start=start, **more)
+    (rows, x, first), (all_rows, _, second) = steps.received
+    assert (rows, all_rows) == (1, "all") and second.eps < first.eps <= 1e-6
+    assert (first.max_iter, second.max_iter) == (100, 70)
+    for found, expected in zip(program.restore_point(*x), start, strict=True):
+        np.testing.assert_array_equal(found, expected)
+    assert np.abs(x[0] - start[0]).max() > 0.0  # The scales of this program are not 1.
+
+
+@pytest.mark.parametrize("x", [None, [0.0, 0.0], [-5.0, 9.0], [3.0, 2.0]])
+@pytest.mark.parametrize("units", [(1.0, 1.0), (1e-3, 1e4)])
+def test_find_ray_returns_a_feasible_point_and_a_descent_direction_for_any_given_point(x, units):
+    """In units of each variable, x_0 >= 2 and x_0 - x_1 = 1; the objective falls along (1, 1)."""
+    units = np.array(units)
+    rows = {"G": [[-1.0 / units[0], 0.0]], "h": [-2.0], "A": [[1.0, -1.0] / units], "b": [1.0]}
+    program = get_program(lv.Problem.from_qp(np.zeros((2, 2)), [-1.0 / units[0], 0.0], **rows).qp)
+    ray, point = find_ray(program, None if x is None else units * x, deadline.NEVER)
+    np.testing.assert_allclose(ray, units / units.max(), rtol=1e-9)
+    point = point / units
+    assert point[0] >= 2.0 - 1e-5 and point[0] - point[1] == pytest.approx(1.0, abs=1e-5)
 
 
 def test_program_form_of_more_rows_than_velocities_is_the_velocity_form():
