@@ -79,9 +79,7 @@ def example(folder):
         made.append(record(case, "pgs", size, 9e-4, tol=1e-3, iterations=40))
         made += [record(case, "pgs", 1e-4, (1 + 3 * k) * 1e-2, order=order, **BUDGET) for k, order in
                  enumerate(("given", "reverse"))]  # fmt: skip
-        made.append(
-            record(case, "liar", 0.1 * size, 0.5, message="done", worst_name="<b>row 3", **FALSE_CLAIM)
-        )
+        made.append(record(case, "liar", 0.1 * size, 0.5, message="done", worst_name="<b>row 3", **FALSE_CLAIM))
         if case == "pile":
             made.append(record(case, "dead", 1.0, float("inf"), **{**crashed, "times": ()}))
     made.append(record("idle", "pgs", 1e-5, 1.0, velocity=3e-12))

@@ -30,9 +30,7 @@ def test_a_residual_that_is_too_small_breaks_the_inequality():
     honest = lv.residual(problem, wrong)
     # As if the judge had lost a factor of a thousand.
     faulty = replace(honest, error=1e-3 * honest.error, relative=1e-3 * honest.relative)
-    row = check.compare_with_reference(
-        problem, "faulty", replace(optimum, impulse=wrong, residual=faulty), optimum
-    )
+    row = check.compare_with_reference(problem, "faulty", replace(optimum, impulse=wrong, residual=faulty), optimum)
     assert row.verdict == check.BREACH
     assert row.contradicted
     fair = check.compare_with_reference(
@@ -110,9 +108,7 @@ def test_relaxed_friction_is_compared_with_a_solver_of_cones_although_a_qp_solve
         assert row.velocity == solution.residual.velocity
 
 
-@pytest.mark.parametrize(
-    ("relative", "floor", "passes"), [(9e-6, 1e-6, True), (1e-3, 1e-2, False), (2e-9, 0.0, False)]
-)
+@pytest.mark.parametrize(("relative", "floor", "passes"), [(9e-6, 1e-6, True), (1e-3, 1e-2, False), (2e-9, 0.0, False)])
 def test_solve_reference_excuses_ten_floors_up_to_the_largest_excused_residual(relative, floor, passes):
     problem = bounded_problem(1)
     solution = lv.solve(problem, "osqp", tol=1e-10)
@@ -220,11 +216,7 @@ UNSOLVED = {
     "random_spd(n=100, condition=1e4)": SWEEPS,  # condition
     "box_stack(n=10, mass_ratio=1e6)": SWEEPS,  # R / (1 + R) a sweep
     "pyramid(k=10, mass_ratio=1e3)": SWEEPS,
-    "boxed_friction(n=3, scene=granular)": {
-        *SWEEPS,
-        "anderson",
-        "quadprog",
-    },  # A is singular; quadprog factors it
+    "boxed_friction(n=3, scene=granular)": {*SWEEPS, "anderson", "quadprog"},  # A is singular; quadprog factors it
     "box_stack(n=10)": {"jacobi"},  # damped, for redundant contacts
     "pyramid(k=10)": {"jacobi"},
     "granular(n=4)": {"jacobi"},
@@ -251,9 +243,7 @@ def test_suite_cases_have_a_reference_and_every_solver_agrees_with_it(case):
 
 
 def test_cross_check_method_of_free_rows_runs_its_bounded_variant():
-    table = lv.cross_check(
-        lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0]), ["gauss_seidel", "sor", "pgs"]
-    )
+    table = lv.cross_check(lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0]), ["gauss_seidel", "sor", "pgs"])
     row = table["gauss_seidel"]
     assert (row.solver, row.ran, row.verdict) == ("gauss_seidel", "pgs", check.AGREES)
     assert "gauss_seidel → pgs  agrees" in str(table)

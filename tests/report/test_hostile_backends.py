@@ -161,9 +161,7 @@ def test_a_backend_that_forks_and_hangs_keeps_nobody_waiting(hostile, watchdog, 
         assert worker.measure_task(p, task(p, f"x_{how}", time_limit=1.5))[0]["status"] == "KILLED"
         pids = list(map(int, hostile.read_text().split()))
         assert how == "escape" or (len(pids) == 2 and wait_until(lambda: not any(map(runs, pids))))
-        assert (
-            worker.measure_task(p, task(p, "pgs"))[0]["status"] == "CONVERGED"
-        )  # and another worker goes on
+        assert worker.measure_task(p, task(p, "pgs"))[0]["status"] == "CONVERGED"  # and another worker goes on
     if how == "escape":
         os.kill(pids[0], signal.SIGKILL)
 
@@ -185,9 +183,7 @@ def test_an_exception_is_named_by_its_type_and_text(hostile, watchdog):
         record, _ = worker.measure_task(p, task(p, "x_quit"))
         assert (record["status"], record["message"]) == ("ERROR", "KeyboardInterrupt")
         record, _ = worker.measure_task(p, task(p, "direct", options={"nonsense": 1}))
-    assert record["status"] == "ERROR" and record["message"].startswith(
-        "UnknownName: unknown option 'nonsense'"
-    )
+    assert record["status"] == "ERROR" and record["message"].startswith("UnknownName: unknown option 'nonsense'")
 
 
 @pytest.mark.slow
@@ -250,12 +246,8 @@ def test_workers_of_a_campaign_end_when_it_is_killed():
 
 def test_a_whole_run_survives_its_backends(hostile, watchdog, monkeypatch):
     monkeypatch.setattr("lavender.report.workers.GRACE_TIME", 0.5)
-    plan = report.Plan(
-        tolerances=(1e-3,), budgets=(), repeats=1, time_limit=1.0
-    )  # a hundred times what they take
-    runs = report.select_runs(
-        report.run([stack(4)], ["x_talk", "x_hang", "x_segfault", "x_leave", "pgs"], plan)
-    )
+    plan = report.Plan(tolerances=(1e-3,), budgets=(), repeats=1, time_limit=1.0)  # a hundred times what they take
+    runs = report.select_runs(report.run([stack(4)], ["x_talk", "x_hang", "x_segfault", "x_leave", "pgs"], plan))
     died = ["KILLED", "CRASHED (SIGSEGV)", "CRASHED (exit status 3)"]
     assert list(runs["status"]) == ["CONVERGED", *died, "CONVERGED"]
     # Its diagonal step does not solve a stack, and it says so.

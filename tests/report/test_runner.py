@@ -137,9 +137,7 @@ def test_run_solver_that_raises_costs_its_own_record(plug_in):
 
     plug_in(fail, "fake_raise"), plug_in(lose, "fake_nan")
     plug_in(lambda problem, impulse: lv.Claim(lv.Status.CONVERGED, 1), "fake_lie")
-    found = report.run(
-        [stack(4, "one"), stack(5, "two")], ["fake_raise", "fake_nan", "fake_lie", "pgs"], QUICK
-    )
+    found = report.run([stack(4, "one"), stack(5, "two")], ["fake_raise", "fake_nan", "fake_lie", "pgs"], QUICK)
     found = rows_of(found)
     by = {(r.case, r.solver): r for r in found}
     for case in ("one", "two"):
@@ -215,9 +213,7 @@ def test_store_has_each_row_when_it_is_made(tmp_path):
         if event.row is not None:
             seen.append(json.loads(path.read_text().splitlines()[-1]) == store.to_jsonable(event.row))
 
-    found = report.run(
-        [stack(6)], ["pgs", "direct"], dataclasses.replace(QUICK, repeats=1), path, watch=watch
-    )
+    found = report.run([stack(6)], ["pgs", "direct"], dataclasses.replace(QUICK, repeats=1), path, watch=watch)
     assert seen == [True] * len(rows_of(found)) and texts(report.read(path)) == texts(found)
     # Files of an editor that marks UTF-8, put together: the mark is before each part.
     path.write_bytes(2 * (b"\xef\xbb\xbf" + path.read_bytes()))
@@ -257,11 +253,7 @@ def test_run_killed_at_any_byte_continues(given, first, later, tmp_path):
         assert keys_of(again) == keys_of(whole) and skipped(again) == skipped(whole)
         assert kept + more >= len(rows_of(whole)) == len(rows_of(report.read(path))) and more <= made
     again, more = measure(later)
-    assert (
-        keys_of(again) == keys_of(whole)
-        and len(rows_of(report.read(path))) == len(rows_of(whole))
-        and more == 0
-    )
+    assert keys_of(again) == keys_of(whole) and len(rows_of(report.read(path))) == len(rows_of(whole)) and more == 0
 
 
 def test_run_process_killed_at_random_times_loses_nothing(tmp_path):
@@ -293,11 +285,7 @@ def test_run_other_version_or_cpu_is_another_run(tmp_path, monkeypatch):
         monkeypatch.setattr(machine, name, value)
         ids |= {r.run for r in rows_of(report.run([stack(5)], ["direct"], QUICK, path))}
     found = report.Report(report.read(path))
-    assert (
-        len(ids) == 3
-        and len(found.runs) == 3 * len(rows_of(first))
-        and len(found.newest) == len(rows_of(first))
-    )
+    assert len(ids) == 3 and len(found.runs) == 3 * len(rows_of(first)) and len(found.newest) == len(rows_of(first))
 
 
 def test_run_ctrl_c_keeps_the_records_that_were_made(tmp_path, plug_in):
@@ -337,11 +325,7 @@ def test_write_csv_has_a_row_for_each_run(tmp_path):
     with (tmp_path / "records.csv").open(newline="") as f:
         rows = list(csv.DictReader(f))
     for row, r in zip(rows, rows_of(found), strict=True):
-        assert (float(row["relative"]), float(row["time"]), row["cpu"]) == (
-            r.relative,
-            r.time,
-            machine.get_cpu_name(),
-        )
+        assert (float(row["relative"]), float(row["time"]), row["cpu"]) == (r.relative, r.time, machine.get_cpu_name())
         assert json.loads(row["work"]) == json.loads(r.work) and int(row["rows"]) == r.rows > 0
     assert f"numpy {np.__version__}" in rows[0]["versions"]
     with pytest.raises(lv.InputError, match="no records of solver 'nncg'; there are records of direct, pgs"):
@@ -476,15 +460,11 @@ def test_campaign_backend_that_cannot_be_used_is_an_input_error(backend, missing
 
 @pytest.mark.nightly
 def test_campaign_cluster_that_loses_a_worker_loses_no_record():
-    distributed = pytest.importorskip(
-        "distributed", reason="a cluster needs dask.distributed (extra: cluster)"
-    )
+    distributed = pytest.importorskip("distributed", reason="a cluster needs dask.distributed (extra: cluster)")
     plan = report.CampaignPlan(tolerances=(1e-6,), budgets=(8, 64))
     expected = report.run(SEEDED[:16], ["pgs", "jacobi"], plan)
     with (
-        distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0"
-        ) as cluster,
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0") as cluster,
         distributed.Client(cluster) as client,
     ):
         pids = list(client.run(os.getpid).values())
@@ -532,12 +512,10 @@ def make_driven_chain(n=6):
 @pytest.mark.parametrize(
     ("problem", "words"),
     [
-        (chain(6), ("chain",)),
-        (make_driven_chain(), ("chain", "redundant")),
+        (chain(6), ("chain",)), (make_driven_chain(), ("chain", "redundant")),
         (suite.case("boxed_friction(n=2)").problem, ("stack", "redundant")),
         (suite.case("boxed_friction(n=3, scene=granular)").problem, ("pile", "redundant")),
-        (lv.Problem.linear(*spd(20)), ("dense",)),
-        (stack(6), ("stack",)),
+        (lv.Problem.linear(*spd(20)), ("dense",)), (stack(6), ("stack",)),
         (lv.Problem.from_rows(two_bodies(1)), ("stack",)),
         (lv.Problem.from_rows(two_bodies(1, 1e4)), ("stack", "large mass ratio")),
         (lv.Problem.from_rows(two_bodies(3)), ("stack", "redundant")),
@@ -546,10 +524,9 @@ def make_driven_chain(n=6):
         (lv.Problem.linear(np.array([[2.0, 0.01], [0.0, 2.0]]), np.ones(2)), ("separate", "asymmetric")),
         (lv.Problem.linear(np.array([[2.0, 0.5], [0.0, 2.0]]), np.ones(2)), ("asymmetric",)),
         (lv.Problem.contact(np.eye(9), np.ones(9), np.full(3, 0.5)), ("separate", "friction")),
-        (make_pile_among_separate_rows(), ("pile",)),
-        (lv.Problem.linear(np.zeros((0, 0)), np.zeros(0)), ("empty",)),
+        (make_pile_among_separate_rows(), ("pile",)), (lv.Problem.linear(np.zeros((0, 0)), np.zeros(0)), ("empty",)),
     ],
-)
+)  # fmt: skip
 def test_classify_structure_names_the_largest_component(problem, words):
     assert report.classify_structure(problem) == words
 
@@ -561,11 +538,7 @@ def test_hash_problem_changes_with_every_number():
         lv.Problem.lcp(p.matrix, p.b, upper=1.0), lv.Problem.lcp(2 * p.matrix, p.b),
         lv.Problem.contact(p.matrix, p.b, np.zeros(5)),
     ]  # fmt: skip
-    jac, mass, v = (
-        np.array([[1.0, 0.2], [0.0, 1.0]]),
-        np.array([[2.0, 0.3], [0.3, 1.0]]),
-        np.array([-1.0, 0.5]),
-    )
+    jac, mass, v = (np.array([[1.0, 0.2], [0.0, 1.0]]), np.array([[2.0, 0.3], [0.3, 1.0]]), np.array([-1.0, 0.5]))
     for s in (1.0, 2.0):  # one A and one b
         cones = lv.Cones.contacts(0.5, 1)
         variants.append(lv.Problem.from_jacobian(s * jac, s * s * mass, v / s, cones=cones))
@@ -588,10 +561,7 @@ def test_resolve_sources_recorded_steps_are_sequences_and_folders_are_searched(t
     ]  # fmt: skip
     assert all(i.sequence == "" for i in report.resolve_sources([tmp_path / "a" / "steps"], sequences=False))
     alike = report.resolve_sources([tmp_path / "a" / name for name in ("my steps", "My_steps")])
-    assert {i.sequence for i in alike} == {
-        "my steps",
-        "a/My_steps",
-    }  # Figures are files named after sequences.
+    assert {i.sequence for i in alike} == {"my steps", "a/My_steps"}  # Figures are files named after sequences.
     (tmp_path / "mixed" / "back").symlink_to(tmp_path / "mixed")  # is not read again
     assert len(report.resolve_sources([tmp_path / "mixed", "stack(n=2)"])) == 4
     for source, message in (
@@ -640,9 +610,7 @@ def test_records_of_a_plug_in_with_changed_code_are_measured_again(tmp_path, mon
     path = tmp_path / "edited_solver.py"
     path.write_text("from lavender.solvers.pgs import ProjectedGaussSeidel as Edited\n")
     monkeypatch.syspath_prepend(tmp_path)
-    register(
-        lv.SolverSpec("edited", "edited_solver:Edited", laws=("lcp",), summary="of a test", max_iter=200)
-    )
+    register(lv.SolverSpec("edited", "edited_solver:Edited", laws=("lcp",), summary="of a test", max_iter=200))
     before = machine.hash_solver_sources()
     assert machine.hash_solver_sources() == before
     path.write_text(path.read_text() + "# changed\n")

@@ -25,16 +25,13 @@ def test_admm_under_coulomb_with_mass_ratios_converges(ratio, speed):
 @pytest.mark.parametrize(
     "problem",
     [
-        lambda: suite.stack(n=200).problem,
-        lambda: suite.hang(n=24).problem,
-        lambda: suite.granular(n=4).problem,
+        lambda: suite.stack(n=200).problem, lambda: suite.hang(n=24).problem, lambda: suite.granular(n=4).problem,
         lambda: suite.granular(n=3, friction="coulomb").problem,
         lambda: suite.granular(n=3, friction="coulomb").problem.relaxed("cone"),
         lambda: suite.pyramid(k=6, mass_ratio=1e6).problem,
-        lambda: suite.pyramid(k=5, mass_ratio=1e6, friction="coulomb").problem,
-        lambda: wild(seed=7921).problem,
+        lambda: suite.pyramid(k=5, mass_ratio=1e6, friction="coulomb").problem, lambda: wild(seed=7921).problem,
     ],
-)
+)  # fmt: skip
 def test_auto_stages_sum_to_the_work_and_end_at_the_residual(problem):
     problem = problem()
     solution = lv.solve(problem, "auto", tol=1e-6)

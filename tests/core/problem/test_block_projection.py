@@ -12,20 +12,17 @@ from lavender.judge.states import judge_and_linearise_impulse
 L = np.longdouble
 H = L(1e-7)  # step of central differences: 1e-14 of truncation, 1e-12 of rounding in long double
 CONES = {
-    "rows": lambda mu, arm, n: lv.Cones(
-        3 * np.arange(n + 1), np.zeros(n, int), -np.repeat(arm, 3), np.repeat(mu, 3), np.zeros(n), np.zeros(n)
-    ),
-    "normal": lambda mu, arm, n: lv.Cones.contacts(0.0 * mu, 0),
-    "one tangent": lambda mu, arm, n: lv.Cones.contacts(mu, 1),
-    "disk": lambda mu, arm, n: lv.Cones.contacts(mu),
-    "spin": lambda mu, arm, n: lv.Cones.contacts(mu, patch_radius=arm),
-    "spin alone": lambda mu, arm, n: lv.Cones.contacts(mu, 0, arm),
-    "box": lambda mu, arm, n: lv.Cones.contacts(np.stack([mu, arm], 1), shape="box"),
-    "ellipse": lambda mu, arm, n: lv.Cones.contacts(np.stack([mu + 0.1, arm], 1)),
-    "rolling": lambda mu, arm, n: lv.Cones.contacts(mu, rolling=arm),
-    "rolling and spin": lambda mu, arm, n: lv.Cones.contacts(mu, patch_radius=0.5 * mu + 0.1, rolling=arm),
-    "round": lambda mu, arm, n: lv.Cones.contacts(mu, 5),
-}
+    "rows": lambda mu, arm,
+    n: lv.Cones(3 * np.arange(n + 1), np.zeros(n, int), -np.repeat(arm, 3), np.repeat(mu, 3), np.zeros(n), np.zeros(n)),
+    "normal": lambda mu, arm, n: lv.Cones.contacts(0.0 * mu, 0), "one tangent": lambda mu, arm,
+    n: lv.Cones.contacts(mu, 1), "disk": lambda mu, arm, n: lv.Cones.contacts(mu), "spin": lambda mu, arm,
+    n: lv.Cones.contacts(mu, patch_radius=arm), "spin alone": lambda mu, arm, n: lv.Cones.contacts(mu, 0, arm),
+    "box": lambda mu, arm, n: lv.Cones.contacts(np.stack([mu, arm], 1), shape="box"), "ellipse": lambda mu, arm,
+    n: lv.Cones.contacts(np.stack([mu + 0.1, arm], 1)), "rolling": lambda mu, arm,
+    n: lv.Cones.contacts(mu, rolling=arm), "rolling and spin": lambda mu, arm,
+    n: lv.Cones.contacts(mu, patch_radius=0.5 * mu + 0.1, rolling=arm), "round": lambda mu, arm,
+    n: lv.Cones.contacts(mu, 5),
+}  # fmt: skip
 
 
 def project(law, y, components):

@@ -109,21 +109,6 @@ def test_the_residual_of_two_problems_side_by_side_is_the_larger_one(form, kind,
         )
 
 
-def test_a_fast_body_does_not_hide_a_stack_that_is_not_solved():
-    """32 boxes in a stack and one contact at 1000 m/s: the verdict is that of the stack alone."""
-    boxes = 32
-    stack = touching([[i - 1, i] for i in range(boxes)], v_free=np.tile([0, 0, -0.1, 0, 0, 0.0], (boxes, 1)))
-    fast = touching([[-1, 0]], v_free=[[0, 0, -1000.0, 0, 0, 0]])
-    alone = lv.Problem.from_rows(stack, tangents=0)
-    both, rows = rows_side_by_side(alone, lv.Problem.from_rows(fast, tangents=0))
-    for name in lv.available(both):
-        solution = lv.solve(both, name, tol=1e-6, max_iter=400)
-        own = lv.residual(alone, solution.impulse[rows < alone.m])
-        if solution.success:
-            assert own.relative <= 1e-6 * (1 + ROUNDING), name
-        assert solution.residual.relative >= own.relative * (1 - ROUNDING), name
-
-
 # -- rows that do not act ------------------------------------------------------------------------------
 
 
@@ -249,14 +234,6 @@ def test_residual_rounding_of_moving_immovable_bodies_is_satisfied():
     problem = unmoved_row_beside(1e-3, "bodies", 1.0).updated(b=[1e-3, 2.8e-17])
     solution = lv.solve(problem, tol=1e-6)
     assert solution.success and solution.residual.relative < 1e-15
-
-
-def test_find_islands_of_separate_bodies_is_the_same_in_every_form():
-    problem = random_contact_problem(3, tangents=2, spin=False)
-    both, _ = rows_side_by_side(problem, random_contact_problem(4, tangents=2, spin=False))
-    counts = [find_islands(convert(both))[0] for convert in FORMS.values()]
-    assert counts[0] > 1
-    assert len(set(counts)) == 1
 
 
 # -- immovable bodies and entries that are zero --------------------------------------------------------

@@ -229,14 +229,10 @@ def test_arrays_that_are_adopted_are_shared_and_read_only():
 @pytest.mark.parametrize(
     ("rows", "bounds", "tangents"),
     [
-        (6, {"mu": 0.7}, [2, 2]),
-        (6, {"mu": [0.7, 0.2]}, [2, 2]),
-        (4, {"mu": 0.7, "tangents": 1}, [1, 1]),
-        (4, {"mu": [0.7, 0.2]}, [1, 1]),
-        (2, {"mu": 0.0, "tangents": 0}, [0, 0]),
-        (6, {"mu": [(0.7, 0.2)] * 2}, [2, 2]),
+        (6, {"mu": 0.7}, [2, 2]), (6, {"mu": [0.7, 0.2]}, [2, 2]), (4, {"mu": 0.7, "tangents": 1}, [1, 1]),
+        (4, {"mu": [0.7, 0.2]}, [1, 1]), (2, {"mu": 0.0, "tangents": 0}, [0, 0]), (6, {"mu": [(0.7, 0.2)] * 2}, [2, 2]),
     ],
-)
+)  # fmt: skip
 def test_from_jacobian_with_mu_has_the_contacts_of_its_rows(rows, bounds, tangents):
     rng = np.random.default_rng(0)
     jac, mass, v = rng.normal(size=(rows, 7)), np.eye(7), rng.normal(size=7)

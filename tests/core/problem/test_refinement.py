@@ -30,6 +30,8 @@ def ill_problem(seed, condition, law="lcp", n=8):
         cones = lv.Cones.free(4)
     elif law == "lcp":
         cones = lv.Cones.bounded(np.zeros(5), np.full(5, np.inf))
+    elif law == "ellipses":  # They are solved as disks, and judged again in their own rows.
+        cones = lv.Cones.contacts([[0.5, 0.2], [0.3, 0.9]], 2)
     else:
         cones = lv.Cones.contacts(rng.uniform(0.1, 0.8, 2), 2)
     return lv.Problem.from_jacobian(
@@ -38,7 +40,7 @@ def ill_problem(seed, condition, law="lcp", n=8):
     )  # fmt: skip
 
 
-LAWS = ("linear", "lcp", "coulomb", "cone")
+LAWS = ("linear", "lcp", "coulomb", "cone", "ellipses")
 
 
 def hinges(n, seed, rows=6):
@@ -108,14 +110,6 @@ def test_no_claim_about_a_backend_is_false_either(name):
         check_claims(name, law, condition, seed, 1e-9)
 
 
-@pytest.mark.parametrize("tol", [1e-6, 1e-9, 1e-11, 1e-13])
-def test_no_claim_is_false_on_a_chain_of_hinges(tol):
-    for n, seed in ((10, 0), (10, 1), (40, 2)):
-        problem = hinges(n, seed)
-        for name in ("auto", "newton", "pgs"):
-            assert false_claim(problem, lv.solve(problem, name, tol=tol, max_iter=20_000)) is None
-
-
 @pytest.mark.parametrize("name", lv.available(impulse=True, external=False))
 def test_sweeps_end_where_float64_loses_the_residual(name):
     """Their own residual meets tol, the refined one does not: no sweep makes it smaller."""
@@ -146,18 +140,6 @@ def test_residual_above_the_floor_is_not_converged():
             assert not solution.residual.at_floor
             seen += "ill-conditioned" in solution.message
     assert seen > 5
-
-
-@given(seed=seeds)
-def test_no_claim_is_false_with_ellipses(seed):
-    """They are solved as disks, and judged again in their own rows."""
-    rng = np.random.default_rng(seed)
-    cones = lv.Cones.contacts([[0.5, 0.2], [0.3, 0.9]], 2)
-    problem = lv.Problem.from_jacobian(
-        rng.standard_normal((6, 8)), conditioned(rng, 8, 1e10), rng.standard_normal(8), cones=cones
-    )
-    for name in ("auto", "pgs", "newton"):
-        assert false_claim(problem, lv.solve(problem, name, tol=1e-9, max_iter=3000)) is None
 
 
 # -- the refined pass ------------------------------------------------------------------------------
@@ -225,6 +207,3 @@ def test_the_condition_of_m_is_estimated_from_below(seed, condition, n):
     estimate = Generalized(np.ones((1, n)), mass, np.zeros(n)).operator.condition
     # The eigenvalue of NumPy has an error of its own, n 2^-53 of the largest.
     assert exact / 10.0 <= estimate <= exact * (1.0 + 1e-3) + 1e-9
-
-
-# -- batches ---------------------------------------------------------------------------------------

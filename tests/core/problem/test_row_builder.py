@@ -193,17 +193,14 @@ def add_everything(builder, lift, axis):
     turn = {} if axis is None else {"axis": axis}
     gear = {} if axis is None else {"axis_a": axis}
     return [
-        builder.hinge(-1, 0, lift(0.0, 0.0), **turn),
-        builder.motor(-1, 0, speed=2.0, max_torque=5.0, **turn),
-        builder.limit(-1, 0, value=0.1, lower=0.0, **turn),
-        builder.distance(0, 1, lift(1.0, 0.2), lift(2.0, 0.5), 1.0),
+        builder.hinge(-1, 0, lift(0.0, 0.0), **turn), builder.motor(-1, 0, speed=2.0, max_torque=5.0, **turn),
+        builder.limit(-1, 0, value=0.1, lower=0.0, **turn), builder.distance(0, 1, lift(1.0, 0.2), lift(2.0, 0.5), 1.0),
         builder.spring(-1, 1, lift(3.0, 3.0), lift(2.2, 1.0), 1.0, stiffness=50.0, damping=1.0),
-        builder.slider(-1, 2, lift(3.0, 0.0), lift(1.0, 1.0)),
-        builder.weld(2, 3, lift(3.5, 0.0)),
+        builder.slider(-1, 2, lift(3.0, 0.0), lift(1.0, 1.0)), builder.weld(2, 3, lift(3.5, 0.0)),
         builder.gear(0, 1, ratio=2.0, **gear),
         builder.contact(-1, 1, lift(2.0, -0.5), lift(0.0, 1.0), gap=-0.01, mu=0.4),
         builder.contact(-1, 3, lift(4.0, -0.5), lift(0.0, 1.0), mu=0.0, restitution=0.5),
-    ]
+    ]  # fmt: skip
 
 
 PLACES = np.array([(1.0, 0.0), (2.0, 0.0), (3.0, 0.0), (4.0, 0.0)])

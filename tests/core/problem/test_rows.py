@@ -19,26 +19,21 @@ def fields(seed):
 
 
 SPOILT = {
-    "nothing": None,
-    "a body that is not there": ("contact_body", (0, 1), 3),
-    "below static": ("joint_body", (1, 0), -2),
-    "a joint of one body": ("joint_body", (0, slice(None)), 1),
+    "nothing": None, "a body that is not there": ("contact_body", (0, 1), 3),
+    "below static": ("joint_body", (1, 0), -2), "a joint of one body": ("joint_body", (0, slice(None)), 1),
     "a contact of one body": ("contact_body", (2, slice(None)), 0),
     "a joint of nobody": ("joint_body", (0, slice(None)), -1),
     "a contact of nobody": ("contact_body", (1, slice(None)), -1),
     "a normal too long by 2e-5": ("normal", (0,), 1.0 + 2e-5),
     "a normal too long by 1e-7": ("normal", (0,), 1.0 + 1e-7),
-    "a normal too long by 1e-11": ("normal", (0,), 1.0 + 1e-11),
-    "a tangent along the normal": ("tangent", (0,), None),
-    "an inertia with a twist": ("inv_inertia", (0, 0, 1), 5.0),
-    "an inertia below zero": ("inv_inertia", (0,), -1.0),
+    "a normal too long by 1e-11": ("normal", (0,), 1.0 + 1e-11), "a tangent along the normal": ("tangent", (0,), None),
+    "an inertia with a twist": ("inv_inertia", (0, 0, 1), 5.0), "an inertia below zero": ("inv_inertia", (0,), -1.0),
     "an inertia about one axis": ("inv_inertia", (0,), np.diag([1.0, 0.0, 0.0])),
     "an inertia of a point": ("inv_inertia", (0,), np.zeros((3, 3))),
     "an inertia near the edge": ("inv_inertia", (0,), np.diag([1.0, 1.0, -0.9e-9])),
     "an inertia at the edge of the door": ("inv_inertia", (0,), 1e-60 * np.eye(3)),
-    "pointers that stand still": ("joint_ptr", (1,), 0),
-    "pointers from one on": ("joint_ptr", (0,), 1),
-}
+    "pointers that stand still": ("joint_ptr", (1,), 0), "pointers from one on": ("joint_ptr", (0,), 1),
+}  # fmt: skip
 
 
 def spoilt(seed, how):

@@ -97,11 +97,8 @@ ARGUMENTS = {
         *("problem.npz", "--solvers", "projected_gradients", "pgs", "--tolerances", "1e-3", "--budgets", "4"),
         *("--repeats", "1", "--no-figures"),
     ),
-    "solvers": (),
-    "contract": ("projected_gradients",),
-    "doctor": (),
-    "export": ("c", "library"),
-}
+    "solvers": (), "contract": ("projected_gradients",), "doctor": (), "export": ("c", "library"),
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")

@@ -59,23 +59,6 @@ def test_solver_solves_every_kind_of_problem_in_every_form(name):
                 )
 
 
-@pytest.mark.parametrize("name", [name for name in lv.available() if "form" in registry.get(name).options])
-def test_every_form_of_a_solver_has_the_same_slack(name):
-    spec = registry.get(name)
-    for (law, kind), (forms, slack) in make_problems_of_every_kind().items():
-        if kind.startswith("round") or spec.refuses(forms[0]) or (kind == "boxes" and law not in spec.laws):
-            continue  # These problems have one form only.
-        for form in ("impulse",) if kind == "ellipses" else ("impulse", "velocity"):
-            solution = lv.solve(forms[0], name, tol=1e-6, form=form)
-            assert str(solution.solver.form).startswith(form)
-            assert solution.success or (spec.external and name not in REQUIRED_BACKENDS)
-            if solution.success and law != "coulomb":
-                size = np.abs(forms[0].slack(forms[0].start())).max()
-                np.testing.assert_allclose(solution.slack, slack, rtol=0, atol=1e-3 * size + 1e-7 * np.abs(slack).max())
-        with pytest.raises(lv.LavenderError, match="velocity"):
-            lv.solve(forms[0], name, form="velocities")
-
-
 SOFT = touching([[-1, 0], [-1, 0]], inv_mass=[0.0], inv_inertia=np.zeros((1, 3, 3)))  # a body that cannot move
 UNUSUAL = {
     "no rows, linear": lv.Problem.linear(np.zeros((0, 0)), []),

@@ -7,7 +7,7 @@ import functools
 
 import numpy as np
 import pytest
-from random_problems import make_problems_of_every_kind, random_lcp, without_solution
+from random_problems import make_problems_of_every_kind, nearly_singular, random_lcp, without_solution
 
 import lavender as lv
 from lavender import registry
@@ -26,8 +26,9 @@ def examples():
     return [*(p for _, (forms, _) in kinds for p in forms), *map(random_lcp, range(4))]
 
 
-def accepted(name):
-    return [p for p in examples() if registry.get(name).refuses(p) is None]
+def accepted(name, *more):
+    """Return the examples, and more problems, that a solver accepts."""
+    return [p for p in (*examples(), *more) if registry.get(name).refuses(p) is None]
 
 
 def objective(problem, impulse):
@@ -57,10 +58,7 @@ def test_solve_from_a_stale_start_is_not_behind_it_by_the_rule(name):
 
 @pytest.mark.parametrize("name", OWN)
 def test_solve_within_a_budget_makes_true_claims(name):
-    spec = registry.get(name)
-    for problem in [*accepted(name), without_solution(3, 6)]:
-        if spec.refuses(problem) is not None:
-            continue
+    for problem in accepted(name, *(without_solution(seed, 6) for seed in range(9)), *map(nearly_singular, range(20))):
         for budget in (0, 1, 7):
             solution = lv.solve(problem, name, max_iter=budget, tol=TOL)
             judged = lv.residual(problem, solution.impulse)
@@ -69,6 +67,9 @@ def test_solve_within_a_budget_makes_true_claims(name):
             assert solution.success == (judged.relative <= TOL) or judged.roundoff_floor > TOL
             if solution.status is lv.Status.INFEASIBLE:
                 assert solution.certificate is not None and judged.energy <= judged.energy_at_zero * (1.0 + 1e-14)
+                assert (solution.impulse >= problem.cones.lower).all() and (
+                    solution.impulse <= problem.cones.upper
+                ).all()
 
 
 @pytest.mark.parametrize("name", OWN)

@@ -5,7 +5,6 @@ import dataclasses
 import importlib.metadata
 import pickle
 import sys
-import warnings
 from types import SimpleNamespace
 
 import numpy as np
@@ -149,32 +148,3 @@ class Entry:
 
 def raises():
     raise RuntimeError("needs a licence")
-
-
-@pytest.mark.parametrize(
-    ("load", "sign"),
-    [
-        (raises, "needs a licence"),
-        (lambda: raises, "needs a licence"),
-        (lambda: named("pgs"), "another solver is named 'pgs'"),
-        (lambda: lambda: 7, "SolverSpec"),
-    ],
-    ids=["import", "factory", "name of ours", "no spec"],
-)
-def test_broken_plug_in_warns_and_leaves_other_solvers(load, sign, monkeypatch):
-    entries = [Entry("broken", load), Entry("good_one", lambda: named("good_one"))]
-    monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: entries)
-    monkeypatch.setattr(registry, "registered", {})
-    registry.register_all_solvers.cache_clear()
-    try:
-        with warnings.catch_warnings(record=True) as told:
-            warnings.simplefilter("always")
-            names = set(registry.specs())
-        assert {"pgs", "newton", "good_one"} <= names
-        (warning,) = told
-        assert "'broken'" in str(warning.message)
-        assert sign in str(warning.message)
-    finally:
-        registry.register_all_solvers.cache_clear()
-        monkeypatch.undo()
-        registry.specs()
