@@ -24,17 +24,12 @@ PROXIMAL = {"eps_abs": TOL, "eps_rel": 0.0}
 GAPS = {f"eps_duality_gap_{kind}": TOL for kind in ("abs", "rel")}
 ALONE = {
     "osqp": {"eps_abs": TOL, "eps_rel": 0.0, "max_iter": 100_000, "polishing": True},
-    "clarabel": {"tol_feas": TOL, "tol_gap_abs": TOL, "tol_gap_rel": TOL},
-    "piqp": PROXIMAL | GAPS,
-    "proxqp": PROXIMAL | GAPS | {"check_duality_gap": True},
-    "qpalm": PROXIMAL,
+    "clarabel": {"tol_feas": TOL, "tol_gap_abs": TOL, "tol_gap_rel": TOL}, "piqp": PROXIMAL | GAPS,
+    "proxqp": PROXIMAL | GAPS | {"check_duality_gap": True}, "qpalm": PROXIMAL,
     "daqp": {"primal_tol": TOL, "dual_tol": TOL},
     "highs": {f"{kind}_feasibility_tolerance": TOL for kind in ("primal", "dual")},
-    "scs": PROXIMAL | {"max_iters": 100_000},
-    "cvxopt": INTERIOR,
-    "kvxopt": INTERIOR,
-    "ecos": INTERIOR,
-}
+    "scs": PROXIMAL | {"max_iters": 100_000}, "cvxopt": INTERIOR, "kvxopt": INTERIOR, "ecos": INTERIOR,
+}  # fmt: skip
 
 
 def draw_program(seed):

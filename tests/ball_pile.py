@@ -57,15 +57,12 @@ class Pile:
         target = np.zeros((len(gap), 3))
         target[:, 0] = np.where(gap > 0.0, -gap / DT, np.clip(0.2 * (-gap - 0.005) / DT, 0.0, 1.0))
         rows = lv.Rows(
-            inv_mass=1.0 / self.mass,
-            inv_inertia=(2.5 / (self.mass * self.radius**2))[:, None, None] * np.eye(3),
-            v_free=self.velocity - [0.0, 9.81 * DT, 0.0, 0.0, 0.0, 0.0],
-            contact_body=body,
-            normal=normal,
+            inv_mass=1.0 / self.mass, inv_inertia=(2.5 / (self.mass * self.radius**2))[:, None, None] * np.eye(3),
+            v_free=self.velocity - [0.0, 9.81 * DT, 0.0, 0.0, 0.0, 0.0], contact_body=body, normal=normal,
             tangent=tangent / np.linalg.norm(tangent, axis=1, keepdims=True),
             arm_a=np.where(body[:, :1] >= 0, normal * self.radius[body[:, :1]], 0.0),
             arm_b=-normal * self.radius[body[:, 1:]],
-        )
+        )  # fmt: skip
         # A wall is told by the axis of its normal.
         name = np.where(body[:, 0] >= 0, body[:, 0], len(self.mass) + abs(normal).argmax(axis=1))
         key = (name.astype(np.uint64) << np.uint64(32)) | body[:, 1].astype(np.uint64)

@@ -122,13 +122,10 @@ def contacts(kind, form):
 MAKERS = {
     **{f"{kind}, {form}": contacts(kind, form) for kind in CONTACTS for form in FORMS},
     "lcp": lambda seed: random_lcp(seed, m=1 + seed % 12),
-    "singular lcp": lambda seed: random_lcp(seed, m=4 + seed % 9, rank=1 + seed % 3),
-    "linear": linear,
-    "bounded blocks": bounded_blocks,
-    "round cones": round_cones,
-    "nearly singular M": nearly_singular,
+    "singular lcp": lambda seed: random_lcp(seed, m=4 + seed % 9, rank=1 + seed % 3), "linear": linear,
+    "bounded blocks": bounded_blocks, "round cones": round_cones, "nearly singular M": nearly_singular,
     "many islands": many_islands,
-}
+}  # fmt: skip
 
 
 def replaced(x, how, rng):

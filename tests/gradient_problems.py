@@ -8,13 +8,10 @@ import numpy as np
 import lavender as lv
 
 KINDS = {
-    "free": lambda rng: lv.Cones.free(2),
-    "bounded": lambda rng: lv.Cones.bounded([-0.3, 0.0], [0.3, np.inf]),
-    "equal": lambda rng: lv.Cones.bounded([0.2], [0.2]),
-    "normal": lambda rng: lv.Cones.contacts(0.0, 0),
+    "free": lambda rng: lv.Cones.free(2), "bounded": lambda rng: lv.Cones.bounded([-0.3, 0.0], [0.3, np.inf]),
+    "equal": lambda rng: lv.Cones.bounded([0.2], [0.2]), "normal": lambda rng: lv.Cones.contacts(0.0, 0),
     "line": lambda rng: lv.Cones.contacts(rng.uniform(0.2, 1.0), 1),
-    "disk": lambda rng: lv.Cones.contacts(rng.uniform(0.2, 1.0)),
-    "smooth": lambda rng: lv.Cones.contacts(0.0),
+    "disk": lambda rng: lv.Cones.contacts(rng.uniform(0.2, 1.0)), "smooth": lambda rng: lv.Cones.contacts(0.0),
     "spin": lambda rng: lv.Cones.contacts(rng.uniform(0.2, 1.0), 2, 0.3),
     "spin alone": lambda rng: lv.Cones.contacts(rng.uniform(0.2, 1.0), 0, 0.4),
     "ellipse": lambda rng: lv.Cones.contacts([rng.uniform(0.2, 1.0, 2)]),
@@ -22,7 +19,7 @@ KINDS = {
     "rolling": lambda rng: lv.Cones.contacts(rng.uniform(0.2, 1.0), 2, rolling=0.2),
     "rolling and spin": lambda rng: lv.Cones.contacts(rng.uniform(0.2, 1.0), 2, 0.3, rolling=0.2),
     "round": lambda rng: lv.Cones.contacts(rng.uniform(0.2, 1.0), 5),
-}
+}  # fmt: skip
 OPERATORS = ("dense", "csr", "asymmetric", "generalized", "bodies")
 
 
@@ -87,26 +84,15 @@ def _of_bodies(rng, cones, law):
     pairs = np.array([(-1, 0), (0, 1), (1, 2), (2, 3), (3, -1)])
     root = rng.standard_normal((n, 3, 3))
     rows = lv.Rows(
-        inv_mass=rng.uniform(0.5, 2.0, n),
-        inv_inertia=root @ root.transpose(0, 2, 1) + np.eye(3),
-        v_free=rng.standard_normal((n, 6)),
-        jac=rng.standard_normal((2, 12)),
-        joint_ptr=[0, 2],
-        joint_body=[(0, 2)],
-        normal=normal,
-        tangent=tangent,
-        arm_a=rng.standard_normal((c, 3)),
-        arm_b=rng.standard_normal((c, 3)),
+        inv_mass=rng.uniform(0.5, 2.0, n), inv_inertia=root @ root.transpose(0, 2, 1) + np.eye(3),
+        v_free=rng.standard_normal((n, 6)), jac=rng.standard_normal((2, 12)), joint_ptr=[0, 2], joint_body=[(0, 2)],
+        normal=normal, tangent=tangent, arm_a=rng.standard_normal((c, 3)), arm_b=rng.standard_normal((c, 3)),
         contact_body=pairs[np.arange(c) % len(pairs)],
-    )
+    )  # fmt: skip
     joint = lv.Cones(
-        np.array([0, 2], np.int32),
-        np.zeros(1, np.int32),
-        np.full(2, -0.5),
-        np.full(2, np.inf),
+        np.array([0, 2], np.int32), np.zeros(1, np.int32), np.full(2, -0.5), np.full(2, np.inf), np.zeros(1),
         np.zeros(1),
-        np.zeros(1),
-    )
+    )  # fmt: skip
     cones = joint + cones
     m = cones.n_rows
     b = rng.standard_normal(m)

@@ -505,19 +505,10 @@ class Problem:
         seen = seen[(seen > 0) & np.isfinite(seen)]
         span = float(np.abs(np.log10(seen)).max(initial=0.0))
         return Judgement(
-            float(relative),
-            float(floor),
-            float(allowed),
-            float(unrefined),
-            float(100 * floor + unrefined),
-            float(energy),
-            float(velocity),
-            nothing,
-            span,
-            np.array(relatives, float),
-            np.array(floors, float),
+            float(relative), float(floor), float(allowed), float(unrefined), float(100 * floor + unrefined),
+            float(energy), float(velocity), nothing, span, np.array(relatives, float), np.array(floors, float),
             np.array([100 * floor + loss for floor, loss in zip(floors, losses, strict=True)], float),
-        )
+        )  # fmt: skip
 
     def _reference(self, rows, start, slack, error):
         """(E0, V0) of the rows of an island from the zero impulse, its slack and error; None if no row acts."""

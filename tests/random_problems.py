@@ -59,18 +59,11 @@ def random_bodies_and_contacts(rng, bodies=5, joints=3, contacts=8):
     tangent = np.array([np.cross(n, unit(rng)) for n in normal]).reshape(-1, 3)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     return Rows(
-        inv_mass=1.0 / mass,
-        inv_inertia=np.array(inertia),
-        v_free=rng.normal(size=(bodies, 6)),
-        jac=jac,
-        joint_ptr=ptr,
-        joint_body=joint_body,
-        normal=normal,
-        tangent=tangent,
-        arm_a=rng.normal(size=(contacts, 3)) * 0.5,
+        inv_mass=1.0 / mass, inv_inertia=np.array(inertia), v_free=rng.normal(size=(bodies, 6)), jac=jac, joint_ptr=ptr,
+        joint_body=joint_body, normal=normal, tangent=tangent, arm_a=rng.normal(size=(contacts, 3)) * 0.5,
         arm_b=rng.normal(size=(contacts, 3)) * 0.5,
         contact_body=np.array([draw_pair() for _ in range(contacts)], np.int32).reshape(-1, 2),
-    )
+    )  # fmt: skip
 
 
 def touching(contact_body, **fields):
@@ -104,18 +97,12 @@ def random_contact_problem(seed, friction="coulomb", tangents=None, spin=True, r
     high = np.where(bounded, rng.uniform(0.0, 0.5, mj), np.inf)
     m = mj + int(np.sum(np.broadcast_to(count, c))) + c * (1 + spin + 2 * rolling)
     return Problem.from_rows(
-        rows,
-        target=rng.normal(size=m) * 0.1,
-        lower=-high,
-        upper=high,
-        mu=rng.uniform(0.0, 1.2, c) * (np.broadcast_to(count, c) > 0 if not spin else 1.0),
-        tangents=count,
+        rows, target=rng.normal(size=m) * 0.1, lower=-high, upper=high,
+        mu=rng.uniform(0.0, 1.2, c) * (np.broadcast_to(count, c) > 0 if not spin else 1.0), tangents=count,
         patch_radius=rng.uniform(0.0, 0.4, c) if spin else None,
-        rolling=rng.uniform(0.0, 0.3, c) * (rng.random(c) < 0.8) if rolling else None,
-        friction=friction,
-        compliance=rng.uniform(0.0, 0.2, m) * (rng.random(m) < 0.5),
-        name=f"random {seed}",
-    )
+        rolling=rng.uniform(0.0, 0.3, c) * (rng.random(c) < 0.8) if rolling else None, friction=friction,
+        compliance=rng.uniform(0.0, 0.2, m) * (rng.random(m) < 0.5), name=f"random {seed}",
+    )  # fmt: skip
 
 
 def as_matrix(problem):

@@ -60,12 +60,9 @@ def test_option_line_pasted_into_a_model_gives_the_measured_options(options):
 
 def measured(time, error, **options):
     return Measured(
-        Setting(tuple(options.items()), iterations=options.get("iterations", 0)),
-        "Newton",
-        np.full(100, error),
-        np.zeros(10),
-        np.full(3, time),
-    )
+        Setting(tuple(options.items()), iterations=options.get("iterations", 0)), "Newton", np.full(100, error),
+        np.zeros(10), np.full(3, time),
+    )  # fmt: skip
 
 
 def html_of(tuning, folder):

@@ -104,15 +104,12 @@ def results_by_hand():
         return Result(problem, rows, "lcp", solver, peer, list(runs))
 
     return [
-        of("big", 2000, "pgs", False, (1.0, 1e-4), (4.0, 1e-10)),
-        of("big", 2000, "auto", False, (2.0, 1e-10)),
+        of("big", 2000, "pgs", False, (1.0, 1e-4), (4.0, 1e-10)), of("big", 2000, "auto", False, (2.0, 1e-10)),
         of("big", 2000, "pgs, from scratch", False, (3.0, 1e-10)),
-        of("big", 2000, "osqp", True, (10.0, 1e-7), (40.0, 1e-11)),
-        of("small", 8, "pgs", False, (6.0, 1e-7)),
-        of("small", 8, "auto", False, (8.0, 1e-7)),
-        of("small", 8, "daqp", True, (2.0, 1e-12)),
+        of("big", 2000, "osqp", True, (10.0, 1e-7), (40.0, 1e-11)), of("small", 8, "pgs", False, (6.0, 1e-7)),
+        of("small", 8, "auto", False, (8.0, 1e-7)), of("small", 8, "daqp", True, (2.0, 1e-12)),
         of("small", 8, "osqp", True, (1.0, 1e-2)),
-    ]
+    ]  # fmt: skip
 
 
 def test_ratios_means_and_losses():

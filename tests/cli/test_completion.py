@@ -6,13 +6,10 @@ from click.shell_completion import ShellComplete
 from lavender.cli.entry import cli
 
 HAS_ALL_NAMES = {
-    "solve x.npz --solver": ("pg", {"pgs"}),
-    "report --solvers": ("auto,sequential_imp", {"auto,sequential_impulses"}),
-    "check --solvers": ("nn", {"nncg"}),
-    "run": ("four_b", {"four_bar"}),
-    "run stack --solver": ("ad", {"admm"}),
+    "solve x.npz --solver": ("pg", {"pgs"}), "report --solvers": ("auto,sequential_imp", {"auto,sequential_impulses"}),
+    "check --solvers": ("nn", {"nncg"}), "run": ("four_b", {"four_bar"}), "run stack --solver": ("ad", {"admm"}),
     "audit model.xml --engine": ("mujo", {"mujoco", "mujoco_warp"}),
-}
+}  # fmt: skip
 
 
 def complete(words, incomplete):

@@ -13,37 +13,20 @@ COMMANDS_PAGE = Path(__file__).resolve().parents[2] / "docs" / "commands.md"
 AIR = '<mujoco><worldbody><body><freejoint/><geom size="1" friction="1"/></body></worldbody></mujoco>'
 #: (code, command). FOLDER contains an unreadable file.
 ENDS = [
-    (0, "solve PROBLEM"),
-    (1, "solve PROBLEM --solver pgs --max-iter 1"),
-    (3, "solve INFEASIBLE --solver direct"),
-    (2, "solve PROBLEM --solver nobody"),
-    (0, "check PROBLEM --solvers pgs,newton"),
-    (0, "check PROBLEM"),
+    (0, "solve PROBLEM"), (1, "solve PROBLEM --solver pgs --max-iter 1"), (3, "solve INFEASIBLE --solver direct"),
+    (2, "solve PROBLEM --solver nobody"), (0, "check PROBLEM --solvers pgs,newton"), (0, "check PROBLEM"),
     (1, "check PROBLEM --solvers newton,pgs --tol 1e-12 --time-limit 1e-9"),
-    (1, "check PROBLEM --time-limit 1e-9 --solvers pgs"),
-    (1, "check FOLDER --solvers newton"),
-    (2, "check PROBLEM --solvers nobody"),
-    (0, "explain PROBLEM"),
-    (1, "explain FOLDER"),
-    (2, "explain nothing.npz"),
+    (1, "check PROBLEM --time-limit 1e-9 --solvers pgs"), (1, "check FOLDER --solvers newton"),
+    (2, "check PROBLEM --solvers nobody"), (0, "explain PROBLEM"), (1, "explain FOLDER"), (2, "explain nothing.npz"),
     (0, "report PROBLEM --solvers pgs --tolerances 1e-3 --budgets 2 --repeats 1 --no-figures"),
     (0, "report PROBLEM --solvers pgs --tolerances 1e-12 --time-limit 1e-9 --budgets 2 --repeats 1 --no-figures"),
     (1, "report FOLDER --solvers pgs --tolerances 1e-3 --budgets 2 --repeats 1 --no-figures"),
-    (2, "report nothing.npz"),
-    (0, "doctor PROBLEM"),
-    (1, "doctor FOLDER"),
-    (2, "doctor nothing.npz"),
-    (0, "solvers"),
-    (0, "contract sor --list"),
-    (2, "contract nobody"),
-    (0, "run stack --steps 2"),
-    (1, "run stack --steps 9 --set gravity=1e60 --set dt=1e60 --set mass=1e60 --set substeps=60"),
-    (2, "run nowhere"),
-    (2, "view nothing.npz"),
-    (2, "export c PROBLEM"),
-    (1, "check granularF(n=3) --solvers sor"),
+    (2, "report nothing.npz"), (0, "doctor PROBLEM"), (1, "doctor FOLDER"), (2, "doctor nothing.npz"), (0, "solvers"),
+    (0, "contract sor --list"), (2, "contract nobody"), (0, "run stack --steps 2"),
+    (1, "run stack --steps 9 --set gravity=1e60 --set dt=1e60 --set mass=1e60 --set substeps=60"), (2, "run nowhere"),
+    (2, "view nothing.npz"), (2, "export c PROBLEM"), (1, "check granularF(n=3) --solvers sor"),
     (0, "check granularF(n=3) --solvers sor newton"),
-]
+]  # fmt: skip
 #: Commands with a wrong word, number or combination of options.
 WRONG = """
 nocommand | slove PROBLEM | report --solvers pgz | report no/such.npz | report stak(n=8) | report --tolerances 0
@@ -67,12 +50,9 @@ tune AIR --worlds 2 --steps 2 --max-velocity-error -1
 """
 #: Commands that need MuJoCo; AIR is a model whose body touches nothing.
 MUJOCO_ENDS = [
-    (1, "slip AIR"),
-    (2, "slip nothing.xml"),
-    (2, "record AIR --steps 1 --out recorded"),
-    (1, "tune AIR --worlds 2 --steps 10 --repeats 1"),
-    (2, "audit nothing.xml"),
-]
+    (1, "slip AIR"), (2, "slip nothing.xml"), (2, "record AIR --steps 1 --out recorded"),
+    (1, "tune AIR --worlds 2 --steps 10 --repeats 1"), (2, "audit nothing.xml"),
+]  # fmt: skip
 
 
 def split_lines(text):

@@ -508,17 +508,10 @@ def test_records_of_any_content_are_shown_or_rejected(tmp_path, entries, kind):
 @pytest.mark.parametrize(
     "text",
     [
-        "[" * 100_000,
-        '{"kind": ' * 5000,
-        "1" * 5000,
-        '{"kind": ["run"]}',
-        '{"kind": {}}',
-        "null",
-        '"run"',
-        "\x00\x00",
+        "[" * 100_000, '{"kind": ' * 5000, "1" * 5000, '{"kind": ["run"]}', '{"kind": {}}', "null", '"run"', "\x00\x00",
         "\ufffe",
     ],
-)
+)  # fmt: skip
 def test_read_records_of_a_malformed_line_names_its_number(tmp_path, text):
     (tmp_path / "records.jsonl").write_text(f"{text}\n")
     with pytest.raises(lv.InputError, match="line 1"):

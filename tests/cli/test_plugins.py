@@ -51,13 +51,9 @@ def install(tmp_path):
 
 def test_solvers_with_broken_plug_ins_reports_each_once_and_lists_the_rest(install):
     environment = install(
-        "good = plugin_module:GOOD",
-        "alias = plugin_module:OTHER",
-        "taken = plugin_module:TAKEN",
-        "leave = plugin_module:leave",
-        "misspelt = plugin_module:misspelt",
-        "no_colon = plugin_module:",
-    )
+        "good = plugin_module:GOOD", "alias = plugin_module:OTHER", "taken = plugin_module:TAKEN",
+        "leave = plugin_module:leave", "misspelt = plugin_module:misspelt", "no_colon = plugin_module:",
+    )  # fmt: skip
     done = python("-m", "lavender", "solvers", env=environment)
     warnings = done.stderr.splitlines()
     expected = (
@@ -93,17 +89,9 @@ def test_solve_with_a_plug_in_that_ends_its_process_names_the_solver(install):
 
 def test_records_of_a_plug_in_have_the_version_of_its_package(install, tmp_path):
     words = (
-        "report",
-        "toy_stack",
-        "--solvers",
-        "good",
-        "pgs",
-        "--repeats",
-        "1",
-        "--no-figures",
-        "--out",
+        "report", "toy_stack", "--solvers", "good", "pgs", "--repeats", "1", "--no-figures", "--out",
         str(tmp_path / "o"),
-    )
+    )  # fmt: skip
     python("-m", "lavender", *words, env=install("good = plugin_module:GOOD"))
     runs = lv.report.select_runs(lv.report.read(tmp_path / "o"))
     assert len(runs) and runs["versions"].astype(str).str.contains("many-solvers 1.2").all()

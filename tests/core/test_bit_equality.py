@@ -110,19 +110,16 @@ def solve_after_a_residual(problem, name, **options):
 
 #: Ways to solve a problem of which nothing was derived before.
 WAYS = {
-    "prepared": prepare_and_solve,
-    "prepared for other numbers": prepare_other_numbers,
-    "prepared for another structure": prepare_another_structure,
-    "a copy of what was prepared": prepare_and_copy,
+    "prepared": prepare_and_solve, "prepared for other numbers": prepare_other_numbers,
+    "prepared for another structure": prepare_another_structure, "a copy of what was prepared": prepare_and_copy,
     "a pickled problem": lambda p, name, **more: lv.solve(pickle.loads(pickle.dumps(p)), name, **more),
-    "judged before": solve_after_a_residual,
-    "one of a list": lambda p, name, **more: lv.solve_many([p], name, **more)[0],
-    "a list and two threads": lambda p, name, **more: lv.solve_many([p] * 3, name, threads=2, **more)[2],
-    "eight threads": solve_in_eight_threads,
+    "judged before": solve_after_a_residual, "one of a list": lambda p, name,
+    **more: lv.solve_many([p], name, **more)[0], "a list and two threads": lambda p, name,
+    **more: lv.solve_many([p] * 3, name, threads=2, **more)[2], "eight threads": solve_in_eight_threads,
     "a time limit that does not bind": lambda p, name, **more: lv.solve(p, name, time_limit=600.0, **more),
     "a list and a time limit": lambda p, name, **more: lv.solve_many([p], name, time_limit=600.0, **more)[0],
     "a callback": solve_with_a_callback,
-}
+}  # fmt: skip
 
 
 @functools.cache

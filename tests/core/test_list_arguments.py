@@ -47,17 +47,9 @@ def test_empty_lists_mean_no_contacts_joints_or_bodies(bodies: int) -> None:
     """A loop over the contacts of a step gives empty lists if there are none."""
     mass, inertia, free = [1.0] * bodies, [np.eye(3)] * bodies, [np.ones(6)] * bodies
     rows = lv.Rows(
-        mass,
-        inertia,
-        free,
-        jac=EMPTY,
-        joint_body=EMPTY,
-        contact_body=EMPTY,
-        normal=EMPTY,
-        tangent=EMPTY,
-        arm_a=EMPTY,
+        mass, inertia, free, jac=EMPTY, joint_body=EMPTY, contact_body=EMPTY, normal=EMPTY, tangent=EMPTY, arm_a=EMPTY,
         arm_b=EMPTY,
-    )
+    )  # fmt: skip
     assert rows == lv.Rows(np.ones(bodies), np.tile(np.eye(3), (bodies, 1, 1)), np.ones((bodies, 6)))
     problem = lv.Problem.from_rows(rows, target=EMPTY, mu=EMPTY)
     assert problem.m == 0 and lv.solve(problem).success

@@ -71,23 +71,19 @@ def set_array(key, values):
 
 
 MISTAKES = {
-    "struct of another version": (set_field("size", 8), "VERSION"),
-    "form": (set_field("form", 9), "OPTION"),
-    "law": (set_field("law", 5), "OPTION"),
-    "rows below 0": (set_field("n_rows", -3), "COUNT"),
+    "struct of another version": (set_field("size", 8), "VERSION"), "form": (set_field("form", 9), "OPTION"),
+    "law": (set_field("law", 5), "OPTION"), "rows below 0": (set_field("n_rows", -3), "COUNT"),
     "fewer rows than blocks": (set_field("n_rows", 3), "COUNT"),
     "entries below 0": (set_field("n_entries", -1), "COUNT"),
     "more joints than blocks": (set_field("n_joints", 99), "COUNT"),
     "joints that are contacts": (set_field("n_joints", 2), "BLOCKS"),
     "blocks that do not end": (change("block_ptr", -1, 35), "BLOCKS"),
     "blocks that go back": (change("block_ptr", 3, 1), "BLOCKS"),
-    "a block far away": (change("block_ptr", 4, 2**30), "BLOCKS"),
-    "no such kind": (change("kind", 2, 7), "BLOCKS"),
+    "a block far away": (change("block_ptr", 4, 2**30), "BLOCKS"), "no such kind": (change("kind", 2, 7), "BLOCKS"),
     "friction below 0": (change("mu", 1, -0.1), "FRICTION"),
     "friction not a number": (change("mu", 1, np.nan), "FRICTION"),
     "a body that is not there": (change("contact_body", 5, 3), "INDEX"),
-    "a body below the world": (change("contact_body", 5, -2), "INDEX"),
-    "NaN in b": (change("b", 0, np.nan), "NUMBER"),
+    "a body below the world": (change("contact_body", 5, -2), "INDEX"), "NaN in b": (change("b", 0, np.nan), "NUMBER"),
     "an infinite normal": (change("normal", 4, np.inf), "NUMBER"),
     "NaN in an inertia": (change("inv_inertia", 9, np.nan), "NUMBER"),
     "a mass below 0": (change("inv_mass", 1, -1.0), "MASS"),
@@ -98,8 +94,7 @@ MISTAKES = {
     "a normal of length 2": (change("normal", 14, 2.0), "FRAME"),
     "a tangent along the normal": (change("tangent", 14, 0.6), "FRAME"),
     "a body that touches itself": (change("contact_body", 10, 1), "PAIR"),
-    "two static bodies": (change("contact_body", 1, -1), "PAIR"),
-    "no masses": (set_field("inv_mass", None), "NULL"),
+    "two static bodies": (change("contact_body", 1, -1), "PAIR"), "no masses": (set_field("inv_mass", None), "NULL"),
     "no normals": (set_field("normal", None), "NULL"),
     "no bodies of contacts": (set_field("contact_body", None), "NULL"),
     "rolling below 0": (set_array("rolling", [-0.1] * 12), "FRICTION"),
@@ -107,7 +102,7 @@ MISTAKES = {
     "rows that do not roll": (change("kind", 2, 5), "BLOCKS"),
     "a box of one tangent": (lambda q: (change("kind", 2, 4)(q), change("block_ptr", 3, 8)(q)), "BLOCKS"),
     "an order with a block twice": (change("order", 1, 0), "INDEX"),
-}
+}  # fmt: skip
 
 
 #: Mistakes of several numbers, with their count: any of these is named.

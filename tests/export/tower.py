@@ -13,15 +13,11 @@ def self_test_problem():
     for v in velocity:
         v[2] = -9.81 / 60.0
     rows = lv.Rows(
-        inv_mass=inv_mass,
-        inv_inertia=inertia,
-        v_free=velocity,
-        contact_body=[(c // 4 - 1, c // 4) for c in range(12)],
-        normal=[(0.0, 0.0, 1.0)] * 12,
-        tangent=[(0.6, 0.8, 0.0)] * 12,
+        inv_mass=inv_mass, inv_inertia=inertia, v_free=velocity, contact_body=[(c // 4 - 1, c // 4) for c in range(12)],
+        normal=[(0.0, 0.0, 1.0)] * 12, tangent=[(0.6, 0.8, 0.0)] * 12,
         arm_a=[(0.0, 0.0, 0.0) if c < 4 else (*side[c % 4], 0.5) for c in range(12)],
         arm_b=[(*side[c % 4], -0.5) for c in range(12)],
-    )
+    )  # fmt: skip
     return lv.Problem.from_rows(rows, mu=[0.1 + 0.05 * c for c in range(12)])
 
 

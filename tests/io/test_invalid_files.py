@@ -66,17 +66,10 @@ def write_npz(path, method=zipfile.ZIP_DEFLATED, **entries):
 
 META = {"operator": "dense", "friction": "coulomb", "name": "", "names": None}
 OWN = {
-    "lavender_format": np.int64(1),
-    "meta": np.frombuffer(json.dumps(META).encode(), np.uint8),
-    "b": np.zeros(2),
-    "cones_ptr": [0, 1, 2],
-    "cones_kind": [0, 0],
-    "cones_lower": np.zeros(2),
-    "cones_upper": np.ones(2),
-    "cones_mu": np.zeros(2),
-    "cones_patch_radius": np.zeros(2),
-    "A": np.eye(2),
-}
+    "lavender_format": np.int64(1), "meta": np.frombuffer(json.dumps(META).encode(), np.uint8), "b": np.zeros(2),
+    "cones_ptr": [0, 1, 2], "cones_kind": [0, 0], "cones_lower": np.zeros(2), "cones_upper": np.ones(2),
+    "cones_mu": np.zeros(2), "cones_patch_radius": np.zeros(2), "A": np.eye(2),
+}  # fmt: skip
 
 
 def hdf5(path, parts):

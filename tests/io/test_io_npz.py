@@ -169,13 +169,8 @@ def test_an_archive_that_hides_its_size_is_refused(tmp_path):
 
 def test_a_program_with_a_singular_hessian_comes_back_and_its_form_is_checked(tmp_path):
     given = {
-        "P": np.diag([1.0, 0.0]),
-        "q": [1.0, -1.0],
-        "A": [[1.0, 2.0]],
-        "b": [1.0],
-        "lb": [0.0, 0.0],
-        "ub": [9.0, 9.0],
-    }
+        "P": np.diag([1.0, 0.0]), "q": [1.0, -1.0], "A": [[1.0, 2.0]], "b": [1.0], "lb": [0.0, 0.0], "ub": [9.0, 9.0],
+    }  # fmt: skip
     problem = lv.Problem.from_qp(**given)
     loaded = lavender.io.load(own(tmp_path, problem))
     answer, before = lv.solve_qp(loaded), lv.solve_qp(problem)
@@ -259,13 +254,10 @@ OF |= dict.fromkeys(("rows_", "compliance"), random_contact_problem(1))
         ({"lavender_format": np.int64(2)}, "this lavender reads 1"),
         ({"lavender_format": np.bool_(True)}, "this lavender reads 1"),
         ({"lavender_format": np.array("1.0")}, "this lavender reads 1"),
-        ({"lavender_format": np.array([1, 1])}, "one value"),
-        ({"b": None}, "entries b are missing"),
+        ({"lavender_format": np.array([1, 1])}, "one value"), ({"b": None}, "entries b are missing"),
         ({"A": None, "cones_mu": None}, "entries cones_mu, A are missing"),
-        ({"extra": np.zeros(1)}, "extra do not belong"),
-        ({"meta": np.frombuffer(b"{", np.uint8)}, "JSON"),
-        ({"meta": np.frombuffer(b"\xff\xfe", np.uint8)}, "JSON"),
-        ({"meta": np.zeros(3)}, "JSON"),
+        ({"extra": np.zeros(1)}, "extra do not belong"), ({"meta": np.frombuffer(b"{", np.uint8)}, "JSON"),
+        ({"meta": np.frombuffer(b"\xff\xfe", np.uint8)}, "JSON"), ({"meta": np.zeros(3)}, "JSON"),
         ({"meta": np.frombuffer(b"[" * 100_000, np.uint8)}, "JSON"),
         ({"meta": META | {"operator": "magic"}}, "operator is 'magic'"),
         ({"meta": META | {"names": "abc"}}, "names is 'abc'"),
@@ -276,33 +268,24 @@ OF |= dict.fromkeys(("rows_", "compliance"), random_contact_problem(1))
         ({"meta": META | {"names": ["one"]}}, "entries for 12 blocks"),
         ({"meta": META | {"program": 2}}, "program is 2; a number of variables, with the operator csr"),
         ({"meta": META | {"operator": "csr", "program": True}}, "program is True; a number of variables"),
-        ({"b": np.full(12, np.nan)}, "finite"),
-        ({"b": np.array(["1"] * 12)}, "numbers are needed"),
-        ({"b": np.zeros(11)}, "b .*shape"),
-        ({"A": np.zeros((12, 11))}, "A .*shape"),
-        ({"key": np.zeros(12)}, "key"),
-        ({"guess": np.zeros(3)}, "guess"),
-        ({"impulse": np.zeros(3)}, "impulse"),
-        ({"cones_ptr": np.arange(13)[::-1]}, "cones.ptr"),
-        ({"cones_lower": np.full(12, np.nan)}, "NaN"),
+        ({"b": np.full(12, np.nan)}, "finite"), ({"b": np.array(["1"] * 12)}, "numbers are needed"),
+        ({"b": np.zeros(11)}, "b .*shape"), ({"A": np.zeros((12, 11))}, "A .*shape"), ({"key": np.zeros(12)}, "key"),
+        ({"guess": np.zeros(3)}, "guess"), ({"impulse": np.zeros(3)}, "impulse"),
+        ({"cones_ptr": np.arange(13)[::-1]}, "cones.ptr"), ({"cones_lower": np.full(12, np.nan)}, "NaN"),
         ({"A_indices": np.array([0, 1, 9, 3], np.int32)}, "column indices from 0 to 9"),
         ({"A_indices": np.array([0, 1, -1, 3], np.int32)}, "column indices from -1 to 3"),
         ({"A_indptr": np.array([0, 3, 2, 3, 4], np.int32)}, "pointers"),
         ({"A_indptr": np.array([0, 1, 2, 3, 2**30], np.int32)}, "announce 1073741824 entries"),
         ({"A_indptr": np.array([1, 1, 2, 3, 4], np.int32)}, "pointers"),
-        ({"A_indptr": np.array([0, 4], np.int32)}, "pointers"),
-        ({"A_indptr": np.array([0.0, 1, 2, 3, 4])}, "pointers"),
-        ({"A_data": np.zeros((2, 2))}, "values"),
-        ({"A_shape": np.array([2**31, 2**31])}, "A_shape"),
-        ({"A_shape": np.array([4])}, "A_shape"),
-        ({"rows_contact_body": np.full((8, 2), 99, np.int32)}, "body 99"),
+        ({"A_indptr": np.array([0, 4], np.int32)}, "pointers"), ({"A_indptr": np.array([0.0, 1, 2, 3, 4])}, "pointers"),
+        ({"A_data": np.zeros((2, 2))}, "values"), ({"A_shape": np.array([2**31, 2**31])}, "A_shape"),
+        ({"A_shape": np.array([4])}, "A_shape"), ({"rows_contact_body": np.full((8, 2), 99, np.int32)}, "body 99"),
         ({"rows_joint_body": np.full((3, 2), -2, np.int32)}, "body -2"),
         ({"rows_joint_ptr": np.array([0, 2**31 - 1], np.int32)}, "jac"),
-        ({"rows_normal": np.zeros((8, 3))}, "unit vectors"),
-        ({"rows_arm_a": np.zeros((7, 3))}, "arm_a"),
+        ({"rows_normal": np.zeros((8, 3))}, "unit vectors"), ({"rows_arm_a": np.zeros((7, 3))}, "arm_a"),
         ({"compliance": np.full(1, -1.0)}, "compliance"),
     ],
-)
+)  # fmt: skip
 def test_load_of_an_inconsistent_npz_names_the_entry(tmp_path, changes, sign):
     changes = {
         n: np.frombuffer(json.dumps(v).encode(), np.uint8) if isinstance(v, dict) else v for n, v in changes.items()
@@ -317,25 +300,17 @@ def test_load_of_an_inconsistent_npz_names_the_entry(tmp_path, changes, sign):
 @pytest.mark.parametrize(
     ("entry", "sign"),
     [
-        (npy("<f8", (2**60,)), "declares"),
-        (npy("<f8", (2**40, 2**40)), "declares"),
-        (npy("<f8", (12,), bytes(95)), "declares"),
-        (npy("<f8", (12,), bytes(97)), "declares"),
-        (npy("<f8", (-12,), b""), "shape"),
-        (npy("<f8", (True, 12), bytes(96)), "integer|shape"),
-        (npy("<f8", 12, bytes(96)), "shape"),
-        (npy([("x", "<f8")], (12,), bytes(96)), "plain numbers are needed"),
-        (npy("<c16", (6,), bytes(96)), "numbers are needed"),
-        (npy("<M8[s]", (12,), bytes(96)), "numbers are needed"),
-        (npy("nonsense", (12,), bytes(96)), "cannot be read"),
-        (npy("<f8", (12,), bytes(96), version=4), "version 1.0"),
+        (npy("<f8", (2**60,)), "declares"), (npy("<f8", (2**40, 2**40)), "declares"),
+        (npy("<f8", (12,), bytes(95)), "declares"), (npy("<f8", (12,), bytes(97)), "declares"),
+        (npy("<f8", (-12,), b""), "shape"), (npy("<f8", (True, 12), bytes(96)), "integer|shape"),
+        (npy("<f8", 12, bytes(96)), "shape"), (npy([("x", "<f8")], (12,), bytes(96)), "plain numbers are needed"),
+        (npy("<c16", (6,), bytes(96)), "numbers are needed"), (npy("<M8[s]", (12,), bytes(96)), "numbers are needed"),
+        (npy("nonsense", (12,), bytes(96)), "cannot be read"), (npy("<f8", (12,), bytes(96), version=4), "version 1.0"),
         (b"\x93NUMPY\x01\x00\xff\xff" + b" " * 65535, "header"),
         (b"\x93NUMPY\x01\x00\x10\x00" + b"(" * 16, "cannot be read"),
-        (b"\x93NUMPY\x02\x00\xff\xff\xff\xff", "version 1.0"),
-        (b"", "magic"),
-        (b"\x93NUM", "magic"),
+        (b"\x93NUMPY\x02\x00\xff\xff\xff\xff", "version 1.0"), (b"", "magic"), (b"\x93NUM", "magic"),
     ],
-)
+)  # fmt: skip
 def test_load_of_npz_entries_with_false_headers_raises(tmp_path, entry, sign):
     with pytest.raises(lv.InputError, match=sign):
         lavender.io.load(own(tmp_path, b=entry))
@@ -344,10 +319,8 @@ def test_load_of_npz_entries_with_false_headers_raises(tmp_path, entry, sign):
 @pytest.mark.parametrize(
     ("changes", "sign"),
     [
-        ({"A": None}, "no entry 'A_shape'"),
-        ({"lo": np.zeros(6)}, "'lo'"),
-        ({"lo": np.full(7, 1.0), "hi": np.zeros(7)}, "lower <= upper"),
-        ({"b": np.zeros((7, 1))}, "one dimension"),
+        ({"A": None}, "no entry 'A_shape'"), ({"lo": np.zeros(6)}, "'lo'"),
+        ({"lo": np.full(7, 1.0), "hi": np.zeros(7)}, "lower <= upper"), ({"b": np.zeros((7, 1))}, "one dimension"),
         ({"cone_start": [5], "cone_dim": [3], "cone_mu": [0.5]}, "within rows 0 to 6"),
         ({"cone_start": [-1], "cone_dim": [3], "cone_mu": [0.5]}, "within rows 0 to 6"),
         ({"cone_start": [0, 2], "cone_dim": [3, 3], "cone_mu": [0.5, 0.5]}, "overlap"),
@@ -358,10 +331,9 @@ def test_load_of_npz_entries_with_false_headers_raises(tmp_path, entry, sign):
         ({"cone_start": [0.5], "cone_dim": [3], "cone_mu": [0.5]}, "'cone_start' holds"),
         ({"cone_start": [0], "cone_dim": [2.5], "cone_mu": [0.5]}, "'cone_dim' holds"),
         ({"cone_start": [np.nan], "cone_dim": [3], "cone_mu": [0.5]}, "'cone_start' holds"),
-        ({"l_ref": np.zeros(3)}, "l_ref"),
-        ({"A": np.full((7, 7), np.inf)}, "finite"),
+        ({"l_ref": np.zeros(3)}, "l_ref"), ({"A": np.full((7, 7), np.inf)}, "finite"),
     ],
-)
+)  # fmt: skip
 def test_load_of_a_wrong_box_file_names_the_entry(tmp_path, changes, sign):
     with pytest.raises(lv.InputError, match=sign):
         lavender.io.load(box(tmp_path, **changes))

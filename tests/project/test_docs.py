@@ -152,11 +152,8 @@ def anchors(page):
 
 
 LINKED = [
-    *PAGES,
-    ROOT / "CHANGELOG.md",
-    *sorted((ROOT / ".github").glob("*.md")),
-    *sorted((ROOT / "examples").rglob("*.md")),
-]
+    *PAGES, ROOT / "CHANGELOG.md", *sorted((ROOT / ".github").glob("*.md")), *sorted((ROOT / "examples").rglob("*.md")),
+]  # fmt: skip
 
 
 def links(page):

@@ -87,12 +87,9 @@ def nearly_singular(seed):
     spread, turn = least ** rng.random(n), np.linalg.qr(rng.normal(size=(n, n)))[0]
     load, chain = rng.normal(size=(n, 1 + n // 3)), np.diff(np.eye(n), axis=0)
     P = (
-        (turn * spread) @ turn.T,
-        np.diag(spread),
-        np.diag(np.where(rng.random(n) < 0.5, 1.0, least)),
-        load @ load.T / n + least * np.eye(n),
-        chain.T @ chain + least * np.eye(n),
-    )[seed % 5]
+        (turn * spread) @ turn.T, np.diag(spread), np.diag(np.where(rng.random(n) < 0.5, 1.0, least)),
+        load @ load.T / n + least * np.eye(n), chain.T @ chain + least * np.eye(n),
+    )[seed % 5]  # fmt: skip
     G, x = rng.normal(size=(int(rng.integers(n, 4 * n)), n)), rng.normal(size=n)
     qp = dict.fromkeys(NAMES) | {"P": 0.5 * (P + P.T), "q": rng.normal(size=n), "G": G}
     qp["h"] = G @ x + rng.exponential(size=len(G)) * rng.integers(0, 2, len(G))

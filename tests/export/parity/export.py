@@ -29,13 +29,9 @@ from lavender_ext.engine.arrays import make_array_views  # noqa: E402
 ORDERS = ("symmetric", "random", "reverse")
 #: Tolerance, iterations and options of each solver.
 SOLVED = {
-    "jacobi": [(0.0, 9, {})],
-    "block_gauss_seidel": [(0.0, 9, {})],
-    "anderson": [(0.0, 40, {})],
-    "nncg": [(0.0, 40, {})],
-    "newton": [(1e-8, 100, {})],
-    "direct": [(1e-8, 100, {})],
-}
+    "jacobi": [(0.0, 9, {})], "block_gauss_seidel": [(0.0, 9, {})], "anderson": [(0.0, 40, {})],
+    "nncg": [(0.0, 40, {})], "newton": [(1e-8, 100, {})], "direct": [(1e-8, 100, {})],
+}  # fmt: skip
 
 
 def numbers(*values):

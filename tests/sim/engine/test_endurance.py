@@ -80,13 +80,9 @@ def test_energy_is_that_of_the_textbook():
     half = np.sqrt(0.5)
     scene.add_plane()
     scene.add_box(
-        (1, 2, 3),
-        12.0,
-        position=(0, 0, 5),
-        quaternion=(half, 0, 0, half),
-        velocity=(3, 0, 4),
+        (1, 2, 3), 12.0, position=(0, 0, 5), quaternion=(half, 0, 0, half), velocity=(3, 0, 4),
         angular_velocity=(0, 2, 0),
-    )
+    )  # fmt: skip
     observation = lv.Simulation(scene).reset()[0]
     expected = 0.5 * 12 * 25 + 0.5 * (4 + 9) * 4 + 12 * 10 * 5
     assert energy(scene, observation) == pytest.approx(expected, rel=1e-14)

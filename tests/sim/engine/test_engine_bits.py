@@ -13,16 +13,10 @@ from lavender.sim.engine.state import State
 from lavender_ext.host import memory
 
 SCENES = {
-    "stack": {},
-    "pyramid": {"base": 4, "friction_shape": "box"},
-    "chain": {"n": 8},
-    "spinner": {},
-    "ramp": {"rolling_radius": 0.01},
-    "four_bar": {"motor": 1.0},
-    "bridge": {"n": 6},
-    "pile": {"n": 20, "kind": "mixed", "rolling_radius": 0.03, "patch_radius": 0.05},
-    "card_house": {},
-}
+    "stack": {}, "pyramid": {"base": 4, "friction_shape": "box"}, "chain": {"n": 8}, "spinner": {},
+    "ramp": {"rolling_radius": 0.01}, "four_bar": {"motor": 1.0}, "bridge": {"n": 6},
+    "pile": {"n": 20, "kind": "mixed", "rolling_radius": 0.03, "patch_radius": 0.05}, "card_house": {},
+}  # fmt: skip
 
 
 def trajectory(sim, steps):

@@ -13,18 +13,10 @@ import lavender as lv
 from lavender_ext.newton.warm_start import FACTORED
 
 SCENES = [
-    ("stack", {"n": 5}),
-    ("stack", {"n": 4, "friction": 0.0}),
-    ("stack", {"n": 4, "patch_radius": 0.1}),
-    ("pyramid", {"base": 5}),
-    ("pyramid", {"base": 5, "friction": 0.15}),
-    ("ramp", {}),
-    ("chain", {"n": 12}),
-    ("bridge", {"n": 5}),
-    ("four_bar", {}),
-    ("newtons_cradle", {"substeps": 1}),
-    ("pile", {"n": 12}),
-]
+    ("stack", {"n": 5}), ("stack", {"n": 4, "friction": 0.0}), ("stack", {"n": 4, "patch_radius": 0.1}),
+    ("pyramid", {"base": 5}), ("pyramid", {"base": 5, "friction": 0.15}), ("ramp", {}), ("chain", {"n": 12}),
+    ("bridge", {"n": 5}), ("four_bar", {}), ("newtons_cradle", {"substeps": 1}), ("pile", {"n": 12}),
+]  # fmt: skip
 
 
 def impulses(sim, observation):
@@ -80,14 +72,10 @@ def problem_in(scene, step, **parameters):
 @pytest.mark.parametrize(
     ("scene", "step", "parameters"),
     [
-        ("pyramid", 1, {}),
-        ("pyramid", 3, {"friction": 0.2}),
-        ("pyramid", 12, {"friction": 0.2}),
-        ("card_house", 1, ONE),
-        ("card_house", 3, ONE),
-        ("table", 3, {"friction": 1.0, **ONE}),
+        ("pyramid", 1, {}), ("pyramid", 3, {"friction": 0.2}), ("pyramid", 12, {"friction": 0.2}),
+        ("card_house", 1, ONE), ("card_house", 3, ONE), ("table", 3, {"friction": 1.0, **ONE}),
     ],
-)
+)  # fmt: skip
 def test_redundant_contacts_at_rest(scene, step, parameters):
     problem = problem_in(scene, step, **parameters)
     assert problem.law == "coulomb"

@@ -234,13 +234,10 @@ def test_recorded_problems_are_the_problems_of_the_steps(tmp_path):
 @pytest.mark.parametrize(
     ("parameters", "order"),
     [
-        ({}, "alternating"),
-        *(({"order": order}, order) for order in SCENE_ORDERS),
-        ({"solver": "pgs"}, "given"),
-        ({"solver": "pgs", "solver_options": {"order": "reverse"}}, "reverse"),
-        ({"solver": "newton"}, None),
+        ({}, "alternating"), *(({"order": order}, order) for order in SCENE_ORDERS), ({"solver": "pgs"}, "given"),
+        ({"solver": "pgs", "solver_options": {"order": "reverse"}}, "reverse"), ({"solver": "newton"}, None),
     ],
-)
+)  # fmt: skip
 def test_step_reports_the_order_of_its_sweeps(parameters, order):
     sim = lv.Simulation(lv.Scene("stack", n=2, **parameters))
     assert sim.reset()[1]["order"] == sim.step()[-1]["order"] == order

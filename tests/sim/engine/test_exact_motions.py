@@ -288,16 +288,13 @@ def test_limits_of_overhang_and_arch_equal_those_of_a_linear_program(make, limit
 @pytest.mark.parametrize(
     ("scene", "stands"),
     [
-        (lambda: make_overhang(0.98, 10, **NEWTON), True),
-        (lambda: make_overhang(1.02, 10, **NEWTON), False),
-        (lambda: make_overhang(0.98, 5), True),
-        (lambda: make_arch(1.05), True),
-        (lambda: make_arch(0.95), False),
+        (lambda: make_overhang(0.98, 10, **NEWTON), True), (lambda: make_overhang(1.02, 10, **NEWTON), False),
+        (lambda: make_overhang(0.98, 5), True), (lambda: make_arch(1.05), True), (lambda: make_arch(0.95), False),
         (lambda: lv.Scene("heavy_on_light", n=3, ratio=1e4, gravity=G, dt=DT, friction=0.5, **NEWTON), True),
         (lambda: lv.Scene("heavy_on_light", n=3, ratio=100.0, gravity=G, dt=DT, friction=0.5), True),
     ],
     ids=["overhang 10", "too far 10", "overhang 5, sweeps", "arch", "too thin", "heavy newton", "heavy sweeps"],
-)
+)  # fmt: skip
 def test_structure_stands_exactly_if_statics_allows(scene, stands):
     _, x, _, _ = record(scene(), 8.0)
     drop = (x[0] - x[-1])[:, 2].max()

@@ -26,20 +26,12 @@ def test_scene_of_one_box_gives_the_documented_observation():
 @pytest.mark.parametrize(
     ("name", "more", "bodies", "contacts", "rows"),
     [
-        ("stack", {"friction": 0.0}, 7, 24, 24),
-        ("stack", {}, 7, 24, 72),
-        ("stack", {"patch_radius": 0.1}, 7, 24, 96),
-        ("pyramid", {"base": 10}, 56, 400, 1200),
-        ("table", {}, 11, 72, 216),
-        ("heavy_on_light", {}, 3, 8, 24),
-        ("ramp", {}, 2, 4, 12),
-        ("spinner", {}, 2, 1, 4),
-        ("chain", {"n": 7}, 7, 0, 21),
-        ("bridge", {"n": 4, "load": 0.0}, 4, 0, 25),
-        ("four_bar", {}, 3, 0, 20),
-        ("four_bar", {"motor": 1.0}, 3, 0, 21),
+        ("stack", {"friction": 0.0}, 7, 24, 24), ("stack", {}, 7, 24, 72), ("stack", {"patch_radius": 0.1}, 7, 24, 96),
+        ("pyramid", {"base": 10}, 56, 400, 1200), ("table", {}, 11, 72, 216), ("heavy_on_light", {}, 3, 8, 24),
+        ("ramp", {}, 2, 4, 12), ("spinner", {}, 2, 1, 4), ("chain", {"n": 7}, 7, 0, 21),
+        ("bridge", {"n": 4, "load": 0.0}, 4, 0, 25), ("four_bar", {}, 3, 0, 20), ("four_bar", {"motor": 1.0}, 3, 0, 21),
     ],
-)
+)  # fmt: skip
 def test_sizes_are_those_of_the_docstrings(name, more, bodies, contacts, rows):
     scene = lv.Scene(name, **more)
     problem = lv.Simulation(scene).constraint_problem()
