@@ -7,8 +7,8 @@ import lavender as lv
 from lavender.audit.audit import audit_steps
 from lavender.audit.engine_scenes import NEWTON_STATE, read_engine_states, step_scene
 from lavender.audit.pieces import N_WORST_WORLDS, Judging, judge_steps
-from lavender.audit.result import OUTCOMES
-from lavender.audit.simulated_worlds import Frame
+from lavender.audit.result import OUTCOMES, Audit
+from lavender.audit.simulated_worlds import Divergence, Frame, Runs
 
 CONES = lv.Cones.contacts(0.5, tangents=1)
 
@@ -132,3 +132,44 @@ def test_audit_steps_of_other_sizes_or_none_raises():
         audit_steps([])
     with pytest.raises(lv.InputError, match="2 worlds, and the first step 1"):
         audit_steps([step_of([0.0], [1]), step_of([0.0, 0.0], [1, 1])])
+
+
+def test_audit_of_steps_judged_in_pieces_equals_the_audit_of_one_piece(tmp_path):
+    worlds, steps = 8, 6
+    world, step = np.repeat(np.arange(worlds), steps), np.tile(np.arange(steps), worlds)
+    errors = np.where(step % 2 == 0, 0.0, 0.1 + 1e-3 * step + 1e-2 * world)
+    found = []
+    for sizes in ([48], [12, 36], [7, 1, 20, 20]):
+        one = Audit.with_size(Runs("boxes", None, worlds, steps), "theirs", key="this")
+        for at in np.split(np.arange(48), np.cumsum(sizes)[:-1]):
+            answer, ones = step_of(errors[at], np.ones(len(at))), np.ones(len(at), int)
+            frame = Frame(answer.batch, answer.impulse, {}, rows=2 * ones, contacts=ones, n_dropped=len(at))
+            judging = Judging("float64", 1e-6, None, contact_share=0.25)
+            one.add_piece(judge_steps(frame, judging, world[at], step[at], lambda i: {"q": np.zeros(1)}), None)
+        found.append(one)
+        assert one.n_dropped == 48 and one.where == found[0].where
+        np.testing.assert_array_equal(one.numbers, found[0].numbers)
+        assert [(w.world, w.step, w.velocity) for w in one.worst] == [(w, 5, one.numbers[0, w, 5]) for w in (7, 6, 5)]
+        wrong = np.sort(one.numbers[0][one.is_unconverged])
+        assert len(wrong) == 24 and one.errors["velocity, unconverged [m/s]"].iloc[0] == wrong[12]
+        assert one.errors["velocity [m/s]"].iloc[0] == np.quantile(one.numbers[0], 0.5, method="higher")
+    first, last = (found[0].contact_states[i] for i in (0, -1))
+    assert len(found[0].contact_states) == 12 and (first.world, last.world) == (0, 7)  # All worlds have contact.
+    again = Audit.with_size(Runs("boxes", None, worlds, steps), "theirs", key="this")
+    found[0].write(tmp_path)
+    assert again.restore(tmp_path) and again.totals == found[0].totals | {"dropped_rows": 0, "notes": again.advice}
+    found[0].verdict[3, 4:] = -1  # A world that was judged in part.
+    found[0].write(tmp_path)
+    again = Audit.with_size(Runs("boxes", None, worlds, steps), "theirs", key="this")
+    assert not again.restore(tmp_path) and again.n_processed == 0
+
+
+def test_audit_is_unmet_for_each_reason_alone():
+    answer = [step_of([0.0, 0.0], [1, 1])]
+    assert not audit_steps(answer, max_velocity_error=0.1).is_unmet
+    assert audit_steps([step_of([0.0, 0.2], [1, 1])], max_velocity_error=0.1).is_unmet
+    assert audit_steps([step_of([0.0, 0.0], [1, 1], nan=[1])], max_velocity_error=0.1).is_unmet
+    for change in ({"n_dropped": 1}, {"divergences": [Divergence(0, 0, "qvel", False)]}):
+        found = audit_steps(answer, max_velocity_error=0.1)
+        vars(found).update(change)
+        assert found.is_unmet

@@ -39,7 +39,7 @@ def draw_worlds(kind):
     if kind == "matrices":
         return [lv.Problem.contact(*spd(6, seed=i), mu=0.5) for i in range(3)]
     if kind == "bounded":
-        cones = [lv.Cones.bounded(np.full(6, -0.1 * i), np.linspace(0.1, 0.2 * i + 0.2, 6)) for i in range(6)]
+        cones = [lv.Cones.bounded(np.full(6, 0.05 * i - 0.1), np.linspace(0.2, 0.2 * i + 0.2, 6)) for i in range(6)]
     if kind == "zeros of M":
         for world, column in zip(mass, (0, 1, 2, 1, 0, 3), strict=True):
             world[4, column] = world[column, 4] = 0.3 * world[0, 0]
