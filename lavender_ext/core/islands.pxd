@@ -76,28 +76,24 @@ cdef inline int32_t connect_blocks_by_matrix(const blocks_t* p, const csr_t* a, 
 
 cdef inline int32_t connect_blocks_by_trees(const blocks_t* p, const generalized_t* g, int32_t* parent,
                                             int32_t* first) noexcept nogil:
-    """Connect blocks with rows of J that touch a common tree of M; return the number of components. first (2 n) is scratch."""
-    cdef int32_t i, q, t, last, count = p.n_blocks
-    cdef int32_t* tree = first + g.n
+    """Connect blocks with a common root of a tree of M in their panels; return the number of components. first (n) is scratch."""
+    cdef int32_t i, q, trees = 0, count = p.n_blocks
     for i in range(g.n):
-        tree[i] = i if g.parent[i] < 0 else tree[g.parent[i]]
         first[i] = -1
+        trees += g.parent[i] < 0
     for i in range(p.n_blocks):
-        last = -1
-        for q in range(g.jptr[p.ptr[i]], g.jptr[p.ptr[i + 1]]):
-            t = tree[g.jidx[q]]
-            if t != last and g.jval[q] != 0.0:
-                count -= merge_with_first_at(first, t, i, parent)
-                last = t
-        if count == 1:
-            break
+        for q in range(g.pcol[g.home[i]], g.pcol[g.home[i] + 1]):
+            if g.parent[g.cols[q]] < 0:
+                count -= merge_with_first_at(first, g.cols[q], i, parent)
+                if trees == 1:
+                    break
     return count
 
 
 cdef inline int64_t island_workspace_integers(const view_t* v) noexcept nogil:
     """Return the number of int32 that `find_islands` needs."""
     cdef int64_t k = v.p.n_blocks
-    cdef int64_t scratch = 2 * <int64_t>v.g.n if v.g != NULL else v.r.n_bodies if v.r != NULL else v.p.n_rows
+    cdef int64_t scratch = v.g.n if v.g != NULL else v.r.n_bodies if v.r != NULL else v.p.n_rows
     return 4 * k + 1 + scratch
 
 

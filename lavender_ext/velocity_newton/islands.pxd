@@ -1,14 +1,14 @@
 """Islands of Newton's method over generalised velocities, and the binding of its arrays to the caller's workspace.
 
-Panels that share a column, directly or through other panels, form an island. The velocities of one island do not move
-the rows of another.
+The islands are those of the problem (`core/islands.pxd`), listed as panels and columns. The velocities of one island do not
+move the rows of another.
 """
 from libc.stdint cimport int32_t, int64_t
+from libc.string cimport memset
 
 from lavender_ext.core.arena cimport arena_t, take_doubles, take_integers
 from lavender_ext.core.order cimport sort_blocks_by_level
 from lavender_ext.core.block_types cimport CONE, COULOMB, blocks_t, has_friction
-from lavender_ext.core.roots cimport find_root
 from lavender_ext.core.view cimport generalized_t
 from lavender_ext.velocity_newton.flow cimport flow_t, end_row_of_run, first_row_of_run
 from lavender_ext.velocity_newton.normal cimport STRIP_ROWS
@@ -30,62 +30,6 @@ cdef struct requirements_t:     # sizes of the workspace, and the work of a fact
     double row_matrix_values    # values of A and Y^T of the largest island that is solved over rows
     double work                 # multiply-adds of forming N and of its factorisations, all islands
     double unused_entries       # upper bound of the entries of L of islands over rows, which are not factored
-
-
-cdef inline int32_t join_trees(const generalized_t* g, int32_t* up) noexcept nogil:
-    """Write the union-find parents up (n): columns of one tree, and trees that a panel couples, share a root.
-
-    Returns the number of trees before panels couple them.
-    """
-    cdef int32_t b, q, r, k, i, end, n = g.n, trees = 0
-    cdef const int32_t* parent = g.parent
-    cdef const int32_t* cols = g.cols
-    for i in range(n):
-        k = parent[i]
-        if k < 0:
-            trees += 1
-            up[i] = i
-        else:
-            up[i] = up[k]                               # A parent precedes its children.
-    for b in range(g.n_panels):
-        end = g.pcol[b + 1]
-        if end > g.pcol[b] and trees > 1:
-            r = find_root(up, cols[g.pcol[b]])
-            for q in range(g.pcol[b] + 1, end):
-                if parent[cols[q]] >= 0:                # The root of its tree is in the panel, too.
-                    continue
-                k = find_root(up, cols[q])
-                if r < k:
-                    up[k] = r
-                elif k < r:
-                    up[r] = k
-                    r = k
-    return trees
-
-
-cdef inline bint list_single_island(flow_t* f, requirements_t* need) noexcept nogil:
-    """Put all panels into one island and list its columns; return False if some panel has no columns."""
-    cdef int32_t i, q, n = 0
-    cdef const generalized_t* g = f.g
-    cdef int32_t* iptr = <int32_t*>f.iptr
-    cdef int32_t* run = <int32_t*>f.run
-    cdef int32_t* cptr = <int32_t*>f.cptr
-    cdef int32_t* icols = <int32_t*>f.icols
-    cdef int32_t* local = <int32_t*>f.local
-    for i in range(g.n_panels):
-        if g.pcol[i + 1] == g.pcol[i]:
-            return False
-    f.n_islands, iptr[0], iptr[1], run[0], run[1] = 1, 0, 1, 0, g.n_panels
-    for i in range(g.n):
-        local[i] = -1
-    for q in range(g.pcol[g.n_panels]):
-        local[g.cols[q]] = 0
-    for i in range(g.n):
-        if local[i] == 0:
-            local[i], icols[n] = n, i
-            n += 1
-    cptr[0], cptr[1], need.island_columns = 0, n, n
-    return True
 
 
 cdef inline void index_panels(flow_t* f, requirements_t* need) noexcept nogil:
@@ -114,13 +58,12 @@ cdef inline void index_panels(flow_t* f, requirements_t* need) noexcept nogil:
     vptr[f.p.n_blocks] = at
 
 
-cdef inline void find_islands(flow_t* f, int32_t* up, int32_t* label, requirements_t* need) noexcept nogil:
-    """Assign numbers to the islands in the order of their first panel, and list their panels and columns.
+cdef inline void list_islands(flow_t* f, int32_t* label, int32_t* number, requirements_t* need) noexcept nogil:
+    """Number the islands in the order of their first panel, and list their panels and columns.
 
-    up (n) and label (max(n, n_panels)) are scratch. iptr and cptr have places for n_panels + 1. A panel without columns
-    is an island of its own.
+    label (n_panels) and number (k) are scratch.
     """
-    cdef int32_t b, q, r, i, n = 0, panels = f.g.n_panels
+    cdef int32_t b, q, i, n = 1, panels = f.g.n_panels
     cdef const generalized_t* g = f.g
     cdef const int32_t* cols = g.cols
     cdef int32_t* iptr = <int32_t*>f.iptr
@@ -128,21 +71,18 @@ cdef inline void find_islands(flow_t* f, int32_t* up, int32_t* label, requiremen
     cdef int32_t* cptr = <int32_t*>f.cptr
     cdef int32_t* icols = <int32_t*>f.icols
     cdef int32_t* local = <int32_t*>f.local
-    if join_trees(g, up) == 1 and list_single_island(f, need):
-        return
-    # Label each panel with the number of its island; `local` holds the numbers of the roots.
-    for i in range(g.n):
-        local[i] = -1
+    # Label each panel with the island of its first block. Panels without columns may leave out islands.
+    if f.p.islands != NULL:
+        n = 0
+        memset(number, 255, f.p.islands.n * sizeof(int32_t))        # -1
     for b in range(panels):
-        if g.pcol[b + 1] == g.pcol[b]:
-            label[b] = n
-            n += 1
-            continue
-        r = find_root(up, cols[g.pcol[b]])
-        if local[r] < 0:
-            local[r] = n
-            n += 1
-        label[b] = local[r]
+        label[b] = 0
+        if f.p.islands != NULL:
+            i = f.p.islands.label[f.pblock[b]]
+            if number[i] < 0:
+                number[i] = n
+                n += 1
+            label[b] = number[i]
     f.n_islands = n
     # List the runs of consecutive panels of each island.
     for i in range(n + 1):
@@ -207,8 +147,8 @@ cdef inline bint choose_row_form(const flow_t* f, int32_t island, requirements_t
 
 
 cdef struct structure_t:        # memory of `find_islands_and_factor_patterns`
-    int32_t* root               # (n) scratch
-    int32_t* label              # (max(n, n_panels)) scratch
+    int32_t* label              # (n_panels) scratch
+    int32_t* number             # (k) scratch
     int32_t* over_rows          # (n_panels)
     int32_t* pattern            # `pattern_index_size` of sparse.pxd
 
@@ -217,8 +157,8 @@ cdef inline void bind_structure(flow_t* f, const blocks_t* p, const generalized_
                                 arena_t* a) noexcept nogil:
     """Take the integers of islands, blocks and rows, and of a pattern with `per` entries in each row of L."""
     cdef int64_t n = g.n, panels = g.n_panels, m = p.n_rows
-    s.root, s.label = take_integers(a, n), take_integers(a, max(n, panels))
-    f.linear.swap = s.root                              # `find_islands` does not need it any more.
+    f.linear.swap = take_integers(a, n)
+    s.label, s.number = take_integers(a, panels), take_integers(a, p.n_blocks)
     f.iptr, f.cptr, f.run, f.pblock = (take_integers(a, panels + 1), take_integers(a, panels + 1), take_integers(a, 2 * panels),
                                        take_integers(a, panels + 1))
     f.icols, f.local, f.vptr = take_integers(a, n), take_integers(a, n), take_integers(a, p.n_blocks + 1)
@@ -231,7 +171,7 @@ cdef inline void bind_structure(flow_t* f, const blocks_t* p, const generalized_
 
 cdef inline void find_islands_and_factor_patterns(flow_t* f, const blocks_t* p, const generalized_t* g, int32_t per,
                                                   structure_t* memory, requirements_t* need) noexcept nogil:
-    """Find the islands of a problem and the pattern of L of each, in the memory of `bind_structure`."""
+    """List the islands of a problem and find the pattern of L of each, in the memory of `bind_structure`."""
     cdef int32_t i, size
     cdef double values
     cdef const int32_t* lptr
@@ -241,7 +181,7 @@ cdef inline void find_islands_and_factor_patterns(flow_t* f, const blocks_t* p, 
     f.softness = 1e-4 if not has_friction(p) else (3e-2 if f.law == COULOMB else 3e-3)
     f.g = g
     index_panels(f, need)
-    find_islands(f, memory.root, memory.label, need)
+    list_islands(f, memory.label, memory.number, need)
     f.paused.island = -1
     f.bounded_rows_only = True
     for i in range(p.n_blocks):
