@@ -5,7 +5,7 @@
 
 Three environments of an arm above four boxes and of a stack of three boxes, with different velocities, are stepped with
 each contact resolution. The file holds the arrays under their attribute names, the velocities after the step, and the
-versions. `test_io_genesis.py` converts them without the engine.
+versions. `tests/io` converts them without the engine.
 """
 
 import sys

@@ -6,7 +6,7 @@
 Three models are stepped: worlds of different sizes (a stack, a cart and pole, a nunchaku, a four-bar linkage with an
 implicit spring), by PADMM over a dense Jacobian and by DVI over a sparse one; and eight stacks, of which one has a NaN
 velocity. The file holds the arrays under their attribute names, the velocities of the bodies after the step, and the
-versions. `test_io_kamino.py` converts them without the engine.
+versions. `tests/io` converts them without the engine.
 """
 
 import sys

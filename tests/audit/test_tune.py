@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from approved_texts import check_text
 from calls import BOXES, keep_values
 from calls import EARLY_BOXES as EARLY
 
@@ -74,28 +75,66 @@ def chosen(*some, held=(), threshold=1e-6):
     return Tuning("m.xml", 10, list(some), list(held), threshold)
 
 
-@pytest.mark.parametrize(("with_contact", "is_enough"), [(19, False), (20, True)])
-def test_no_line_is_recommended_if_few_steps_have_contact(with_contact, is_enough):
-    now, quick = measured(10.0, 1e-3), measured(8.0, 1e-3, iterations=9)
+def of_contacts(tuning, with_contact, can_touch=True):
+    """The tuning of 100 steps of which some have contact."""
     contacts = (np.arange(100) < with_contact).astype(int)
-    found = replace(chosen(now, quick), sizes=StepSizes(contacts + 1, contacts, True))
-    assert bool(found.lines) == is_enough == (not found.reason_without_line)
-    assert ("No setting is recommended: 19 of 100" in " ".join(found.headline)) != is_enough
-    assert "(19.0 %)" in found.reason_without_line or is_enough
-    # A model without geoms that can collide is judged by its rows.
-    assert replace(found, sizes=StepSizes(contacts + 1, 0 * contacts, False)).lines
-    assert not replace(found, sizes=StepSizes(0 * contacts, 0 * contacts, False)).lines
+    return replace(tuning, sizes=StepSizes(contacts + 1, contacts, can_touch))
 
 
-def test_tuning_chooses_the_faster_and_the_more_accurate_setting():
-    now = measured(10.0, 1e-3)
-    quick, loose = measured(8.0, 1e-3, iterations=9), measured(2.0, 1e-1, iterations=1)
-    exact, slow = measured(10.2, 1e-5, tolerance=1e-9), measured(20.0, 1e-9, tolerance=1e-15)
-    other = measured(1.0, 0.0, cone="elliptic")
-    found = chosen(now, quick, loose, exact, slow, other)
-    assert found.faster is quick and found.closer is exact
-    assert found.pareto_front == [loose, quick, exact, slow]
-    assert '<option iterations="9"/>' in found.lines[0]
+def first_step(setting, error):
+    """The setting with another error in its first step of a hundred."""
+    setting.error[0] = error
+    return setting
+
+
+NOW, QUICK = measured(10.0, 1e-3), measured(8.0, 1e-3, iterations=9)
+OTHER, SLOW = measured(1.0, 0.0, cone="elliptic"), measured(20.0, 1e-9, tolerance=1e-15)
+GOOD, ASTRAY = measured(12.0, 1e-5, tolerance=1e-6), measured(5.0, 1e-10, tolerance=1e-4)
+ASTRAY.motion[:] = 1e-3  # Its answers are right, and the bodies are elsewhere.
+RARE = first_step(measured(11.0, 1e-5, tolerance=1e-5), 0.5)
+FIVE = chosen(measured(10.0, 1e-1), measured(8.0, 1e-2, iterations=9), RARE, GOOD, SLOW, OTHER)
+LIMITED = replace(FIVE, error_limit=1e-3)
+TUNINGS = {
+    "19 of 100 steps have contact": of_contacts(chosen(NOW, QUICK), 19),
+    "20 of 100 steps have contact": of_contacts(chosen(NOW, QUICK), 20),
+    "no step has contact, and no geoms can touch": of_contacts(chosen(NOW, QUICK), 0, False),
+    "a faster, a more accurate, and a setting that changes the problem": chosen(
+        NOW, QUICK, measured(2.0, 1e-1, iterations=1), measured(10.2, 1e-5, tolerance=1e-9), SLOW, OTHER),
+    "of equally fast settings the largest limit of iterations": chosen(
+        measured(10.0, 1e-3, iterations=15), measured(7.0, 3e-16, iterations=3), measured(7.2, 4e-16, iterations=10),
+        measured(8.0, 1e-17, iterations=99)),
+    "an equally fast setting with a larger error is not as accurate": chosen(
+        measured(10.0, 1e-3, iterations=15), measured(7.0, 3e-16, iterations=3), measured(7.2, 2e-6, iterations=10)),
+    "a larger median error is not as accurate, though the largest error is smaller": chosen(
+        first_step(measured(10.0, 1e-4), 1e-1), QUICK),
+    "a smaller median error is as accurate, though 40 of 100 errors are larger": chosen(
+        first_step(measured(10.0, 1e-4), 1e-1), replace(QUICK, error=np.repeat([1e-5, 1e-3], [60, 40]))),
+    "the fastest of those within 1e-3 in every step": LIMITED,
+    "the choice exceeds 1e-3 on the worlds held back": replace(LIMITED, held_errors={GOOD.setting: 2e-3}),
+    "no setting within 1e-12": replace(LIMITED, error_limit=1e-12),
+    "no limit": FIVE,
+    "two settings within 1e-3 and the noise of times": replace(
+        chosen(measured(10.0, 0.1), GOOD, measured(12.012, 1e-8, iterations=30), SLOW), error_limit=1e-3),
+    "the present setting is within 0.2": replace(chosen(NOW, SLOW), error_limit=0.2),
+    "gains within noise and below the threshold": chosen(
+        measured(10.0, 1e-9), measured(9.8, 1e-9, iterations=9), measured(10.0, 1e-12, tolerance=1e-12)),
+    "an error that is larger than now and below the threshold": chosen(
+        measured(10.0, 1e-9), measured(5.0, 1e-7, tolerance=1e-4)),
+    "an error of 1 in one step of a hundred": chosen(
+        measured(10.0, 1e-9), first_step(measured(5.0, 1e-10, tolerance=1e-4), 1.0)),
+    "bodies that end elsewhere": chosen(measured(10.0, 1e-9), ASTRAY),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", TUNINGS)
+def test_tuning_has_its_approved_recommendation(name):
+    found = TUNINGS[name]
+    of = {"faster": found.faster, "closer": found.closer, "within the limit": found.within_limit}
+    of = {word: setting.setting.option_line for word, setting in of.items() if setting is not None}
+    front = [m.setting.option_line or "the present setting" for m in found.pareto_front]
+    met = f"is_limit_met: {found.page.numbers['is_limit_met']}" if found.error_limit is not None else ""
+    parts = [*found.headline, *found.lines, found.reason_without_line, met, f"{of}", f"Pareto front: {front}"]
+    check_text("tune.txt", name, "\n".join(part for part in parts if part))
 
 
 def test_errors_on_the_worlds_held_back_do_not_change_the_choice():
@@ -108,52 +147,6 @@ def test_errors_on_the_worlds_held_back_do_not_change_the_choice():
         after = replace(before, held=held, held_errors={m.setting: float(m.error.max()) for m in held})
         assert (after.faster, after.closer) == (before.faster, before.closer) == (first, first)
         assert not any("not measured" in line for line in after.lines)
-
-
-def test_tuning_of_equally_fast_settings_chooses_the_largest_iteration_limit():
-    now, few, many, slow = (
-        measured(10.0, 1e-3, iterations=15), measured(7.0, 3e-16, iterations=3),
-        measured(7.2, 4e-16, iterations=10), measured(8.0, 1e-17, iterations=99),
-    )  # fmt: skip
-    found = chosen(now, few, many, slow)
-    assert found.faster is many and found.closer is None
-    assert "not needed, 4.0e-16 m/s is within 1e-06" in found.lines[-1]
-    assert chosen(now, few, measured(7.2, 2e-6, iterations=10)).faster is few
-
-
-def test_tuning_rejects_a_setting_with_a_larger_median_error():
-    now, quick = measured(10.0, 1e-4), measured(8.0, 1e-3, iterations=9)
-    now.error[0] = 1e-1
-    assert quick.error.max() < now.error.max() and chosen(now, quick).faster is None
-    quick.error[:60] = 1e-5
-    assert chosen(now, quick).faster is quick
-
-
-def test_tuning_with_an_error_limit_chooses_the_fastest_setting_within_it(tmp_path):
-    now, quick = measured(10.0, 1e-1), measured(8.0, 1e-2, iterations=9)
-    rare, good = measured(11.0, 1e-5, tolerance=1e-5), measured(12.0, 1e-5, tolerance=1e-6)
-    rare.error[0] = 0.5  # One step in a hundred: the limit is for every step.
-    slow, other = measured(20.0, 1e-9, tolerance=1e-15), measured(1.0, 0.0, cone="elliptic")
-    found = replace(chosen(now, quick, rare, good, slow, other), error_limit=1e-3)
-    assert found.within_limit is found.limit_choice is good
-    assert found.lines[0] == '<option tolerance="1e-06"/>  <!-- error at most 0.001 m/s, fastest -->'
-    assert found.lines[1].endswith("(at most 1.0e-5 in 100 steps)") and "not measured" in found.lines[2]
-    assert "On other states they can be larger" in html_of(found, tmp_path)
-    # What exceeds the limit on the worlds held back is not within it.
-    refuted = replace(found, held_errors={good.setting: 2e-3})
-    assert refuted.within_limit is slow
-    none = replace(found, error_limit=1e-12)
-    assert none.within_limit is None and none.most_accurate is slow
-    assert none.lines[:2] == [
-        "error at most 1e-12 m/s: none of 5 settings; the most accurate is",
-        '<option tolerance="1e-15"/>  <!-- most accurate -->',
-    ]
-    assert none.page.numbers["is_limit_met"] is False
-    equal = measured(12.0 * (1.0 + 1e-3), 1e-8, iterations=30)  # within the noise of times
-    assert replace(chosen(now, good, equal, slow), error_limit=1e-3).within_limit is equal
-    own = replace(chosen(now, slow), error_limit=0.2)
-    assert own.lines[0] == "error at most 0.2 m/s, fastest: the model's own setting"
-    assert "error at most" not in "".join(replace(found, error_limit=None).lines)
 
 
 @pytest.mark.parametrize(("limit", "is_met"), [(1e-6, True), (0.0, False)])
@@ -186,21 +179,6 @@ def test_tune_measures_the_default_options_of_mujoco(boxes, monkeypatch):
     assert line.endswith("<!-- as accurate as now, faster, MuJoCo's defaults -->")
     # A model with the default options: its own setting is not measured twice.
     assert not any(m.setting.is_default for m in tune(boxes(), worlds=2, steps=10, repeats=1).measured)
-
-
-def test_tuning_ignores_gains_within_noise_or_threshold():
-    now, noise = measured(10.0, 1e-9), measured(9.8, 1e-9, iterations=9)
-    found = chosen(now, noise, measured(10.0, 1e-12, tolerance=1e-12))
-    assert found.faster is None and found.closer is None
-    assert "not needed" in found.lines[1]
-    loose = measured(5.0, 1e-7, tolerance=1e-4)
-    assert chosen(now, loose).faster is loose  # further off than now, and no further than anybody asks
-    rare = measured(5.0, 1e-10, tolerance=1e-4)
-    rare.error[0] = 1.0  # one step in a hundred: below the quantile, not below the worst
-    assert chosen(now, rare).faster is None
-    astray = measured(5.0, 1e-10, tolerance=1e-4)
-    astray.motion[:] = 1e-3  # its answers are right, and the bodies elsewhere
-    assert chosen(now, astray).faster is None
 
 
 def test_ctrl_c_keeps_what_there_is(boxes, monkeypatch, tmp_path):

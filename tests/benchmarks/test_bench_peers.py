@@ -6,7 +6,6 @@ import math
 import os
 import time
 
-import numpy as np
 import pytest
 from click.testing import CliRunner
 
@@ -140,28 +139,7 @@ def test_ratios_means_and_losses():
     assert "- small at 1e-09: daqp against -, only the peer" in text
 
 
-def test_siconos_solves_the_same_problems():
-    python = os.environ.get("LAVENDER_SICONOS", "")
-    if not python:
-        pytest.skip("LAVENDER_SICONOS names no interpreter with Siconos")
-    for kind, name in (("coulomb", "NSGS"), ("coulomb", "NSGS dense"), ("coulomb", "NSN_AC"), ("lcp", "PGS")):
-        contestant = by_name(f"siconos {name}", python)
-        assert reached(contestant, suite.case(SMALL[kind]).problem) < 1e-6
-
-
 # -- engines ---------------------------------------------------------------------------------------
-
-
-def test_mujoco_carries_the_same_weight():
-    pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[peers]'")
-    problem = engines.export("stack6", settle=480)
-    solution = lv.solve(problem, "newton", tol=1e-8)
-    normals = solution.impulse[problem.cones.ptr[:-1]]
-    ground = [i for i, name in enumerate(problem.names) if "(0, 1)" in name]
-    mass = sum(b.mass for b in lv.Scene("stack").bodies)
-    # The stack of 16 sweeps still moves a little; a box more or less would be a sixth.
-    assert normals[ground].sum() == pytest.approx(9.81 * mass * engines.DT, rel=0.1)
-    assert np.all(problem.cones.mu == 0.5)
 
 
 def test_the_command_steps_the_same_scene_in_every_engine_and_keeps_losses(tmp_path, monkeypatch):

@@ -19,7 +19,6 @@ from worked import python
 import lavender as lv
 from lavender import cli, report
 from lavender.cli import entry
-from lavender.report.store import select_skips
 
 TOLD = {"capture_output": False, "stderr": subprocess.PIPE}  # where the output goes to a place of its own
 QUICK = ("--tolerances", "1e-3", "1e-6", "--budgets", "2", "4", "--repeats", "1", "--no-figures")
@@ -144,20 +143,6 @@ def test_read_records_with_an_endless_line_raises(tmp_path):
         stream.truncate(2**27)
     with pytest.raises(lv.InputError, match="has a line of more than"):
         report.read(path)
-
-
-@pytest.mark.parametrize("tail", [b"", b"torn", b"x" * 70_000, b"x" * 65_536])
-@pytest.mark.parametrize("reasons", [[], ["why"] * 3, ["y" * 65_400, "why"], ["y" * 70_000]])
-def test_store_with_a_torn_last_line_cuts_it(tmp_path, reasons, tail):
-    entries = [
-        {"kind": "skip", "run": "run", "case": f"case {i}", "reason": reason} for i, reason in enumerate(reasons)
-    ]
-    head = b"".join(json.dumps(entry).encode() + b"\n" for entry in entries)
-    (tmp_path / "a.jsonl").write_bytes(head + tail)
-    with report.Store(tmp_path / "a.jsonl") as store:
-        assert list(select_skips(store.lines)["reason"]) == reasons
-        assert store.lines.attrs["dropped"] == (len(tail) > 0)
-    assert (tmp_path / "a.jsonl").read_bytes() == head
 
 
 INTERRUPT = """

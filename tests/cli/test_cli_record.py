@@ -1,14 +1,12 @@
 """`lavender record` and the report of what it wrote."""
 
 import json
-import re
 
 import numpy as np
 import pytest
 from mujoco_scene import mj, scene
 
 import lavender as lv
-from lavender.cli import EXIT_BAD_INPUT
 from lavender.judge.residuals import AT_FLOOR
 
 PGS = 1e-6  # as in test_io_mujoco.py
@@ -42,31 +40,6 @@ def test_record_verdict_follows_the_threshold_of_the_user(lavender, tmp_path):
     for threshold, status, told in (("1e-6", 0, "0 also more than 1e-6"), ("0", 1, "1 also more than 0")):
         code, out, _ = lavender(*words, threshold)
         assert code == status and f"1 of 1 above their floor, {told} m/s off" in " ".join(out.split())
-
-
-def test_record_then_report_from_the_command_line(lavender, tmp_path):
-    model, out, page = (tmp_path / name for name in ("scene.xml", "steps", "report"))
-    model.write_text(scene())
-    code, told, _ = lavender("record", model, "--steps", 30, "--record-every", 15, "--out", out)
-    assert code == 0 and "2 problems" in told
-    assert len(list(out.glob("*.npz"))) == 2
-    assert lavender("record", model, "--controls", "no.npy", "--out", tmp_path / "o")[0] == EXIT_BAD_INPUT
-    assert lavender("report", tmp_path / "none.xml", "--out", page)[0] == EXIT_BAD_INPUT
-    for text in ("<mujoco><worldbody>", '<mujoco><include file="none.xml"/></mujoco>', "no XML"):
-        (tmp_path / "torn.xml").write_text(text)
-        code, _, said = lavender("report", tmp_path / "torn.xml", "--out", page)
-        assert code == EXIT_BAD_INPUT and "torn.xml: " in said
-    words = ("report", model, "--steps", 30, "--record-every", 10, "--controls", "zero", "--solvers", "auto,newton")
-    for again in range(2):  # the second time nothing is recorded anew
-        code, told, _ = lavender(*words, "--no-figures", "--tables", "--out", page)
-        assert code == 0 and ("3 problems" in told) == (again == 0)
-        assert "Newton" in told and "engine" in told  # in a row of its own, folded
-    (own,) = (page / "recorded").glob("*-scene/engine.jsonl")
-    lines = [json.loads(line) for line in own.read_text().splitlines()]
-    assert len(lines) == 3
-    for text in ((page / "index.html").read_text(), (page / "summary.md").read_text()):
-        assert re.search(r"own Newton(: it)? solves 3 cases in", text) and "inside the engine" in text
-    assert f"{max(line['relative'] for line in lines):.1e}" in (page / "summary.md").read_text()
 
 
 def test_record_without_a_selected_constraint_counts_the_steps_between(lavender, boxes, tmp_path):

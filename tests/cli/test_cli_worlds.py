@@ -31,36 +31,6 @@ def test_audit_command_exit_code_follows_the_error_limit(lavender, boxes, tmp_pa
     assert not list((tmp_path / "out" / "worst").glob("*.npz"))  # files of another run are gone
 
 
-def test_recordings_start_from_states(lavender, tmp_path, boxes):
-    path = boxes()
-    assert lavender("audit", path, "--worlds", 1, "--steps", 40, "--workers", 1, "--out", tmp_path / "a")[0] == 0
-    low = [0, 0, 0.099, 1, 0, 0, 0, 0.02, 0, 0.32, 1, 0, 0, 0, 0]
-    states = {
-        "qpos": np.array([low, [0, 0, 7, *low[3:]]]),
-        "qvel": np.zeros((2, 13)),
-        "ctrl": np.array([[1.0], [-1.0]]),
-    }
-    np.savez(tmp_path / "two.npz", **states)
-    words = (path, "--steps", 10, "--record-every", 5, "--states", tmp_path / "two.npz", "--controls", "zero")
-    assert lavender("record", *words, "--out", tmp_path / "steps")[0] == 0
-    lines = [json.loads(line) for line in (tmp_path / "steps" / "engine.jsonl").read_text().splitlines()]
-    rows = [line["rows"] for line in lines]
-    assert rows[0] > rows[-1]  # The lower box of the second state is far above the floor.
-    mujoco = pytest.importorskip("mujoco")
-    model = mujoco.MjModel.from_xml_path(str(path))
-    for start, (qpos, ctrl) in enumerate(zip(states["qpos"], states["ctrl"], strict=True)):  # The states' own problems.
-        data = mujoco.MjData(model)
-        data.qpos[:], data.ctrl[:] = qpos, ctrl
-        mujoco.mj_forward(model, data)
-        file = next(line["file"] for line in lines if line["start"] == start)
-        np.testing.assert_array_equal(lv.load(tmp_path / "steps" / file).b, lv.io.from_mujoco(model, data).b)
-    words = ("report", *words, "--solvers", "auto", "--no-figures", "--out", tmp_path / "page")
-    assert lavender(*words)[0] == 0
-    (how,) = (tmp_path / "page" / "recorded").glob("*/how.json")
-    assert json.loads(how.read_text())["states"].endswith("two.npz")
-    assert lavender("report", "stack(n=4)", "--states", "keyframes", "--out", tmp_path / "no")[0] == 2
-
-
 def test_states_that_an_audit_saves_are_read_by_the_other_commands(lavender, boxes, tmp_path):
     path, file = boxes(EARLY), tmp_path / "contact.npz"
     words = ("--worlds", 2, "--steps", 40, "--workers", 1, "--out", tmp_path / "a")

@@ -32,19 +32,3 @@ def test_doctor_with_a_changed_bit_ends_with_1(monkeypatch):
     assert done.exit_code == 1
     assert re.search(rf"^ *{name} +{'0' * 16} expected", done.output, re.MULTILINE)
     assert f"{len(doctor.HASHES) - 1} of {len(doctor.HASHES)} give their bits" in done.output
-
-
-def test_doctor_with_one_sweep_less_fails_every_part(monkeypatch):
-    before = doctor.run_self_test()
-    assert before == doctor.run_self_test() == doctor.HASHES
-    assert len(set(before.values())) == len(before)
-    monkeypatch.setattr(
-        doctor, "solve", lambda *given, solve=doctor.solve, **more: solve(*given, **{**more, "max_iter": 11})
-    )
-    after = doctor.run_self_test()
-    same = {name for name in before if before[name] == after[name]}
-    assert same == {"stack, 60 steps", "gallery, 5 steps"}
-    simulate = doctor.simulate_positions
-    monkeypatch.setattr(doctor, "simulate_positions", lambda name, n: simulate(name, n - 1))
-    after = doctor.run_self_test()
-    assert all(before[name] != after[name] for name in before)

@@ -8,33 +8,10 @@ import pytest
 import scipy.sparse as sp
 from hypothesis import given
 from kkt_truth import eliminate
-from random_problems import as_matrix, seeds, touching
+from random_problems import as_matrix, seeds
 
 import lavender as lv
 from lavender.diagnostics.redundancy import redundancy
-
-
-def box_on_corners(mu=None, points=4):
-    """A unit cube, 1 kg, on the corners of its base."""
-    xy = 0.5 * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]])[:points]
-    arm = np.column_stack([xy, np.full(len(xy), -0.5)])
-    falls = [[0.0, 0.0, -0.1, 0.0, 0.0, 0.0]]
-    rows = touching([[-1, 0]] * len(arm), inv_inertia=[6.0 * np.eye(3)], v_free=falls, arm_b=arm)
-    if mu is None:
-        return lv.Problem.from_rows(rows)
-    return lv.Problem.from_rows(rows, mu=mu, tangents=2, friction="cone")
-
-
-@pytest.mark.parametrize("as_given", [lambda p: p, as_matrix])
-def test_redundancy_of_a_cube_on_four_points_is_known(as_given):
-    """Rank 3 of the normals; 6 with friction: a rigid body has six motions."""
-    found = redundancy(as_given(box_on_corners()))
-    assert found.rank == 3
-    assert found.row_names == ("contact 3, normal",)
-    assert found.block_names == ("contact 3",)
-    assert not found.impulse_is_unique.any(), "the four share the load in any balanced way"
-    assert found.unique == ("slack", "body velocities", "objective")
-    assert redundancy(as_given(box_on_corners(0.5))).rank == 6
 
 
 def test_redundancy_of_two_equal_hinges_names_the_second():
@@ -92,24 +69,6 @@ def test_redundancy_of_a_chain_of_6300_rows_finds_no_redundant_row():
     chain = sp.diags_array([-np.ones(m - 1), 2.0 * np.ones(m), -np.ones(m - 1)], offsets=[-1, 0, 1])
     found = redundancy(lv.Problem.linear(chain, np.zeros(m)))
     assert (found.rank, found.rows) == (m, ()) and found.impulse_is_unique.all()
-
-
-@pytest.mark.parametrize(("form", "n_contacts"), [("bodies", 2100), ("matrix", 300)])
-def test_redundancy_of_thousands_of_contacts_of_ten_bodies_has_rank_60(form, n_contacts):
-    """A tower of ten bodies with many contacts at each joint: six motions for each body, known by hand."""
-    rng = np.random.default_rng(4)
-    below = np.repeat(np.arange(-1, 9), n_contacts // 10)
-    arm = np.column_stack([rng.uniform(-0.5, 0.5, (n_contacts, 2)), np.full(n_contacts, -0.5)])
-    rows = touching(
-        np.column_stack([below, below + 1]), inv_mass=np.ones(10), inv_inertia=np.tile(6.0 * np.eye(3), (10, 1, 1)),
-        v_free=np.zeros((10, 6)), arm_a=arm + np.eye(3)[2], arm_b=arm,
-    )  # fmt: skip
-    problem = lv.Problem.from_rows(rows, mu=0.5, tangents=2, friction="cone")
-    found = redundancy(problem if form == "bodies" else as_matrix(problem))
-    assert (problem.m, found.rank) == (3 * n_contacts, 60)
-    independent = np.setdiff1d(np.arange(problem.m), found.rows)
-    assert np.array_equal(independent // (problem.m // 10), np.repeat(np.arange(10), 6))  # Each joint has six.
-    assert not found.impulse_is_unique.any()
 
 
 def test_redundancy_of_an_island_beyond_memory_raises():

@@ -4,6 +4,7 @@ import contextlib
 import functools
 import io as streams
 import json
+import re
 import warnings
 import zipfile
 from pathlib import Path
@@ -12,6 +13,7 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from approved_texts import check_text
 from hypothesis import given
 from random_problems import random_contact_problem
 
@@ -367,6 +369,66 @@ def damaged_files(draw, folder):
         else:
             arrays[name] = draw(replaced_array(arrays[name]))
     return suffix, file_of(suffix, arrays, draw(st.integers(0, 9)) == 9)
+
+
+#: Words for an entry in messages, if they are not its name.
+WORDS = {
+    "data": "values|A|J|M", "indices": "indices|M", "indptr": "pointers", "i": "indices", "p": "pointers",
+    "x": "values", "m": "rows|x|f", "n": "columns|x|w|rows", "lo": "lower", "hi": "upper", "b": "lo",
+    "inv_mass": "inv_inertia", "v_free": "compressed matrix", "A": "A_shape", "start": "cone_dim",
+}  # fmt: skip
+
+
+def list_replacements(x):
+    """Yield (description, array) in place of x; None: the entry is left out."""
+    flat = x.reshape(-1)
+    yield from {"missing": None, "longer": np.concatenate([flat, flat[:1]]), "shorter": flat[:-1],
+                "a column": x.reshape(-1, 1, 1), "a scalar": np.array(2.5)}.items()  # fmt: skip
+    if x.dtype.kind in "iuf":
+        yield from {"text": np.full(x.shape, "a"), "complex": x.astype(complex)}.items()
+        for value in (-7, 99, 2**31 - 1) if x.dtype.kind in "iu" else (np.nan, np.inf, -1.0):
+            with np.errstate(all="ignore"):
+                y = x.astype(x.dtype)
+                y.reshape(-1)[-1:] = np.array(value).astype(x.dtype)
+            yield f"last {value}", y
+    if x.dtype.kind in "iu":
+        yield from {"floats": x.astype(float), "reversed": flat[::-1]}.items()
+
+
+def read_replaced(path, suffix, arrays, name, x):
+    """Read a file in which one array is replaced; return the error's message, or an empty string."""
+    path.write_bytes(file_of(suffix, {k: v for k, v in (arrays | {name: x}).items() if v is not None}, False))
+    try:
+        io.read(path, max_bytes=10**7)
+    except lv.LavenderError as error:
+        return str(error)
+    return ""
+
+
+@pytest.mark.filterwarnings("error")
+def test_file_with_an_array_replaced_names_it_or_is_read_as_approved(tmp_path):
+    unnamed, accepted = [], {}
+    for suffix, data in valid_files(tmp_path):
+        arrays, path = arrays_in(suffix, data), tmp_path / f"replaced{suffix}"
+        kind = f"{suffix}, {', '.join(sorted({name.partition('_')[0].partition('/')[0] for name in arrays}))}"
+        if kind in accepted:
+            continue  # a larger problem in the same layout
+        accepted[kind] = []
+        for name, x in arrays.items():
+            last = name.rpartition("/")[2]
+            words = [re.escape(w) for w in (last, last.replace("_", "."), last.partition("_")[2]) if w]
+            words += [WORDS[key] for key in (last, last.rpartition("_")[2], last.partition("_")[2]) if key in WORDS]
+            pattern, read = re.compile(rf"{re.escape(str(path))}.*\b(?:{'|'.join(words)})\b", re.DOTALL), []
+            for how, value in list_replacements(np.array(x)):
+                if suffix == ".hdf5" and how == "text":
+                    continue  # HDF5 has no texts of NumPy.
+                message = read_replaced(path, suffix, arrays, name, value)
+                read += [how] * (not message)
+                unnamed += [f"{name}, {how}: {message}"] * bool(message and not pattern.search(message))
+            accepted[kind] += [f"{name}: {', '.join(read) or 'none'}"]
+    assert not unnamed, "\n".join(unnamed)
+    for kind, names in accepted.items():
+        check_text("accepted_arrays.txt", kind, "\n".join(names))
 
 
 @pytest.mark.fuzz

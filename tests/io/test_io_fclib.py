@@ -319,28 +319,12 @@ def test_load_of_fclib_with_links_reads_no_other_file(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "sign"),
     [
-        ({"W": GOOD | {"p": np.array([0, 2, 1, 6], np.int32)}}, "pointers"),
-        ({"W": GOOD | {"p": np.array([0, 2, 4, 60], np.int32)}}, "announce 60 entries"),
-        ({"W": GOOD | {"p": np.array([0, 2], np.int32)}}, "pointers"),
-        ({"W": GOOD | {"i": np.array([0, 1, 1, 2, 0, 3], np.int32)}}, "indices from 0 to 3"),
-        ({"W": GOOD | {"i": np.array([0, 1, 1, 2, 0, -1], np.int32)}}, "indices from -1 to 2"),
-        ({"W": GOOD | {"i": np.zeros(6)}}, "whole numbers"), ({"W": GOOD | {"x": np.full(6, np.nan)}}, "finite"),
-        ({"W": GOOD | {"x": np.zeros(3)}}, "announce 6 entries"),
-        ({"W": GOOD | {"x": np.array([b"1"] * 6)}}, "numbers are needed"),
-        ({"W": GOOD | {"m": np.array([4], np.int32), "p": np.array([0, 2, 4, 6, 6])}}, "4 x 3"),
-        ({"W": GOOD | {"m": np.array([-3], np.int32)}}, "declares -3 rows"),
         ({"W": GOOD | {"m": np.array([2**40])}}, "32-bit integer"),
-        ({"W": GOOD | {"m": np.array([3, 3], np.int32)}}, "1 are needed"),
         ({"W": GOOD | {"nz": np.array([-3], np.int32)}}, "nz must be -2"),
         ({"W": GOOD | {"nz": np.array([5], np.int32), "p": np.zeros(4, np.int32)}}, "nz announces 5 triplets"),
-        (
-            {"W": GOOD | {"nz": np.array([3], np.int32), "p": np.array([0, 1, 3], np.int32)}},
-            "3 rows and 3 columns are declared",
-        ),
-        ({"W": {k: v for k, v in GOOD.items() if k != "nz"}}, "W/nz is missing"),
-        ({"q": np.zeros(4)}, "q has 4 entries; 3"), ({"q": np.full(3, np.inf)}, "finite"),
-        ({"mu": [0.5, 0.5]}, "mu has 2 entries; 1"), ({"mu": [-0.5]}, "mu"), ({"mu": None}, "mu is missing"),
-        ({"spacedim": 2}, "has 3 rows, which is not a multiple of spacedim = 2"), ({"spacedim": 5}, "2 or 3 is needed"),
+        ({"W": GOOD | {"nz": np.array([3], np.int32), "p": np.array([0, 1, 3], np.int32)}}, "3 rows and 3 columns are"),
+        ({"mu": [-0.5]}, "mu"), ({"spacedim": 2}, "has 3 rows, which is not a multiple of spacedim = 2"),
+        ({"spacedim": 5}, "2 or 3 is needed"),
     ],
 )  # fmt: skip
 def test_load_of_an_inconsistent_fclib_file_names_the_entry(tmp_path, changes, sign):

@@ -241,60 +241,31 @@ def test_the_documentation_lists_every_entry_of_our_format(tmp_path):
         assert missing == []
 
 
-# Of whom entries of these names are, before a kernel reads them.
 META = {"operator": "dense", "friction": "coulomb", "name": "", "names": None}
-# Problems whose files have entries of these names.
-OF = {"A_": lv.Problem.linear(sp.eye_array(4, format="csr"), np.ones(4))}
-OF |= dict.fromkeys(("rows_", "compliance"), random_contact_problem(1))
 
 
 @pytest.mark.parametrize(
     ("changes", "sign"),
     [
         ({"lavender_format": np.int64(2)}, "this lavender reads 1"),
-        ({"lavender_format": np.bool_(True)}, "this lavender reads 1"),
-        ({"lavender_format": np.array("1.0")}, "this lavender reads 1"),
-        ({"lavender_format": np.array([1, 1])}, "one value"), ({"b": None}, "entries b are missing"),
-        ({"A": None, "cones_mu": None}, "entries cones_mu, A are missing"),
-        ({"extra": np.zeros(1)}, "extra do not belong"), ({"meta": np.frombuffer(b"{", np.uint8)}, "JSON"),
-        ({"meta": np.frombuffer(b"\xff\xfe", np.uint8)}, "JSON"), ({"meta": np.zeros(3)}, "JSON"),
-        ({"meta": np.frombuffer(b"[" * 100_000, np.uint8)}, "JSON"),
-        ({"meta": META | {"operator": "magic"}}, "operator is 'magic'"),
-        ({"meta": META | {"names": "abc"}}, "names is 'abc'"),
-        ({"meta": META | {"names": [1]}}, "a list of names, or null"),
-        ({"meta": META | {"more": 1}}, "unknown names more"),
-        ({"meta": META | {"friction": "glue"}}, "'coulomb' or 'cone'"),
-        ({"meta": META | {"precision": "float16"}}, "precision is 'float16'; float64 or float32"),
-        ({"meta": META | {"names": ["one"]}}, "entries for 12 blocks"),
-        ({"meta": META | {"program": 2}}, "program is 2; a number of variables, with the operator csr"),
-        ({"meta": META | {"operator": "csr", "program": True}}, "program is True; a number of variables"),
-        ({"b": np.full(12, np.nan)}, "finite"), ({"b": np.array(["1"] * 12)}, "numbers are needed"),
-        ({"b": np.zeros(11)}, "b .*shape"), ({"A": np.zeros((12, 11))}, "A .*shape"), ({"key": np.zeros(12)}, "key"),
-        ({"guess": np.zeros(3)}, "guess"), ({"impulse": np.zeros(3)}, "impulse"),
-        ({"cones_ptr": np.arange(13)[::-1]}, "cones.ptr"), ({"cones_lower": np.full(12, np.nan)}, "NaN"),
-        ({"A_indices": np.array([0, 1, 9, 3], np.int32)}, "column indices from 0 to 9"),
-        ({"A_indices": np.array([0, 1, -1, 3], np.int32)}, "column indices from -1 to 3"),
-        ({"A_indptr": np.array([0, 3, 2, 3, 4], np.int32)}, "pointers"),
-        ({"A_indptr": np.array([0, 1, 2, 3, 2**30], np.int32)}, "announce 1073741824 entries"),
-        ({"A_indptr": np.array([1, 1, 2, 3, 4], np.int32)}, "pointers"),
-        ({"A_indptr": np.array([0, 4], np.int32)}, "pointers"), ({"A_indptr": np.array([0.0, 1, 2, 3, 4])}, "pointers"),
-        ({"A_data": np.zeros((2, 2))}, "values"), ({"A_shape": np.array([2**31, 2**31])}, "A_shape"),
-        ({"A_shape": np.array([4])}, "A_shape"), ({"rows_contact_body": np.full((8, 2), 99, np.int32)}, "body 99"),
-        ({"rows_joint_body": np.full((3, 2), -2, np.int32)}, "body -2"),
-        ({"rows_joint_ptr": np.array([0, 2**31 - 1], np.int32)}, "jac"),
-        ({"rows_normal": np.zeros((8, 3))}, "unit vectors"), ({"rows_arm_a": np.zeros((7, 3))}, "arm_a"),
-        ({"compliance": np.full(1, -1.0)}, "compliance"),
+        ({"lavender_format": np.array([1, 1])}, "one value"),
+        ({"A": None, "cones_mu": None}, "entries cones_mu, A are missing"), ({"extra": np.zeros(1)}, "do not belong"),
+        *(({"meta": np.frombuffer(text, np.uint8)}, "JSON") for text in (b"{", b"\xff\xfe", b"[" * 100_000)),
+        *(({"meta": META | change}, words) for change, words in (
+            ({"operator": "magic"}, "operator is 'magic'"), ({"names": "abc"}, "names is 'abc'"),
+            ({"names": [1]}, "a list of names, or null"), ({"more": 1}, "unknown names more"),
+            ({"friction": "glue"}, "'coulomb' or 'cone'"), ({"names": ["one"]}, "entries for 12 blocks"),
+            ({"precision": "float16"}, "precision is 'float16'; float64 or float32"),
+            ({"program": 2}, "program is 2; a number of variables, with the operator csr"),
+            ({"operator": "csr", "program": True}, "program is True; a number of variables"))),
     ],
 )  # fmt: skip
-def test_load_of_an_inconsistent_npz_names_the_entry(tmp_path, changes, sign):
+def test_load_of_npz_with_other_entries_or_metadata_names_them(tmp_path, changes, sign):
     changes = {
-        n: np.frombuffer(json.dumps(v).encode(), np.uint8) if isinstance(v, dict) else v for n, v in changes.items()
+        k: np.frombuffer(json.dumps(v).encode(), np.uint8) if isinstance(v, dict) else v for k, v in changes.items()
     }
-    problem = next((p for start, p in OF.items() if min(changes).startswith(start)), None)
-    assert problem is None or lavender.io.load(own(tmp_path, problem)) == problem
-    with pytest.raises(lv.InputError, match=sign) as error:
-        lavender.io.load(own(tmp_path, problem, **changes))
-    assert "own.npz" in str(error.value)
+    with pytest.raises(lv.InputError, match=rf"(?s)own\.npz.*{sign}"):
+        lavender.io.load(own(tmp_path, **changes))
 
 
 @pytest.mark.parametrize(
@@ -319,19 +290,13 @@ def test_load_of_npz_entries_with_false_headers_raises(tmp_path, entry, sign):
 @pytest.mark.parametrize(
     ("changes", "sign"),
     [
-        ({"A": None}, "no entry 'A_shape'"), ({"lo": np.zeros(6)}, "'lo'"),
-        ({"lo": np.full(7, 1.0), "hi": np.zeros(7)}, "lower <= upper"), ({"b": np.zeros((7, 1))}, "one dimension"),
+        ({"lo": np.full(7, 1.0), "hi": np.zeros(7)}, "lower <= upper"),
         ({"cone_start": [5], "cone_dim": [3], "cone_mu": [0.5]}, "within rows 0 to 6"),
         ({"cone_start": [-1], "cone_dim": [3], "cone_mu": [0.5]}, "within rows 0 to 6"),
         ({"cone_start": [0, 2], "cone_dim": [3, 3], "cone_mu": [0.5, 0.5]}, "overlap"),
         ({"cone_start": [0], "cone_dim": [5], "cone_mu": [0.5]}, "1 to 3 rows"),
         ({"cone_start": [0], "cone_dim": [3], "cone_mu": [-0.5]}, "mu"),
         ({"cone_start": [0], "cone_dim": [3, 3], "cone_mu": [0.5]}, "'cone_dim'"),
-        ({"cone_start": [0], "cone_mu": [0.5]}, "'cone_dim'"),
-        ({"cone_start": [0.5], "cone_dim": [3], "cone_mu": [0.5]}, "'cone_start' holds"),
-        ({"cone_start": [0], "cone_dim": [2.5], "cone_mu": [0.5]}, "'cone_dim' holds"),
-        ({"cone_start": [np.nan], "cone_dim": [3], "cone_mu": [0.5]}, "'cone_start' holds"),
-        ({"l_ref": np.zeros(3)}, "l_ref"), ({"A": np.full((7, 7), np.inf)}, "finite"),
     ],
 )  # fmt: skip
 def test_load_of_a_wrong_box_file_names_the_entry(tmp_path, changes, sign):

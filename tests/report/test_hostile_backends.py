@@ -1,6 +1,5 @@
 """A worker outlives the backends that mean it harm, and believes none of them."""
 
-import contextlib
 import json
 import os
 import pickle
@@ -200,18 +199,6 @@ def test_a_worker_ends_when_its_parent_is_killed(hostile):
     assert wait_until(lambda: not any(map(runs, pids)))
 
 
-LONG = """
-import sys, numpy as np, lavender as lv
-from scipy.sparse import diags_array
-from lavender import report
-def hard(i):
-    chain = diags_array([2.0, -1.0, -1.0], offsets=[0, 1, -1], shape=(3000, 3000))  # condition 4e6
-    return lv.Problem.lcp(chain.tocsr(), (1.0 + i) * np.eye(1, 3000)[0], name=f"hard {i}")
-plan = report.CampaignPlan(tolerances=(1e-9,), budgets=(), cap=10_000_000)
-report.run([hard(i) for i in range(4)], ["pgs"], plan, workers=2)
-"""
-
-
 def children(pid):
     try:
         with open(f"/proc/{pid}/task/{pid}/children") as f:
@@ -219,29 +206,6 @@ def children(pid):
     except FileNotFoundError:
         return []
     return [c for child in found for c in (child, *children(child))]
-
-
-@pytest.mark.nightly
-@pytest.mark.skipif(
-    not os.path.exists(f"/proc/self/task/{os.getpid()}/children"), reason="children are seen in Linux's /proc"
-)
-def test_workers_of_a_campaign_end_when_it_is_killed():
-    parent = subprocess.Popen([sys.executable, "-c", LONG], stderr=subprocess.DEVNULL)
-
-    def busy():
-        return [p for p in children(parent.pid) if cpu(p) > 1.5]
-
-    def cpu(pid):
-        with contextlib.suppress(OSError), open(f"/proc/{pid}/stat") as f:
-            words = f.read().rpartition(")")[2].split()
-            return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
-        return 0.0
-
-    assert wait_until(lambda: len(busy()) >= 1)
-    family = children(parent.pid)
-    parent.kill()
-    parent.wait()
-    assert wait_until(lambda: not any(map(runs, family)))
 
 
 def test_a_whole_run_survives_its_backends(hostile, watchdog, monkeypatch):

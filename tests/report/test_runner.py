@@ -4,12 +4,7 @@ import csv
 import dataclasses
 import json
 import math
-import os
-import signal
-import subprocess
 import sys
-import threading
-import time
 
 import numpy as np
 import pytest
@@ -256,27 +251,6 @@ def test_run_killed_at_any_byte_continues(given, first, later, tmp_path):
     assert keys_of(again) == keys_of(whole) and len(rows_of(report.read(path))) == len(rows_of(whole)) and more == 0
 
 
-def test_run_process_killed_at_random_times_loses_nothing(tmp_path):
-    """The end of a process by SIGKILL, several times, and then a whole run."""
-    path = tmp_path / "records.jsonl"
-    code = f"""from lavender import report
-plan = report.Plan(tolerances=(1e-6,), budgets=(4, 8), repeats=1)
-report.run({SEEDED[:6]}, ["pgs", "nncg"], plan, {str(path)!r})"""
-    sizes = [0]
-    for target in np.random.default_rng(1).integers(2000, 9000, 3):
-        process = subprocess.Popen([sys.executable, "-c", code])
-        while process.poll() is None and (path.stat().st_size if path.exists() else 0) < sizes[-1] + target:
-            time.sleep(0.01)
-        process.kill()
-        process.wait()
-        sizes.append(path.stat().st_size)
-        assert len(report.read(path)) >= 0
-    python("-c", code)
-    fresh = report.run(SEEDED[:6], ["pgs", "nncg"], report.Plan((1e-6,), budgets=(4, 8), repeats=1))
-    # Without the first field, the hash of the run: it depends on the packages that this process has imported.
-    assert [key[1:] for key in keys_of(report.read(path))] == [key[1:] for key in keys_of(fresh)]
-
-
 def test_run_other_version_or_cpu_is_another_run(tmp_path, monkeypatch):
     path = tmp_path / "records.jsonl"
     first = report.run([stack(5)], ["direct"], QUICK, path)
@@ -456,29 +430,6 @@ def test_campaign_backend_that_cannot_be_used_is_an_input_error(backend, missing
         monkeypatch.setattr(workers, "CONNECT_TIMEOUT", 0.2)
     with pytest.raises(lv.InputError, match=message):
         report.run(NAMES[:1], ["pgs"], CAMPAIGN, backend=backend)
-
-
-@pytest.mark.nightly
-def test_campaign_cluster_that_loses_a_worker_loses_no_record():
-    distributed = pytest.importorskip("distributed", reason="a cluster needs dask.distributed (extra: cluster)")
-    plan = report.CampaignPlan(tolerances=(1e-6,), budgets=(8, 64))
-    expected = report.run(SEEDED[:16], ["pgs", "jacobi"], plan)
-    with (
-        distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0") as cluster,
-        distributed.Client(cluster) as client,
-    ):
-        pids = list(client.run(os.getpid).values())
-        killed = threading.Event()
-
-        def watch(event):
-            if event.done >= event.total // 3 and not killed.is_set():
-                killed.set()
-                os.kill(pids[0], signal.SIGKILL)
-
-        found = report.run(SEEDED[:16], ["pgs", "jacobi"], plan, backend="dask", watch=watch)
-        while pids[0] in client.run(os.getpid, on_error="ignore").values():  # until the cluster has noticed
-            time.sleep(0.1)
-    assert killed.is_set() and texts(found) == texts(expected)
 
 
 # -- cases -------------------------------------------------------------------------------------------------

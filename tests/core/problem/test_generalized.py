@@ -9,10 +9,9 @@ import scipy.linalg
 import scipy.sparse as sp
 from hypothesis import given
 from hypothesis import strategies as st
-from random_problems import ancestors, as_matrix, random_generalized_problem, random_tree_parents, seeds, tree_mass
+from random_problems import as_matrix, random_generalized_problem, random_tree_parents, seeds, tree_mass
 
 import lavender as lv
-from lavender.solvers.sweeping import is_sweep_over_jacobian_cheaper
 
 # -- the operator ----------------------------------------------------------------------------------
 
@@ -116,29 +115,6 @@ def test_newton_over_velocities_continues_centering_with_many_rows(nv, seed):
     assert solution.success, str(solution)
 
 
-@pytest.mark.parametrize("compliance", [0.0, 1e-9, 0.05])
-@pytest.mark.parametrize("rows", [1, 3, 8, 19])
-def test_rows_fewer_than_velocities_have_the_answer_of_their_matrix(rows, compliance):
-    """Of 20 velocities, where steps are taken by the rows that answer or by all velocities."""
-    rng = np.random.default_rng(rows)
-    parent = random_tree_parents(rng, 20)
-    jac = np.zeros((rows, 20))
-    for row in jac:
-        on = ancestors(parent, int(rng.integers(0, 20)))
-        row[on] = rng.normal(size=len(on))
-    cones = lv.Cones.bounded(np.where(rng.random(rows) < 0.5, 0.0, -0.2), np.full(rows, 0.3))
-    problem = lv.Problem.from_jacobian(
-        jac, tree_mass(rng, parent), rng.normal(size=20), cones=cones, compliance=compliance
-    )
-    found = lv.solve(problem, "newton", tol=1e-11)
-    want = lv.solve(as_matrix(problem), "newton", tol=1e-12)
-    assert found.success, str(found)
-    assert np.count_nonzero(found.impulse) > 0
-    np.testing.assert_allclose(problem.velocity(found.impulse), problem.velocity(want.impulse), rtol=1e-9, atol=1e-9)
-    many = lv.solve_many([problem, problem], "newton", tol=1e-11)
-    assert many.impulse.tobytes() == found.impulse.tobytes() * 2
-
-
 def test_updated_is_the_same_structure_with_new_numbers():
     problem = random_generalized_problem(9, "cone")
     general = problem.generalized
@@ -238,26 +214,3 @@ def test_workspace_for_a_larger_pattern_grows():
     problem = cloth(50, 0)
     assert lv.solve(problem, "newton", form="velocity", tol=1e-9).success
     assert lv.solve_many([problem], tol=1e-6)[0].success
-
-
-# -- sweeps ---------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", ["pgs", "block_gauss_seidel", "nncg", "anderson"])
-@given(seed=seeds, friction=st.sampled_from(["cone", "coulomb"]), spin=st.booleans(), few=st.booleans())
-def test_sweeps_over_j_and_m_are_those_over_a(name, seed, friction, spin, few):
-    """Many rows on few velocities are swept over Y, few rows on many over A: the same iterates to rounding."""
-    problem = random_generalized_problem(seed, friction, n=30 if few else 6, contacts=2 if few else 6, spin=spin)
-    if lv.known(problem)[name]:
-        assert name == "pgs" and problem.law == "cone"
-        return
-    # Later mixtures of anderson combine residuals that are dependent to rounding, so their coefficients are arbitrary.
-    sweeps = 5 if name == "anderson" else 12
-    one = lv.solve(problem, name, tol=0.0, max_iter=sweeps)
-    same = lv.solve(as_matrix(problem), name, tol=0.0, max_iter=sweeps)
-    scale = 1.0 + np.abs(same.impulse).max()
-    # Sums in another order: 1e-13 of their terms, and a factor of a few on each of a dozen sweeps.
-    np.testing.assert_allclose(one.impulse, same.impulse, atol=1e-7 * scale)
-    assert ("whitened J" in one.solver.form) == is_sweep_over_jacobian_cheaper(problem)
-    found = lv.solve(problem, name, tol=1e-6, max_iter=20_000)
-    assert found.success or found.status is not lv.Status.CONVERGED

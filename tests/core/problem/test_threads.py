@@ -8,7 +8,6 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import numpy as np
 import pytest
 from random_problems import random_contact_problem, random_lcp
 from worked import python
@@ -81,17 +80,6 @@ def test_derived_arrays_are_one_object_for_all_threads(often):
         problem = random_contact_problem(seed)
         for name in ("data", "csr", "csr_data", "jacobian"):
             assert len({id(x) for x in at_once(lambda p=problem, n=name: getattr(p, n))}) == 1
-
-
-def test_threads_read_worlds_whose_turn_came_too_late(often):
-    """Their starts are judged when numbers are first read, by whichever threads come: all see all of them."""
-    problems = [random_lcp(seed) for seed in range(100)]
-    starts = [np.ones(p.m) for p in problems]
-    alone = lv.residual_many(problems, starts).relative
-    late = lv.solve_many(problems, impulses=starts, time_limit=1e-9)
-    assert all(status is lv.Status.TIME_LIMIT for status in late.status)
-    for found in at_once(lambda: late.relative.copy()):
-        assert found.tobytes() == alone.tobytes()
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="forks are of POSIX")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from hypothesis import example, given
+from hypothesis import given
 from hypothesis import strategies as st
 from kkt_truth import OF_PROGRAM as NAMES
 from kkt_truth import of_program as kkt
@@ -313,58 +313,10 @@ def test_no_solver_calls_a_program_unbounded_that_has_no_feasible_point(solver, 
     assert some.ray is not None and not some.found
 
 
-@given(seed=seeds)
-@example(seed=187)  # found, and a ray in other units
-@example(seed=287)  # a proximal step whose M was not definite
-@example(seed=319)
-def test_units_of_variables_and_rows_change_neither_verdict_nor_objective(seed):
-    """Where q = 0 an objective 40 times the least was found; a curvature that is small in one unit was no curvature."""
-    qp, rng = drawn(seed, singular=True), np.random.default_rng(seed)
-    n = len(qp["q"])
-    if rng.random() < 0.3:
-        qp["q"] = np.zeros(n)
-    for bound, far in (("lb", -np.inf), ("ub", np.inf)):  # so that some are unbounded
-        qp[bound] = np.where(rng.random(n) < 0.3, far, qp[bound])
-    units, other = 10.0 ** rng.uniform(-4.0, 4.0, n), dict(qp)
-    other["P"], other["q"] = units * (qp["P"] * units).T, units * qp["q"]
-    other["lb"], other["ub"] = qp["lb"] / units, qp["ub"] / units
-    for matrix, side in (("A", "b"), ("G", "h")):
-        if qp[matrix] is not None:
-            of_rows = 10.0 ** rng.uniform(-4.0, 4.0, len(qp[side]))
-            other[matrix], other[side] = of_rows[:, None] * qp[matrix] * units, of_rows * qp[side]
-    one, two = (lv.solve_qp(lv.Problem.from_qp(**each)) for each in (qp, other))
-    assert not (one.found and two.ray is not None) and not (two.found and one.ray is not None)
-    if one.found and two.found:
-        x = np.abs(one.x)
-        size = 1.0 + x @ np.abs(qp["P"]) @ x + np.abs(qp["q"]) @ x
-        # Errors of 1e-9 are relative to the largest force: of one in a unit 1e8 times as small they are more.
-        assert abs(one.objective - two.objective) <= 1e-3 * size
-
-
 # -- a singular P ----------------------------------------------------------------------------------
 
 SINGULAR = lv.Problem.from_qp(np.diag([1.0, 0.0]), [1.0, 1.0], G=[[1.0, 1.0]], h=[1.0], lb=[-4.0, -4.0])
 BACKENDS = [name for name in lv.available(SINGULAR) if name != "auto"]
-
-
-@pytest.mark.parametrize("name", BACKENDS)
-@given(seed=seeds)
-def test_every_backend_solves_programs_with_a_singular_hessian(name, seed):
-    qp = drawn(seed, singular=True)
-    problem = lv.Problem.from_qp(**qp)
-    if not problem.has_singular_program:
-        return
-    answer, best = (lv.solve_qp(problem, of, tol=tol) for of, tol in ((name, 1e-6), ("auto", 1e-9)))
-    assert best.found, str(best)
-    # The others use up their budget or break down once in some hundred programs; `auto` then calls the next one.
-    if answer.found:
-        size = 1.0 + np.abs(answer.x).sum() + np.abs(answer.impulse).sum()
-        assert max(kkt(qp, answer)) <= 1e-5 * size
-        assert abs(answer.objective - best.objective) <= 1e-5 * size
-        own = answer.primal_residual, answer.dual_residual, answer.duality_gap
-        np.testing.assert_allclose(own, kkt(qp, answer), atol=1e-11 * size**2)
-    else:
-        assert name != "clarabel", str(answer)
 
 
 def test_solve_qp_with_a_singular_p_runs_a_backend_that_is_named():
@@ -434,29 +386,6 @@ def test_singular_programs_are_batched_and_continued():
 def test_a_time_limit_holds_for_a_singular_program(limit):
     answer = lv.solve_qp(SINGULAR, time_limit=limit)
     assert answer.found if limit > 1.0 else answer.solution.status.name in ("TIME_LIMIT", "CONVERGED")
-
-
-def chained(seed, n=150):
-    """A trajectory of n places with limits on them, on its steps and on some sums; P has two null directions."""
-    rng = np.random.default_rng(seed)
-    bend = sp.diags_array([np.ones(n - 2), -2.0 * np.ones(n - 2), np.ones(n - 2)], offsets=[0, 1, 2], shape=(n - 2, n))
-    step = sp.diags_array([-np.ones(n - 1), np.ones(n - 1)], offsets=[0, 1], shape=(n - 1, n))
-    x, some = np.cumsum(rng.uniform(-0.05, 0.05, n)), rng.normal(size=(3, n)) * (rng.random((3, n)) < 0.1)
-    parts = (bend.T @ bend, rng.normal(size=n), sp.vstack([step, -step]), np.full(2 * (n - 1), 0.1), some, some @ x)
-    return dict(zip(NAMES, (*parts, x - rng.random(n), x + rng.random(n)), strict=True))
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_a_trajectory_with_many_limits_is_solved_at_any_scale(seed):
-    qp = chained(seed)
-    answer = lv.solve_qp(lv.Problem.from_qp(**qp))
-    assert answer.found and max(kkt(qp, answer)) <= 1e-6
-    for cost, far in ((1e-6, 1e6), (1e8, 1e-6)):
-        scaled = qp | {"P": cost * qp["P"], "q": cost * far * qp["q"]}
-        scaled |= {name: far * qp[name] for name in ("h", "b", "lb", "ub")}
-        other = lv.solve_qp(lv.Problem.from_qp(**scaled))
-        assert other.found
-        assert other.objective == pytest.approx(cost * far**2 * answer.objective, rel=1e-6)
 
 
 @pytest.mark.parametrize(("seed", "n"), [(0, 300), (1, 800)])

@@ -2,7 +2,6 @@
 
 import copy
 import pickle
-import threading
 
 import numpy as np
 import pytest
@@ -389,18 +388,3 @@ def test_solve_many_of_a_list_begins_at_its_impulses():
         lv.residual_many(given, None)
     with pytest.raises(lv.InputError, match="problems is 3; a sequence of Problems, or a Batch"):
         lv.solve_many(3)
-
-
-def test_error_on_another_thread_is_raised_by_solve_many():
-    both, seen = threading.Barrier(2, timeout=10.0), set()
-
-    def callback(*_):
-        here = threading.current_thread()
-        if here not in seen:
-            seen.add(here)
-            both.wait()  # each thread has a world
-        if here is not threading.main_thread():
-            raise ZeroDivisionError("planted")
-
-    with pytest.raises(ZeroDivisionError, match="planted"):
-        lv.solve_many(list(lv.Batch(*worlds(2), cones=DISKS)), "pgs", threads=2, callback=callback)

@@ -9,7 +9,6 @@ import pytest
 from worked import energy
 
 import lavender as lv
-from lavender.sim.scene import SCENES
 
 G = 9.81
 
@@ -55,16 +54,6 @@ def test_thrown_bodies_gain_no_energy_and_do_not_pass_through_the_ground(seed):
 
 
 SMALL = {"pyramid": {"base": 4}, "pile": {"n": 20}, "chain": {"n": 8}, "bridge": {"n": 6}}
-
-
-@pytest.mark.parametrize("name", sorted(SCENES))
-def test_scene_without_motors_does_not_gain_energy(name):
-    scene = lv.Scene(name, **SMALL.get(name, {}))
-    sim = lv.Simulation(scene)
-    start = energy(scene, sim.reset()[0])
-    gained = max(energy(scene, sim.step()[0]) - start for _ in range(120))
-    # The position projection lifts bodies by a fraction of the slop, and sums are rounded.
-    assert gained <= 1e-5 * abs(start)
 
 
 @pytest.mark.parametrize("name", ["card_house", "bridge", "chain"])

@@ -118,19 +118,6 @@ def test_a_motor_turns_and_its_torque_is_bounded():
 # -- stacks and sweeps -----------------------------------------------------------------------------
 
 
-def test_position_projection_adds_no_kinetic_energy():
-    scene = lv.Scene(gravity=0.0, friction=0.0)
-    for x in (0.0, 0.7):
-        scene.add_box(position=(x, 0, 0), quaternion=(1, 0.1 * x, 0.2 * x, 0))
-    sim = lv.Simulation(scene)
-    assert sim.constraint_problem().m > 0
-    for _ in range(240):
-        observation = run(sim, 1)
-        assert not observation["velocities"].any()
-    # pushed apart without a speed, down to the slop
-    assert observation["contacts"]["depth"].max(initial=0.0) < 1.1 * scene.parameters.slop
-
-
 def slope(angle, turned, shape, **more):
     """Speed [m/s] down a slope after a second, the first tangent `turned` from the way down."""
     g, mu = 9.81, 0.5
