@@ -13,7 +13,8 @@ COMMANDS_PAGE = Path(__file__).resolve().parents[2] / "docs" / "commands.md"
 AIR = '<mujoco><worldbody><body><freejoint/><geom size="1" friction="1"/></body></worldbody></mujoco>'
 #: (code, command). FOLDER contains an unreadable file.
 ENDS = [
-    (0, "solve PROBLEM"), (1, "solve PROBLEM --solver pgs --max-iter 1"), (3, "solve INFEASIBLE --solver direct"),
+    (0, "solve PROBLEM"), (1, "solve PROBLEM --solver pgs --max-iter 1"),
+    (0, "solve PROBLEM --solver pgs --max-iter 1 --tol 0"), (3, "solve INFEASIBLE --solver direct"),
     (2, "solve PROBLEM --solver nobody"), (0, "check PROBLEM --solvers pgs,newton"), (0, "check PROBLEM"),
     (1, "check PROBLEM --solvers newton,pgs --tol 1e-12 --time-limit 1e-9"),
     (1, "check PROBLEM --time-limit 1e-9 --solvers pgs"), (1, "check FOLDER --solvers newton"),

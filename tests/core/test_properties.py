@@ -3,12 +3,13 @@
 import json
 import os
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 import scipy.sparse as sp
 from calls import installed
-from random_problems import random_bodies_and_contacts, random_contact_problem, spd
+from random_problems import CONTACTS, add_compliance, random_bodies_and_contacts, random_contact_problem, spd
 
 import lavender as lv
 from lavender.base import deadline
@@ -177,9 +178,9 @@ def test_certificate_of_an_ellipse_proves_in_the_given_tangents(mu):
 # -- backends ----------------------------------------------------------------------------------------------------------
 
 
-def build_rows_of_every_kind():
+def build_rows_of_every_kind(seed=2):
     """Build J and M with equal limits, two finite limits away from 0, an LCP row, a free row and a row of zeros."""
-    rng = np.random.default_rng(2)
+    rng = np.random.default_rng(seed)
     jac = rng.normal(size=(7, 8))
     jac[5] = 0.0
     low = np.array([0.3, 0.2, 0.0, -np.inf, -0.4, -0.5, -np.inf])
@@ -191,14 +192,31 @@ def build_rows_of_every_kind():
 @pytest.mark.parametrize("form", ["impulse", "velocity"])
 @pytest.mark.parametrize("name", installed("clarabel", "osqp", "daqp", "quadprog", "proxqp", "highs", "piqp", "scs"))
 def test_backend_form_with_nonzero_limits_agrees_with_newton(name, form):
-    problem = build_rows_of_every_kind()
-    expected = lv.solve(problem, "newton", tol=1e-13)
-    found = lv.solve(problem, name, form=form, tol=1e-7)
-    assert expected.success and found.success
-    np.testing.assert_allclose(found.impulse, expected.impulse, atol=1e-5)
-    np.testing.assert_allclose(found.slack, expected.slack, atol=1e-5)
-    if found.dual is not None and form == "impulse":
-        np.testing.assert_allclose(found.dual, -found.slack, atol=1e-4)
+    used = set()
+    for seed in (2, 4, 7):
+        problem = build_rows_of_every_kind(seed)
+        expected = lv.solve(problem, "newton", tol=1e-13)
+        found = lv.solve(problem, name, form=form, tol=1e-7)
+        assert expected.success and found.success
+        np.testing.assert_allclose(found.impulse, expected.impulse, atol=1e-5)
+        np.testing.assert_allclose(found.slack, expected.slack, atol=1e-5)
+        if found.dual is not None and form == "impulse":
+            np.testing.assert_allclose(found.dual, -found.slack, atol=1e-4)
+        used |= set(zip(range(7), expected.states.names, strict=True))
+    assert {(1, "free"), (1, "at a bound"), (6, "free"), (6, "at a bound")} <= used
+
+
+@pytest.mark.parametrize("form", ["impulse", "velocity"])
+@pytest.mark.parametrize("kind", ["one tangent", *(kind for kind in CONTACTS if kind != "ellipses")])
+def test_backend_of_cones_with_every_kind_of_contact_agrees_with_newton(kind, form):
+    pytest.importorskip("clarabel")
+    draw = CONTACTS.get(kind) or partial(random_contact_problem, tangents=1, spin=False)
+    for seed in (3, 4):
+        problem = add_compliance(draw(seed, "cone"), 0.1)
+        expected = lv.solve(problem, "newton" if kind != "boxes" else "direct", tol=1e-11)
+        found = lv.solve(problem, "clarabel_cone", form=form, tol=1e-6)
+        assert expected.success and found.success, f"{expected}, {found}"
+        np.testing.assert_allclose(found.impulse, expected.impulse, atol=1e-4)
 
 
 @pytest.mark.parametrize("form", ["J and M", "matrix"])

@@ -169,6 +169,14 @@ def test_diagnose_with_state_finds_every_planted_mistake(scenes):
                 assert count == total, (mistake, form)  # the state of the engine reveals every planted mistake
 
 
+@pytest.mark.parametrize("mistake", SHOWN_BY_STATE)
+def test_mistake_that_the_state_shows_is_reported_of_a_stack(scenes, mistake):
+    step = scenes["stack 0 2"]
+    assert kinds(step.problem, **step.state) == set()
+    wrong = MISTAKES[mistake](step)
+    assert SHOWN_BY_STATE[mistake] in kinds(wrong.problem, **wrong.state)
+
+
 @pytest.mark.parametrize("form", ["bodies", "J and M"])
 def test_velocity_of_gravity_without_dt_is_reported_without_the_state(scenes, form):
     """21 of the 30 steps show it; in the others, bodies move, or few contacts are with a static body."""

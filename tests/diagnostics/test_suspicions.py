@@ -50,8 +50,11 @@ def test_diagnose_of_opposed_or_repeated_contacts_reports_them(name):
         twice = dict(rows)
         for key in ("contact_body", "tangent", "arm_a", "arm_b"):
             twice[key] = np.concatenate([rows[key], rows[key][-1:]])
-        twice["normal"] = np.concatenate([rows["normal"], sign * rows["normal"][-1:]])
-        assert kind in kinds(lv.Problem.from_rows(lv.Rows(**twice), mu=0.5))
+        second = np.cross(rows["normal"][-1:], rows["tangent"][-1:])
+        for angle in (0.0, 0.3) if sign < 0.0 else (0.0,):  # [rad] Normals that are nearly opposite contradict, too.
+            normal = np.cos(angle) * rows["normal"][-1:] + np.sin(angle) * second
+            twice["normal"] = np.concatenate([rows["normal"], sign * normal])
+            assert kind in kinds(lv.Problem.from_rows(lv.Rows(**twice), mu=0.5))
 
 
 def test_diagnose_of_targets_in_wrong_order_reports_them():
@@ -269,6 +272,23 @@ def test_diagnose_impulse_far_above_momentum_is_reported(as_bodies):
     problem = thin_wall(1.0, as_bodies)
     far = lv.solve(problem, tol=1e-9).impulse + np.array([0.0, 1e6])
     assert "impulses" in [d.kind for d in lv.diagnose(problem, far)]
+
+
+@pytest.mark.parametrize("copies", [10, 200])
+def test_diagnose_limit_of_impulses_grows_with_the_rows(copies):
+    """A change of a velocity counts above max(1, rows / 100) 1e4 times the largest |v*| and |b|, 0.2 m/s."""
+    one = thin_wall(1.0, False).generalized
+    for factor, reported in ((0.5, False), (2.0, True)):
+        change = factor * 1e4 * max(1.0, 2 * copies / 100) * 0.2
+        jac = np.kron(np.eye(copies), one.jac.toarray())
+        jac[0, 0] = 0.05 / change
+        problem = lv.Problem.from_jacobian(
+            jac, 0.5 * np.eye(3 * copies), np.tile(one.v_free, copies), target=np.tile([0.05, 0.0], copies),
+            cones=lv.Cones.contacts(0.0, count=2 * copies, tangents=0),
+        )  # fmt: skip
+        solution = lv.solve(problem, tol=1e-9)
+        assert solution.success and problem.velocity(solution.impulse)[0] == pytest.approx(change, rel=0.01)
+        assert ("impulses" in kinds(problem, solution.impulse)) == reported, factor
 
 
 def test_diagnose_light_body_thrown_away_is_reported():

@@ -60,11 +60,20 @@ def test_solver_whose_refusal_raises_is_refused_alone(register):
 
 
 def test_claim_of_more_iterations_than_the_limit_is_a_numerical_error(plug_in):
-    name = plug_in(lambda problem, impulse: lv.Claim(lv.Status.MAX_ITERATIONS, 7, {}))
+    name = plug_in(lambda problem, impulse: lv.Claim(lv.Status.MAX_ITERATIONS, 6, {}))
     solution = lv.solve(TINY, name, max_iter=5)
     assert solution.status is lv.Status.NUMERICAL_ERROR
-    assert "claims 7 iterations, more than the limit of 5" in solution.message
-    assert lv.solve(TINY, name, max_iter=7).iterations == 7
+    assert "claims 6 iterations, more than the limit of 5" in solution.message
+    assert lv.solve(TINY, name, max_iter=6).iterations == 6
+
+
+def test_arrays_of_a_claim_are_copied(plug_in):
+    """A plug-in may write to the arrays that it returned, which must not change the solution."""
+    own = np.full(TINY.m, 0.5)
+    name = plug_in(lambda problem, impulse: lv.Claim(lv.Status.STALLED, 1, {}, dual=own, certificate=own))
+    solution = lv.solve(TINY, name)
+    own += 1.0
+    assert (solution.dual == 0.5).all() and not solution.dual.flags.writeable
 
 
 def test_message_names_the_row_whose_impulse_is_not_finite(plug_in):
