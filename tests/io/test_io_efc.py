@@ -268,3 +268,8 @@ def test_from_efc_of_coulomb_law_on_unsupported_contacts_raises():
         lv.io.from_efc(**given, friction="coulomb")
     with pytest.raises(lv.InputError, match="friction"):
         lv.io.from_efc(**given, friction="ccp")
+    model = mj.MjModel.from_xml_string(scene(cone="elliptic", condim=3))
+    given = stacked(model, states_of(model, 2), np.float64)
+    given["contacts"][3][:, 1] *= 2.0
+    with pytest.raises(lv.CapabilityError, match="different coefficients of its tangents"):
+        lv.io.from_efc(**given, friction="coulomb")

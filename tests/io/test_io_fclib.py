@@ -176,6 +176,11 @@ def test_equations_become_free_rows(tmp_path):
     assert np.array_equal(glob.b, loc.b)
     assert glob.cones == loc.cones
     assert np.all(np.isinf([glob.cones.lower[3], glob.cones.upper[3]]))
+    with h5py.File(tmp_path / "l.h5", "a") as file:
+        for name, x in (("r", [1.0, 0.2, 0.3]), ("u", [0.0, 0.5, 0.0]), ("l", [7.0])):
+            file[f"solution/{name}"] = x
+    stored = lavender.io.read(tmp_path / "l.h5")  # On an equation the slack is 0.
+    assert (stored.impulse.tolist(), stored.slack.tolist()) == ([1.0, 0.2, 0.3, 7.0], [0.0, 0.5, 0.0, 0.0])
 
 
 def test_both_forms_are_read_as_local(tmp_path):

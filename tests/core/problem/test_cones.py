@@ -54,6 +54,7 @@ def test_projection_is_feasible_idempotent_and_nearest(seed, size):
         ("upper", 0, -np.inf, "row 0: lower = -inf, upper = -inf"),
         ("lower", 0, -1e61, "lower must be at most 1e[+]60"), ("mu", 1, -0.5, "mu must not be negative"),
         ("mu", 1, 1e-70, "mu must be 0 or at least 1e-60"), ("patch_radius", 1, -1.0, "patch_radius"),
+        ("mu", 1, 1e-60, "mu patch_radius .* must be 0 or at least 1e-60"),
         ("rolling", 0, -1.0, "rolling"), ("kind", 1, 4, "block 1 is a box"),
         ("ptr", 1, 0, "must start with 0 and increase"),
     ],

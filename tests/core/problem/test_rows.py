@@ -172,3 +172,29 @@ def test_carry_random_keys_equals_an_assignment_by_a_dict(seed):
         if i is not None and old.kind[i] == new.kind[j]:
             wanted[new.ptr[j] : new.ptr[j + 1]] = impulse[old.ptr[i] : old.ptr[i + 1]]
     assert np.array_equal(now.carry((before, impulse)), wanted)
+
+
+@pytest.mark.parametrize("size", [1.5e-9, 1e-7, 4e-6])
+@pytest.mark.parametrize("kind", ["skew", "long normal", "long tangent"])
+def test_rows_of_slightly_wrong_frames_have_the_nearest_orthonormal_frames(kind, size):
+    given = fields(4)
+    exact = {name: given[name].copy() for name in ("normal", "tangent")}
+    if kind == "skew":
+        given["tangent"] += size * given["normal"]
+    else:
+        given[kind.removeprefix("long ")] *= 1.0 + size
+    rows = lv.Rows(**given)
+    assert np.abs((rows.normal * rows.tangent).sum(axis=1)).max() <= 4.0 * 2.0**-53
+    for name, expected in exact.items():
+        found = getattr(rows, name)
+        np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1.0, rtol=2e-15)
+        np.testing.assert_allclose(found, expected, atol=2.0 * size)
+
+
+def test_rows_of_an_inverse_inertia_that_rounding_made_indefinite_have_a_semidefinite_one():
+    given = fields(4)
+    q = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    given["inv_inertia"][0] = q @ np.diag([3.0, 1.0, -1e-6]) @ q.T
+    rows = lv.Rows(**given)
+    assert np.linalg.eigvalsh(rows.inv_inertia[0])[0] >= -1e-15
+    np.testing.assert_allclose(rows.inv_inertia[0], q @ np.diag([3.0, 1.0, 0.0]) @ q.T, atol=1e-14)
