@@ -1,5 +1,6 @@
 """Room, start and step: the same method without Python, in any number of turns."""
 
+import numpy as np
 import pytest
 from calls import REACHED, driven
 from hypothesis import given
@@ -28,3 +29,14 @@ def test_contacts_are_solved_as_newton_solves_them(friction, seed, rolling):
         if problem.rows is None:  # one method: over bodies other columns may be left out, over rows nothing differs
             assert (how == REACHED) == expected.success
             assert done == pytest.approx(expected.work["factorisations"], abs=2)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_driver_of_an_asymmetric_matrix_converges_quadratically(seed):
+    """With a factor of another matrix, the last step would leave an error just below the tolerance."""
+    rng, m = np.random.default_rng(seed), 12
+    half, skew = rng.normal(size=(m, m)), rng.normal(size=(m, m))
+    a = half @ half.T / m + 0.3 * np.eye(m) + 0.3 * (skew - skew.T)
+    problem = lv.Problem.lcp(a, 3.0 * rng.normal(size=m), -0.2, 0.5)
+    how, _, relative, _ = driven(problem)
+    assert how == REACHED and relative <= 1e-13

@@ -68,3 +68,28 @@ def test_lemke_stopped_by_its_budget_keeps_its_point():
     ):
         with pytest.raises(lv.CapabilityError, match=words):
             lv.solve(lv.Problem(np.ones(5001), cones, sp.eye_array(5001, format="csr")), "lemke")
+
+
+@pytest.mark.parametrize("n", [3, 5, 9])  # Even matrices have several solutions.
+@pytest.mark.parametrize("transposed", [False, True])
+def test_lemke_of_a_cyclic_matrix_whose_ratios_are_all_equal_ends_in_one_path(n, transposed):
+    """Without a rule for equal ratios, bases of this matrix return (Kostreva 1979)."""
+    a = np.eye(n) + 2.0 * np.roll(np.eye(n), 1, axis=0)
+    solution = lv.solve(lv.Problem.lcp(a.T if transposed else a, np.ones(n)), "lemke")
+    np.testing.assert_allclose(solution.impulse, 1.0 / 3.0)
+    assert solution.work["paths"] == 1 and solution.work["pivots"] <= n * n
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_lemke_proves_that_free_and_bounded_rows_contradict_in_one_path(seed):
+    """A y = 0 and b.y > 0, with y of both signs on the free rows."""
+    rng, m = np.random.default_rng(seed), 8
+    y = np.r_[rng.normal(size=3), rng.uniform(0.5, 1.0, 5)]
+    half, b = rng.normal(size=(m, m - 1)), rng.normal(size=m)
+    half -= np.outer(y, y @ half) / (y @ y)
+    b += y * (0.5 - b @ y) / (y @ y)
+    solution = lv.solve(lv.Problem.lcp(half @ half.T, b, np.r_[np.full(3, -np.inf), np.zeros(5)], np.inf), "lemke")
+    assert solution.status is lv.Status.INFEASIBLE and solution.claim_check == "confirmed"
+    assert solution.work["paths"] == 1
+    direction = solution.certificate / np.abs(solution.certificate).max()
+    np.testing.assert_allclose(direction, y / np.abs(y).max(), atol=1e-9)

@@ -8,7 +8,7 @@ import scipy.sparse as sp
 from ball_pile import Pile
 from calls import block_diagonal, dense_h, system_in
 from hypothesis import given
-from random_problems import FORMS, as_matrix, good, random_contact_problem, seeds
+from random_problems import CONTACTS, FORMS, add_compliance, as_matrix, good, random_contact_problem, seeds
 from stacks import bricks
 
 import lavender as lv
@@ -308,3 +308,15 @@ def test_newton_jacobian_with_two_bounds_takes_few_steps(seed):
     problem = lv.Problem.from_jacobian(jac, np.eye(60), rng.normal(size=60), cones=cones)
     solution = lv.solve(problem, "newton", tol=1e-9)
     assert solution.success and solution.work["factorisations"] <= 6  # Exchanges over rows took 1 to 3.
+
+
+@pytest.mark.parametrize("form", ["rows", "matrix"])
+def test_newton_of_cones_takes_as_many_steps_for_large_friction_as_for_small(form):
+    """Between 16 and 21 steps for coefficients from 1/8 to 16."""
+    for seed in (3, 5, 7):
+        bodies = add_compliance(CONTACTS["disks"](seed, "cone"), 0.02)
+        for power in range(-3, 5):
+            mu = np.where(bodies.cones.n_tangents > 0, 2.0**power, 0.0)
+            problem = FORMS[form](replace(bodies, cones=replace(bodies.cones, mu=mu)))
+            solution = lv.solve(problem, "newton", tol=1e-9)
+            assert solution.success and solution.iterations <= 30, f"{seed}, {power}: {solution}"
