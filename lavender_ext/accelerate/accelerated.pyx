@@ -29,12 +29,12 @@ from libc.stdint cimport int32_t, int64_t, uint64_t
 from lavender_ext.accelerate.accelerated cimport AUTOMATIC, acceleration_t
 from lavender_ext.accelerate.mixing cimport (CONTROL, MAX_MEMORY, UNDONE, clear_mixing_memory, mix_anderson_iterates, mixing_t,
                                              store_evaluation)
-from lavender_ext.core.block cimport clip, euclidean_norm
 from lavender_ext.core.order cimport SYMMETRIC
-from lavender_ext.core.block_types cimport CONE, blocks_t, has_independent_rows, get_friction_components, friction_components_t
+from lavender_ext.core.block_types cimport CONE, blocks_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.start cimport is_zero_impulse
 from lavender_ext.core.view cimport view_t
+from lavender_ext.judge.bounds cimport project_block_on_bounds
 from lavender_ext.sweep.serial cimport (Sweeps, compute_sweep_velocities, sweep_over_form, sweep_context_t, sweep_run_t,
                                         count_sweep_velocities)
 
@@ -62,26 +62,6 @@ cdef inline void sweep_once_in_order(acceleration_t* c, double* lam, int32_t fir
         exact = True
     for k in range(2 if c.sweeps.mode == SYMMETRIC else 1):
         sweep_over_form(c.sweeps, p, exact, lam, first and k == 0)
-
-
-cdef inline void project_block_to_bounds(const blocks_t* p, int32_t i, double* lam) noexcept nogil:
-    """Project the impulses of block i in lam (m) to their bounds, the normal before the friction that it bounds."""
-    cdef int32_t j = p.ptr[i], g, k
-    cdef double bound, size
-    cdef friction_components_t q
-    if has_independent_rows(p, i):
-        for k in range(j, p.ptr[i + 1]):
-            lam[k] = clip(lam[k], p.lower[k], p.upper[k])
-        return
-    if lam[j] < 0.0:
-        lam[j] = 0.0
-    get_friction_components(p, i, &q)
-    for g in range(q.n):
-        bound = q.friction_coefficient[g] * lam[j]
-        size = euclidean_norm(lam + j + q.first[g], q.size[g])
-        if size > bound:
-            for k in range(j + q.first[g], j + q.first[g] + q.size[g]):
-                lam[k] *= bound / size
 
 
 cdef inline double weighted_dot(const double* d, const double* x, const double* y, int32_t m) noexcept nogil:
@@ -233,7 +213,7 @@ cdef public void lav_anderson(void* context, double* lam, int32_t first_sweep, i
         mixed = mix_anderson_iterates(&mixing, lam, 1.0 / 0.0)
         if mixed:
             for i in range(p.n_blocks):
-                project_block_to_bounds(p, i, lam)
+                project_block_on_bounds(p, i, 1.0, lam)
             compute_sweep_velocities(c.sweeps, lam)
         for i in range(m):
             x[i] = lam[i]

@@ -20,7 +20,7 @@ from lavender_ext.core.problem cimport (DERIVED, bind_derived_row_arrays, comput
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.driver.driver cimport NEWTON
 from lavender_ext.factor.factors cimport has_wide
-from lavender_ext.judge.best cimport project_far_excess, project_on_bounds
+from lavender_ext.judge.bounds cimport project_far_excess, project_on_bounds
 from lavender_ext.judge.measure cimport (refine_reported_view, residual_above_floor, set_zero_impulse, relative_floor_of_score,
                                          score_given_generalized_slack, judge_zero_impulse,
                                          relative_residual_of_score, count_judge_scratch)

@@ -7,32 +7,33 @@
 
     f = 1/2 lam.A lam - b.lam = 1/2 lam.(w - b)
 
-An island that one iterate has solved keeps it.
+An island that one iterate has solved keeps it. Two kinds of iterates do not count: an iterate that is not finite, and an iterate
+so large that rounding of its slack may hide a thousandth of b.
 
-Which iterates count. Three kinds do not: an iterate that is not finite; an iterate so large that rounding of its slack may hide a
-thousandth of b; and, if A is symmetric, an iterate with a larger f than the default zero impulse.
+E decides if rounding may explain the difference of two f. E also decides in a problem without a solution, because f then falls
+without end, and there the zero impulse counts. A problem counts as one without a solution if this is proven (`by_energy`), or
+if an island diverges or has a residual above 1 after 64 sweeps. The second case does not apply while a bounded row, such as a
+motor, still runs up to a bound.
 
-When E decides. E decides if rounding may explain the difference of two f. E also decides in a problem without a solution, because
-f then falls without end, and there the zero impulse counts. A problem counts as one without a solution if this is proven
-(`by_energy`), or if an island diverges or has a residual above 1 after 64 sweeps. The second case does not apply while a bounded
-row, such as a motor, still runs up to a bound.
-
-Where an island begins. A start that does not meet tol is replaced by the zero impulse in two cases: if A is symmetric and the zero
-impulse has the lower f, or if the zero impulse solves the island. The zero impulse then counts.
+A start that does not meet tol is replaced by the zero impulse in two cases: if A is symmetric and the zero impulse has the lower
+f, or if the zero impulse solves the island. The zero impulse then counts.
 """
 from libc.math cimport INFINITY, fabs
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy
 
-from lavender_ext.core.block cimport clip, euclidean_norm
-from lavender_ext.core.block_types cimport (CONE, blocks_t, friction_components_t, get_friction_components, has_independent_rows,
-                                            is_round_cone_contact)
+from lavender_ext.core.block_types cimport CONE, blocks_t, friction_components_t, get_friction_components, has_independent_rows
 from lavender_ext.core.csr cimport measure_asymmetry_and_bandwidth
-from lavender_ext.core.validate cimport all_finite
 from lavender_ext.core.start cimport clip_zero_to_row_bounds, is_zero_impulse
 from lavender_ext.core.view cimport view_t
 from lavender_ext.judge.score cimport score_t, unit_roundoff
 from lavender_ext.judge.tally cimport get_island_block, index_of_island_begin, index_of_island_end
+
+
+cdef struct objective_t:
+    double value                # J, f of an impulse in one island
+    double rounding             # J, what rounding may change in it
+    int32_t hides_b             # whether rounding of the slack may hide a thousandth of b
 
 
 cdef struct best_t:
@@ -47,7 +48,6 @@ cdef struct best_t:
     double* energy              # (n) sqrt J, energy error of `impulse`; infinite for the zero impulse under (3)
     double* objective           # (n) J, f of `impulse`
     double* now                 # (n, 2) -, sqrt J: relative residual and energy of the next impulse, for `score_t.by_island`
-    double* objective_now       # (n) J, f of the next impulse
     int32_t* cursor             # (m) scratch
 
 
@@ -58,7 +58,7 @@ cdef inline int32_t count_islands(const blocks_t* p) noexcept nogil:
 
 cdef inline int64_t best_workspace_size(int64_t m, int64_t n) noexcept nogil:
     """Return the number of doubles that `bind_best` needs for m rows in n islands."""
-    return 2 * m + 7 * n + (m + 1) // 2
+    return 2 * m + 6 * n + (m + 1) // 2
 
 
 cdef inline void bind_best(best_t* s, const blocks_t* p, double* workspace) noexcept nogil:
@@ -68,8 +68,7 @@ cdef inline void bind_best(best_t* s, const blocks_t* p, double* workspace) noex
     s.impulse, s.begin, s.begin_energy = workspace, workspace + p.n_rows, workspace + 2 * <ssize_t>p.n_rows
     s.relative = s.begin_energy + n
     s.energy, s.objective, s.now = s.relative + n, s.relative + 2 * n, s.relative + 3 * n
-    s.objective_now = s.relative + 5 * n
-    s.cursor = <int32_t*>(s.relative + 6 * n)
+    s.cursor = <int32_t*>(s.relative + 5 * n)
 
 
 cdef inline void copy_score_without_islands(best_t* s, const blocks_t* p, const score_t* x, double relative) noexcept nogil:
@@ -86,113 +85,24 @@ cdef inline void copy_island_impulse(const blocks_t* p, int32_t island, const do
         memcpy(out + p.ptr[i], lam + p.ptr[i], (p.ptr[i + 1] - p.ptr[i]) * sizeof(double))
 
 
-cdef inline void project_on_bounds(const blocks_t* p, double* lam) noexcept nogil:
-    """Project a finite lam (m) on its bounds: rows and normals first, then each friction component on its bound."""
-    cdef int32_t i, g, k, j
-    cdef double size, bound
-    cdef friction_components_t q
-    if not all_finite(lam, p.n_rows):
-        return
-    for i in range(p.n_blocks):
-        j = p.ptr[i]
-        if has_independent_rows(p, i):
-            for k in range(j, p.ptr[i + 1]):
-                lam[k] = clip(lam[k], p.lower[k], p.upper[k])
-            continue
-        lam[j] = max(lam[j], 0.0)
-        get_friction_components(p, i, &q)
-        for g in range(0 if is_round_cone_contact(p, i) else q.n):      # A round cone has a metric of its own.
-            size, bound = euclidean_norm(lam + j + q.first[g], q.size[g]), q.friction_coefficient[g] * lam[j]
-            # A component that rounding has left above its bound is not scaled twice.
-            for k in range(j + q.first[g], j + q.first[g] + q.size[g] if size > (1.0 + 8.0 * unit_roundoff()) * bound else 0):
-                lam[k] = clip(lam[k], -bound, bound) if q.size[g] == 1 else lam[k] * (bound / size)
-
-
-cdef inline bint is_within_bounds(const blocks_t* p, const double* lam) noexcept nogil:
-    """Return whether `project_on_bounds` leaves lam (m) unchanged."""
-    cdef int32_t i, g, k, j
-    cdef friction_components_t q
-    for i in range(p.n_blocks):
-        j = p.ptr[i]
-        for k in range(j, p.ptr[i + 1] if has_independent_rows(p, i) else j):
-            if lam[k] < p.lower[k] or lam[k] > p.upper[k]:
-                return False
-        if has_independent_rows(p, i):
-            continue
-        if lam[j] < 0.0:
-            return False
-        get_friction_components(p, i, &q)
-        for g in range(0 if is_round_cone_contact(p, i) else q.n):
-            if euclidean_norm(lam + j + q.first[g], q.size[g]) > (
-                    1.0 + 8.0 * unit_roundoff()) * q.friction_coefficient[g] * lam[j]:
-                return False
-    return True
-
-
-cdef inline bint project_far_excess(const blocks_t* p, double* lam, double* before) noexcept nogil:
-    """Project lam (m) on its bounds if a number exceeds them by more than 1e-6 of itself; return whether it was.
-
-    Smaller excesses stay, as in the C library, with the same bits. before (m) is lam as it came.
-    """
-    cdef int32_t i
-    if is_within_bounds(p, lam):
-        return False
-    memcpy(before, lam, p.n_rows * sizeof(double))
-    project_on_bounds(p, lam)
-    for i in range(p.n_rows):
-        if fabs(lam[i] - before[i]) > 1e-6 * fabs(before[i]):
-            return True
-    memcpy(lam, before, p.n_rows * sizeof(double))
-    return False
-
-
 # -- objectives -------------------------------------------------------------------------------------------------------
 
 
-cdef inline void compute_objectives(best_t* s, const blocks_t* p, const double* lam, const double* w) noexcept nogil:
-    """Compute `objective_now` of lam (m) with slack w (m); two sums shorten the chain of additions."""
-    cdef int32_t island, a, i, k
-    cdef double even, odd
-    if s.by_energy:
-        return
-    for island in range(s.n):
-        even = odd = 0.0
-        for a in range(index_of_island_begin(p, island), index_of_island_end(p, island)):
-            i = get_island_block(p, a)
-            k = p.ptr[i]
-            while k + 2 <= p.ptr[i + 1]:
-                even += lam[k] * (w[k] - p.b[k])
-                odd += lam[k + 1] * (w[k + 1] - p.b[k + 1])
-                k += 2
-            if k < p.ptr[i + 1]:
-                even += lam[k] * (w[k] - p.b[k])
-        s.objective_now[island] = 0.5 * (even + odd)
-
-
-cdef inline double rounding_of_objective(const blocks_t* p, int32_t island, const double* lam, const double* w) noexcept nogil:
-    """Return what rounding may change in the f of lam (m) with slack w (m) [J].
+cdef inline objective_t measure_objective(const blocks_t* p, int32_t island, const double* lam, const double* w) noexcept nogil:
+    """Return the f of lam (m) with slack w (m) in an island, and what rounding may change in it.
 
     A slack and b are sums over dozens of terms. On a stack of six boxes the f of two solutions differ by 1.6e-15 J, four times
     as much as 8 roundings of each row's largest terms. In 60 steps of such stacks, 64 roundings were not enough in two.
     """
     cdef int32_t a, i, k
-    cdef double size = 0.0
+    cdef double total = 0.0, size = 0.0, largest = 0.0, velocity = 0.0
     for a in range(index_of_island_begin(p, island), index_of_island_end(p, island)):
         i = get_island_block(p, a)
         for k in range(p.ptr[i], p.ptr[i + 1]):
+            total += 0.5 * lam[k] * (w[k] - p.b[k])
             size += fabs(lam[k]) * ((fabs(w[k]) + fabs(p.b[k])) + p.d[k] * fabs(lam[k]))
-    return 1024.0 * unit_roundoff() * size
-
-
-cdef inline bint is_b_hidden(const blocks_t* p, int32_t island, const double* lam) noexcept nogil:
-    """Return whether lam (m) is so large that rounding of its slack may hide a thousandth of b."""
-    cdef int32_t a, i, k
-    cdef double largest = 0.0, velocity = 0.0
-    for a in range(index_of_island_begin(p, island), index_of_island_end(p, island)):
-        i = get_island_block(p, a)
-        for k in range(p.ptr[i], p.ptr[i + 1]):
             largest, velocity = max(largest, fabs(p.b[k])), max(velocity, p.d[k] * fabs(lam[k]))
-    return unit_roundoff() * velocity > 1e-3 * largest
+    return objective_t(total, 1024.0 * unit_roundoff() * size, unit_roundoff() * velocity > 1e-3 * largest)
 
 
 cdef inline bint is_matrix_symmetric(best_t* s, const view_t* v) noexcept nogil:
@@ -222,36 +132,27 @@ cdef inline bint minimises_objective(best_t* s, const view_t* v, int32_t island)
 # -- iterates ---------------------------------------------------------------------------------------------------------
 
 
-cdef inline bint is_better_in_island(best_t* s, const view_t* v, int32_t island, const double* lam, const double* w,
-                                     double tol) noexcept nogil:
-    """Return whether lam (m), scored in `now`, with slack w (m), is returned rather than `impulse`."""
-    cdef double difference = s.objective_now[island] - s.objective[island]
+cdef inline bint is_better_in_island(best_t* s, const view_t* v, int32_t island, const objective_t* f, double tol) noexcept nogil:
+    """Return whether the impulse scored in `now`, with objective f, is returned rather than `impulse`."""
+    cdef double difference = f.value - s.objective[island]
     cdef bint better = s.now[2 * island + 1] < s.energy[island]
     if s.relative[island] <= tol or s.now[2 * island] <= tol:
         return not s.relative[island] <= tol
-    if not s.now[2 * island] < INFINITY:
-        return False
-    if not s.by_energy and better != (difference < 0.0) and fabs(difference) > rounding_of_objective(&v.p, island, lam, w):
-        if minimises_objective(s, v, island) or (s.energy[island] == INFINITY and is_matrix_symmetric(s, v)):
-            better = difference < 0.0
-    return better and not is_b_hidden(&v.p, island, lam)
-
-
-cdef inline void store_island(best_t* s, const view_t* v, int32_t island, const double* lam) noexcept nogil:
-    """Store lam (m), scored in `now`, in one island."""
-    s.relative[island], s.energy[island] = s.now[2 * island], s.now[2 * island + 1]
-    s.objective[island] = s.objective_now[island]
-    copy_island_impulse(&v.p, island, lam, s.impulse)
+    if better != (difference < 0.0) and fabs(difference) > f.rounding and minimises_objective(s, v, island):
+        better = difference < 0.0
+    return better and not f.hides_b and s.now[2 * island] < INFINITY
 
 
 cdef inline bint store_better_islands(best_t* s, const view_t* v, const double* lam, const double* w, double tol) noexcept nogil:
     """Store lam (m), scored in `now`, with slack w (m), in the islands in which it is better; return whether there is one."""
     cdef int32_t i
+    cdef objective_t f
     cdef bint changed = False
-    compute_objectives(s, &v.p, lam, w)
     for i in range(s.n):
-        if s.seen == 0 or is_better_in_island(s, v, i, lam, w, tol):
-            store_island(s, v, i, lam)
+        f = measure_objective(&v.p, i, lam, w)
+        if s.seen == 0 or is_better_in_island(s, v, i, &f, tol):
+            s.relative[i], s.energy[i], s.objective[i] = s.now[2 * i], s.now[2 * i + 1], f.value
+            copy_island_impulse(&v.p, i, lam, s.impulse)
             changed = True
     s.seen += 1
     return changed
@@ -321,16 +222,13 @@ cdef inline bint begin_at_better_point(const blocks_t* p, const double* now, dou
     now (n, 2) has the relative residuals of lam, at_zero is that of the zero impulse over all rows.
     """
     cdef int32_t island, a, i, k
-    cdef double zero, objective
+    cdef double zero
+    cdef objective_t f
     cdef bint changed = False
     for island in range(count_islands(p)):
-        zero, objective = relative_residual_at_zero(p, island, at_zero), 0.0
-        for a in range(index_of_island_begin(p, island), index_of_island_end(p, island)):
-            i = get_island_block(p, a)
-            for k in range(p.ptr[i], p.ptr[i + 1]):
-                objective += 0.5 * lam[k] * (w[k] - p.b[k])
+        zero, f = relative_residual_at_zero(p, island, at_zero), measure_objective(p, island, lam, w)
         if now[2 * island] <= tol or now[2 * island] < INFINITY and not (zero < 0.5 and zero < now[2 * island]) and not (
-                symmetric and objective > rounding_of_objective(p, island, lam, w) and is_zero_impulse_of_island(p, island, NULL)):
+                symmetric and f.value > f.rounding and is_zero_impulse_of_island(p, island, NULL)):
             continue
         for a in range(index_of_island_begin(p, island), index_of_island_end(p, island)):
             i = get_island_block(p, a)

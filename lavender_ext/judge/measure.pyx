@@ -13,9 +13,9 @@ from lavender_ext.core.block_types cimport blocks_t, islands_t
 from lavender_ext.core.problem cimport Data, Workspace, allocate_bytes
 from lavender_ext.core.velocity cimport compute_velocity_change
 from lavender_ext.core.view cimport generalized_t, view_t
+from lavender_ext.judge.bounds cimport project_far_excess, project_on_bounds
 from lavender_ext.judge.best cimport (best_workspace_size, best_t, bind_best, count_islands, copy_score_without_islands,
-                                      is_within_bounds, project_far_excess, project_on_bounds, store_better_islands,
-                                      store_start)
+                                      store_better_islands, store_start)
 from lavender_ext.judge.forms cimport (compute_csr_slack, judge_impulse_over_bodies, judge_impulse_over_csr,
                                        judge_impulse_over_generalized, score_generalized_slack)
 from lavender_ext.judge.measure cimport (residual_above_floor, set_zero_impulse, relative_floor_of_score,
@@ -428,12 +428,10 @@ def combine_best_islands(Data p, impulse, list impulses, double tol, bint by_ene
 
 def project_far_excess_of(Data p, impulse):
     """Return an impulse (m,) [N s] as `project_far_excess` projects it, or the impulse itself if it stays as it is."""
-    cdef const double* lam = as_double_pointer(impulse, p.blocks.n_rows)
+    cdef Py_ssize_t m = p.blocks.n_rows
     cdef double[::1] inside
-    if p.blocks.n_rows == 0 or is_within_bounds(&p.blocks, lam):
-        return impulse
     both = inside = np.concatenate([impulse, impulse])
-    return both[: p.blocks.n_rows] if project_far_excess(&p.blocks, &inside[0], &inside[p.blocks.n_rows]) else impulse
+    return both[:m] if m and project_far_excess(&p.blocks, &inside[0], &inside[m]) else impulse
 
 
 def write_velocity_change(Data p, const double[::1] lam, double[:, ::1] v):

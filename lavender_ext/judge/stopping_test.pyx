@@ -8,8 +8,9 @@ import numpy as np
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport view_t
-from lavender_ext.judge.best cimport (count_islands, copy_score_without_islands, project_on_bounds, relative_residual_of_best,
-                                      restore_best_islands, store_better_islands, store_start)
+from lavender_ext.judge.bounds cimport project_on_bounds
+from lavender_ext.judge.best cimport (count_islands, copy_score_without_islands, relative_residual_of_best, restore_best_islands,
+                                      store_better_islands, store_start)
 from lavender_ext.judge.measure cimport (residual_above_floor, relative_floor_of_score, judge_view, refine_view,
                                          relative_residual_of_score, count_judge_scratch)
 from lavender_ext.judge.progress cimport residual_envelope_slope, record_impulse, has_stalled, record_residual

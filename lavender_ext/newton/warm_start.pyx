@@ -15,7 +15,8 @@ from lavender_ext.core.start cimport is_zero_impulse
 from lavender_ext.core.velocity cimport compute_velocity_change
 from lavender_ext.core.view cimport rows_t
 from lavender_ext.factor.linear cimport analyse_band, factor_linear_system_matrix, solve_linear_system, linear_t
-from lavender_ext.judge.best cimport begin_at_better_point, project_on_bounds
+from lavender_ext.judge.bounds cimport project_on_bounds
+from lavender_ext.judge.best cimport begin_at_better_point
 from lavender_ext.judge.measure cimport score_given_slack
 from lavender_ext.judge.score cimport make_empty_score, relative_residual, score_t
 from lavender_ext.judge.slack cimport compute_body_slack

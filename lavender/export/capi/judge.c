@@ -52,7 +52,7 @@ static void begin_at_start(lav_solver *s, double tol) {
   int32_t i = 0;
   while (i < s->p.n_rows && s->impulse[i] == core_start_clip_zero_to_row_bounds(&s->p, i)) i++;
   if (i == s->p.n_rows) return;
-  judge_best_project_on_bounds(&s->p, s->impulse);
+  judge_bounds_project_on_bounds(&s->p, s->impulse);
   if (see(s, s->impulse, -tol) != 0.0) s->driven = 0;
 }
 #endif
