@@ -27,9 +27,9 @@ from lavender.solvers.islands import find_islands
 from lavender.solvers.newton_systems import general
 from lavender_ext.batch.many import Limits, solve_new_generalized_problem
 from lavender_ext.newton.solve import MAX_ROWS_ALWAYS_DENSE
-from lavender_ext.small.call import Islands, Rules, Small
+from lavender_ext.small.call import Rules, Small
 
-# Key in `Derived.cache` of the problem's compiled call, a `Small` or `Islands`; its value is False if there is none.
+# Key in `Derived.cache` of the problem's compiled call, a `Small`; its value is False if there is none.
 COMPILED_CALL_KEY = "lavender.solvers.small: compiled call"
 
 #: Messages if no solver ran, by the status of the start.
@@ -97,7 +97,7 @@ def _make_call(problem: Problem) -> Small | None:
         return Small(data, problem.csr_data if bounded else data)
     # Newton's method factors over the bodies if these have fewer unknowns than there are rows, otherwise over A.
     bodies = problem.rows is not None and problem.m > 6 * problem.rows.n_bodies
-    return Islands(data, data if bodies else problem.csr_data)
+    return Small(data, data if bodies else problem.csr_data, True)
 
 
 def call_uses_pivots(problem: Problem) -> bool:

@@ -296,7 +296,7 @@ cdef inline bint prepare_task_for_small_call(task_t* j, small_problem_t* s, task
     if not (grow_workspace_to(&workspaces.call.work, 0, 3 * m + count_judge_scratch(&s.v))
             and judge_zero_impulse_of_task(j, &workspaces.islands, workspaces.call.work.real)):
         return False
-    s.v.p = j.p
+    s.v.p, s.by_island = j.p, False
     s.over = s.v
     s.zero_residual[0], s.zero_residual[1], s.zero_residual[2] = j.zero_residual[0], j.zero_residual[1], j.zero_residual[2]
     return j.zero_residual[2] >= 0.0

@@ -33,6 +33,7 @@ cdef struct small_problem_t:
     double zero_residual[3]     # E0, V0, relative residual of the zero impulse
     int32_t band                # half bandwidth of A for bounded rows; m - 1 if A is not symmetric
     int32_t split               # number of joint blocks, which are swept before the contacts
+    bint by_island              # `v.p.islands` are solved one by one
     bint pivots, linear, symmetric      # all rows are bounded; all rows are free; A is symmetric
     const int32_t* at           # offsets into `prepared` if blocks are solved exactly (`prepare_exact_blocks`), else NULL
     const double* prepared
@@ -50,7 +51,7 @@ cdef bint are_all_rows_bounded(const blocks_t* p) noexcept nogil
 cdef bint derive_small_problem(small_problem_t* s, workspace_t* workspace) noexcept nogil
 cdef void judge_small_impulse(small_problem_t* s, const double* lam, double* both, double* scratch) noexcept nogil
 cdef int32_t solve_small(small_problem_t* s, const small_rules_t* rules, double* own, bint cold, double tol, deadline_t* deadline,
-                         double* both, solve_workspaces_t* workspaces, int32_t* counts) noexcept nogil
+                         double* both, solve_workspaces_t* workspaces, int32_t* counts) except -1 nogil
 
 
 cdef class Rules:

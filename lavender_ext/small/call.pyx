@@ -2,7 +2,7 @@
 
     bounded rows   factorisation of A, linear or with bounds, a shift if A is singular, refinement   (pivot/direct.pyx);
                    if exchanges are stuck and another method follows, Lemke's path                   (pivot/lemke.pyx)
-    friction       accelerated sweeps, alternating with Newton's method                              (friction.pxd)
+    friction       accelerated sweeps, then Newton's method if these are slow                        (friction.pxd)
 
 Under friction a subproblem is the whole problem, or each island in turn. An island's data is copied out of A or the bodies, and
 it is solved to its own relative residual (judge/score.pxd). An island with data identical to the previous one reuses its
@@ -21,11 +21,10 @@ from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles, take_int
 from lavender_ext.core.arrays cimport as_double_pointer, make_read_only, ndarray
 from lavender_ext.core.deadline cimport deadline_t, get_pointer, has_passed
 from lavender_ext.core.csr cimport measure_asymmetry_and_bandwidth
-from lavender_ext.core.block_types cimport (CONE, CONTACT_ROLLING, N_FRICTION_ARRAYS, ROUND, blocks_t, get_friction_arrays,
-                                            has_independent_rows, bind_friction_arrays)
+from lavender_ext.core.block_types cimport CONE, CONTACT_ROLLING, ROUND, blocks_t, has_independent_rows, islands_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.method cimport workspace_t
-from lavender_ext.core.view cimport get_block_bodies, csr_t, rows_t
+from lavender_ext.core.view cimport get_block_bodies, csr_t, rows_t, view_t
 from lavender_ext.factor.factors cimport has_wide
 from lavender_ext.small.call cimport (N_COUNTS, RESULT_FAILED, RESULT_IS_START, RESULT_SOLVED, Rules, small_problem_t,
                                       small_rules_t, solve_workspaces_t)
@@ -53,6 +52,8 @@ cdef enum:
     FULL_SWEEP_ROWS = 12        # Islands with at most this many rows get all sweeps before their factorisations.
     MAX_KEPT_DOUBLES = 4096     # A larger workspace is freed after a run, since many problems may be kept for long.
     INTERRUPT_CHECK_WORK = 5000000      # multiply-adds between two checks for Ctrl-C, a few milliseconds
+    ISLAND_ROW_DOUBLES = 33     # Doubles of a copied island per row, if all are rows of joints: 8, J, M^-1 J^T and the result,
+    ISLAND_BLOCK_DOUBLES = 40   # and per block, if all are contacts between two bodies of their own.
 
 
 cdef bint are_all_rows_bounded(const blocks_t* p) noexcept nogil:
@@ -240,7 +241,7 @@ cdef bint solve_by_sweeps(const small_problem_t* s, double* own, double tol, int
     """Solve contacts as one subproblem, with at most `swept` sweeps before factorisations; counts as in `store_work_counts`."""
     cdef int32_t m = s.v.p.n_rows, n = s.over.r.n_bodies if s.over.r != NULL else 0
     cdef subproblem_t sub
-    cdef friction_run_t o = friction_run_t(tol, swept, swept, has_wide(), 0, 0, 0, 0.0, deadline, 0, 0)
+    cdef friction_run_t o = friction_run_t(tol, swept, has_wide(), 0, 0, 0, 0.0, deadline, 0, 0)
     cdef bint good
     if not grow_workspace_to(&workspaces.work, s.v.p.n_blocks, subproblem_work_size(m, n) + m):
         return False
@@ -253,43 +254,7 @@ cdef bint solve_by_sweeps(const small_problem_t* s, double* own, double tol, int
     return good or has_passed(deadline, 0.0)
 
 
-cdef int32_t solve_small(small_problem_t* s, const small_rules_t* rules, double* own, bint cold, double tol, deadline_t* deadline,
-                         double* both, solve_workspaces_t* workspaces, int32_t* counts) noexcept nogil:
-    """Solve and judge from `own` (m) [N s], or from the zero impulse if `cold`, into `own`; return the result code.
-
-    both (2 m) receives the slack and the error of the result, counts the work (`store_work_counts`). At the deadline the
-    iterate is the result.
-    """
-    cdef int64_t m = s.v.p.n_rows, scratch = m + count_judge_scratch(&s.v)
-    memset(counts, 0, N_COUNTS * sizeof(int32_t))
-    if not grow_workspace_to(&workspaces.work, 0, scratch):
-        return RESULT_FAILED
-    if set_start_of_small_problem(s, rules, own, cold, tol, both, workspaces.work.real):
-        return RESULT_IS_START
-    if not (solve_by_pivoting(s, own, tol, rules.follows, deadline, workspaces, counts) if s.pivots
-            else solve_by_sweeps(s, own, tol, rules.swept, deadline, workspaces, counts)):
-        return RESULT_FAILED
-    if not grow_workspace_to(&workspaces.work, 0, scratch):
-        return RESULT_FAILED
-    judge_result_within_bounds(s, own, tol, both, workspaces.work.real)
-    return RESULT_SOLVED if s.pivots or s.relative <= tol or has_passed(deadline, 0.0) else RESULT_FAILED
-
-
-cdef class Rules:
-    """Settings of the calls for small problems: `small_rules_t`."""
-
-    def __init__(self, int rows, int swept, double warm, bint pivots, bint follows):
-        self.at.rows, self.at.swept, self.at.warm, self.at.pivots, self.at.follows = rows, swept, warm, pivots, follows
-
-
-cdef enum:                      # doubles of an island's data
-    ROW_DOUBLES = 7             # per row: lower, upper, b, d, nu, step, start
-    JOINT_ROW_DOUBLES = 24      # per joint row: J, M^-1 J^T
-    CONTACT_ROW_DOUBLES = 6     # per contact row: inv_inertia_arm
-    N_SIZES = 5                 # rows, blocks, entries of A, joint rows, joints
-
-
-cdef struct island_t:           # copied from A or the bodies; its doubles and integers are one contiguous array each
+cdef struct island_t:           # an island copied from A or the bodies; its doubles and its integers are contiguous
     subproblem_t s
     csr_t a
     rows_t r
@@ -299,134 +264,103 @@ cdef struct island_t:           # copied from A or the bodies; its doubles and i
     int64_t n_integers
 
 
-cdef inline void bind_island_arrays(island_t* x, arena_t* arena, const int32_t* size, int32_t n) noexcept nogil:
-    """Take the arrays of an island with the given sizes (N_SIZES) and n bodies, and of its result, from an arena.
-
-    n < 0: over A, without joints.
-    """
-    cdef blocks_t* p = &x.s.v.p
-    cdef rows_t* r = &x.r
-    cdef int32_t m = size[0], k = size[1], nnz = size[2], mj = size[3], kj = size[4], c = k - kj
-    x.numbers, x.integers = take_doubles(arena, 0), take_integers(arena, 0)
-    x.n_numbers, x.n_integers = arena.n_real, arena.n_index
-    p.n_blocks, p.n_rows, p.islands = k, m, NULL
-    p.lower, p.upper, p.b = take_doubles(arena, m), take_doubles(arena, m), take_doubles(arena, m)
-    p.d, p.nu = take_doubles(arena, m), take_doubles(arena, m)
-    p.step, x.s.lam = take_doubles(arena, m), take_doubles(arena, m)
-    bind_friction_arrays(p, take_doubles(arena, N_FRICTION_ARRAYS * k), k)
-    p.ptr, p.kind = take_integers(arena, k + 1), take_integers(arena, k)
-    x.s.v.a = x.s.v.r = x.s.v.g = NULL
-    if n < 0:
-        x.a.data, x.a.indptr, x.a.indices = take_doubles(arena, nnz), take_integers(arena, m + 1), take_integers(arena, nnz)
-        x.s.v.a = &x.a
-    else:
-        r.n_bodies, r.n_joints, r.n_contacts = n, kj, c
-        r.jac, r.minv_jac = take_doubles(arena, 12 * mj), take_doubles(arena, 12 * mj)
-        r.normal, r.tangent = take_doubles(arena, 3 * c), take_doubles(arena, 3 * c)
-        r.arm_a, r.arm_b = take_doubles(arena, 3 * c), take_doubles(arena, 3 * c)
-        r.coupling, r.inv_inertia_arm = take_doubles(arena, 5 * c), take_doubles(arena, CONTACT_ROW_DOUBLES * (m - mj))
-        r.compliance, r.inv_mass, r.inv_inertia = take_doubles(arena, m), take_doubles(arena, n), take_doubles(arena, 9 * n)
-        r.joint_body, r.contact_body = take_integers(arena, 2 * kj), take_integers(arena, 2 * c)
-        x.s.v.r = r
-    x.n_numbers, x.n_integers = arena.n_real - x.n_numbers, arena.n_index - x.n_integers
-    x.s.answer = take_doubles(arena, m)
+cdef struct island_index_t:     # rows, contacts and bodies of an island
+    int32_t* row                # (m) rows of the problem
+    int32_t* place              # (rows of the problem) row of the island, -1 in no island or in another one
+    int32_t* contact            # (contacts of the island) contacts of the problem
+    int32_t* body               # (n) bodies of the problem
+    int32_t* number             # (bodies of the problem) body of the island, -1 outside of `copy_island_bodies`
 
 
-cdef inline void copy_island_blocks(island_t* x, const blocks_t* p, const int32_t* block, const double* lam,
-                                    int32_t* place) noexcept nogil:
-    """Copy the blocks `block` of the complete problem; place (rows of the problem) receives the row indices in the island."""
-    cdef const double* of_row[ROW_DOUBLES]
-    cdef const double* of_block[N_FRICTION_ARRAYS]
-    cdef blocks_t* own = &x.s.v.p
-    cdef int32_t i, j, k, q, row, n = 0
-    cdef int32_t* ptr = <int32_t*>own.ptr
-    of_row[0], of_row[1], of_row[2], of_row[3], of_row[4], of_row[5] = p.lower, p.upper, p.b, p.d, p.nu, p.step
-    of_row[6] = lam
-    get_friction_arrays(p, of_block)
-    own.law = p.law
-    ptr[0] = 0
-    for k in range(own.n_blocks):
-        i = block[k]
-        (<int32_t*>own.kind)[k] = p.kind[i]
-        for q in range(N_FRICTION_ARRAYS):
-            x.numbers[ROW_DOUBLES * own.n_rows + q * own.n_blocks + k] = of_block[q][i]
-        j = p.ptr[i]
-        for q in range(ROW_DOUBLES):
-            memcpy(x.numbers + q * own.n_rows + n, of_row[q] + j, (p.ptr[i + 1] - j) * sizeof(double))
-        for row in range(j, p.ptr[i + 1]):
-            place[row] = n
-            n += 1
-        ptr[k + 1] = n
+cdef inline const double* gather(arena_t* arena, const double* x, int32_t width, const int32_t* index, int32_t n) noexcept nogil:
+    """Copy the entries `index` (n) of x, each of `width` numbers, to an arena."""
+    cdef double* out = take_doubles(arena, <int64_t>width * n)
+    cdef int32_t i
+    for i in range(n):
+        if width == 1:
+            out[i] = x[index[i]]
+        else:
+            memcpy(out + width * i, x + <int64_t>width * index[i], width * sizeof(double))
+    return out
 
 
-cdef inline void copy_island_matrix(island_t* x, const blocks_t* p, const csr_t* a, const int32_t* block,
-                                    const int32_t* place) noexcept nogil:
-    """Copy the entries of A between the island's rows; other entries, zeros of immovable bodies, have a place of -1."""
-    cdef int32_t i, k, q, row, at = 0, n = 0
-    cdef int32_t* indptr = <int32_t*>x.a.indptr
-    indptr[0] = 0
-    for k in range(x.s.v.p.n_blocks):
-        i = block[k]
-        for row in range(p.ptr[i], p.ptr[i + 1]):
-            for q in range(a.indptr[row], a.indptr[row + 1]):
-                if place[a.indices[q]] >= 0:
-                    (<int32_t*>x.a.indices)[at] = place[a.indices[q]]
-                    (<double*>x.a.data)[at] = a.data[q]
-                    at += 1
-            n += 1
-            indptr[n] = at
-
-
-cdef inline int32_t number_island_bodies(const rows_t* r, const int32_t* block, int32_t k, int32_t* number,
-                                         int32_t* body) noexcept nogil:
-    """Number the bodies of k blocks in the order of appearance, in `body`; `number` is the inverse. Return their count."""
-    cdef const int32_t* two
-    cdef int32_t i, side, n = 0
-    for i in range(k):
-        two = get_block_bodies(r, block[i])
-        for side in range(2):
-            if two[side] >= 0 and number[two[side]] < 0:
-                number[two[side]] = n
-                body[n] = two[side]
-                n += 1
-    return n
-
-
-cdef inline void copy_entry_numbers(const double* to, int64_t n, const double* x, int64_t i) noexcept nogil:
-    """Copy entry i of x, which has n numbers for each entry, to `to` (n)."""
-    memcpy(<void*>to, x + n * i, n * sizeof(double))
+cdef inline void copy_island_matrix(island_t* x, const csr_t* a, const island_index_t* z, arena_t* arena) noexcept nogil:
+    """Copy the entries of A between the island's rows; other entries are zeros of immovable bodies."""
+    cdef int32_t i, q, m = x.s.v.p.n_rows, count = 0
+    cdef int32_t* indptr = take_integers(arena, m + 1)
+    cdef int32_t* indices = take_integers(arena, 0)
+    cdef double* data = take_doubles(arena, 0)
+    for i in range(m):
+        indptr[i] = count
+        for q in range(a.indptr[z.row[i]], a.indptr[z.row[i] + 1]):
+            if z.place[a.indices[q]] >= 0:
+                indices[count], data[count] = z.place[a.indices[q]], a.data[q]
+                count += 1
+    indptr[m] = count
+    x.a.indptr, x.a.indices, x.a.data = indptr, take_integers(arena, count), take_doubles(arena, count)
+    x.s.v.a = &x.a
 
 
 cdef inline void copy_island_bodies(island_t* x, const blocks_t* p, const rows_t* r, const int32_t* block,
-                                    const int32_t* number, const int32_t* body) noexcept nogil:
-    """Copy the island's joints, contacts and bodies."""
-    cdef const blocks_t* own = &x.s.v.p
-    cdef const rows_t* y = &x.r
-    cdef const int32_t* two
-    cdef int32_t i, j, k, m, c, n, first = own.ptr[y.n_joints]
-    cdef int32_t* pair
-    for k in range(own.n_blocks):
-        i, m, n = block[k], own.ptr[k], own.ptr[k + 1] - own.ptr[k]
-        j, two, pair = p.ptr[i], get_block_bodies(r, i), <int32_t*>get_block_bodies(y, k)
-        for c in range(2):
-            pair[c] = number[two[c]] if two[c] >= 0 else -1
-        memcpy(<void*>(y.compliance + m), r.compliance + j, n * sizeof(double))
-        if k < y.n_joints:
-            memcpy(<void*>(y.jac + 12 * m), r.jac + 12 * j, 12 * n * sizeof(double))
-            memcpy(<void*>(y.minv_jac + 12 * m), r.minv_jac + 12 * j, 12 * n * sizeof(double))
-            continue
-        memcpy(<void*>(y.inv_inertia_arm + CONTACT_ROW_DOUBLES * (m - first)),
-               r.inv_inertia_arm + CONTACT_ROW_DOUBLES * (j - p.ptr[r.n_joints]),
-               CONTACT_ROW_DOUBLES * n * sizeof(double))
-        c, i = k - y.n_joints, i - r.n_joints
-        copy_entry_numbers(y.normal + 3 * c, 3, r.normal, i)
-        copy_entry_numbers(y.tangent + 3 * c, 3, r.tangent, i)
-        copy_entry_numbers(y.arm_a + 3 * c, 3, r.arm_a, i)
-        copy_entry_numbers(y.arm_b + 3 * c, 3, r.arm_b, i)
-        copy_entry_numbers(y.coupling + 5 * c, 5, r.coupling, i)
-    for k in range(y.n_bodies):
-        copy_entry_numbers(y.inv_mass + k, 1, r.inv_mass, body[k])
-        copy_entry_numbers(y.inv_inertia + 9 * k, 9, r.inv_inertia, body[k])
+                                    const island_index_t* z, arena_t* arena) noexcept nogil:
+    """Copy the island's joints, contacts and bodies, which are numbered in the order of appearance."""
+    cdef rows_t* y = &x.r
+    cdef int32_t i, body, n = 0, k = x.s.v.p.n_blocks, m = x.s.v.p.n_rows, kj = x.s.split, mj = x.s.v.p.ptr[kj], c = k - kj
+    cdef int32_t* pair = take_integers(arena, 2 * k)
+    for i in range(2 * k):
+        body = get_block_bodies(r, block[i // 2])[i % 2]
+        if body >= 0 and z.number[body] < 0:
+            z.number[body], z.body[n] = n, body
+            n += 1
+        pair[i] = z.number[body] if body >= 0 else -1
+    for i in range(n):
+        z.number[z.body[i]] = -1                        # Islands may share immovable bodies.
+    y.n_bodies, y.n_joints, y.n_contacts, y.joint_body, y.contact_body = n, kj, c, pair, pair + 2 * kj
+    y.inv_mass, y.inv_inertia = gather(arena, r.inv_mass, 1, z.body, n), gather(arena, r.inv_inertia, 9, z.body, n)
+    y.compliance = gather(arena, r.compliance, 1, z.row, m)
+    y.jac, y.minv_jac = gather(arena, r.jac, 12, z.row, mj), gather(arena, r.minv_jac, 12, z.row, mj)
+    for i in range(c):
+        z.contact[i] = block[kj + i] - r.n_joints
+    y.normal, y.tangent = gather(arena, r.normal, 3, z.contact, c), gather(arena, r.tangent, 3, z.contact, c)
+    y.arm_a, y.arm_b = gather(arena, r.arm_a, 3, z.contact, c), gather(arena, r.arm_b, 3, z.contact, c)
+    y.coupling = gather(arena, r.coupling, 5, z.contact, c)
+    for i in range(mj, m):
+        z.row[i] -= p.ptr[r.n_joints]
+    y.inv_inertia_arm = gather(arena, r.inv_inertia_arm, 6, z.row + mj, m - mj)
+    x.s.v.r = y
+
+
+cdef inline void copy_island(island_t* x, const view_t* v, const double* lam, const int32_t* block, int32_t k,
+                             const island_index_t* z, arena_t arena) noexcept nogil:
+    """Copy the island of k blocks out of a problem over A or bodies, with its start out of lam, to an arena."""
+    cdef const blocks_t* p = &v.p
+    cdef blocks_t* own = &x.s.v.p
+    cdef int32_t i, q, m = 0
+    cdef int32_t* ptr = take_integers(&arena, k + 1)
+    cdef int32_t* kind = take_integers(&arena, k)
+    x.numbers, x.integers = arena.real, arena.index
+    x.s.split = 0
+    for i in range(k):
+        ptr[i], kind[i] = m, p.kind[block[i]]
+        x.s.split += v.r != NULL and block[i] < v.r.n_joints
+        for q in range(p.ptr[block[i]], p.ptr[block[i] + 1]):
+            z.row[m], z.place[q] = q, m
+            m += 1
+    ptr[k] = m
+    own.n_blocks, own.n_rows, own.law, own.ptr, own.kind, own.islands = k, m, p.law, ptr, kind, NULL
+    own.mu, own.patch_radius = gather(&arena, p.mu, 1, block, k), gather(&arena, p.patch_radius, 1, block, k)
+    own.rolling = gather(&arena, p.rolling, 1, block, k)
+    own.lower, own.upper = gather(&arena, p.lower, 1, z.row, m), gather(&arena, p.upper, 1, z.row, m)
+    own.b, own.d = gather(&arena, p.b, 1, z.row, m), gather(&arena, p.d, 1, z.row, m)
+    own.nu, own.step = gather(&arena, p.nu, 1, z.row, m), gather(&arena, p.step, 1, z.row, m)
+    x.s.lam = <double*>gather(&arena, lam, 1, z.row, m)
+    x.s.v.a = x.s.v.r = x.s.v.g = NULL
+    if v.r != NULL:
+        copy_island_bodies(x, p, v.r, block, z, &arena)
+    else:
+        copy_island_matrix(x, v.a, z, &arena)
+    x.n_numbers, x.n_integers = arena.n_real, arena.n_index
+    x.s.answer = take_doubles(&arena, m)
 
 
 cdef inline bint are_islands_identical(const island_t* x, const island_t* y) noexcept nogil:
@@ -443,6 +377,106 @@ cdef inline int32_t count_first_sweeps(const blocks_t* p, int32_t max_sweeps) no
     return 0 if p.law == CONE else max_sweeps * FULL_SWEEP_ROWS // p.n_rows
 
 
+cdef bint solve_by_islands(const small_problem_t* s, double* own, double tol, int32_t swept, deadline_t* deadline,
+                           solve_workspaces_t* workspaces, int32_t* counts) except -1 nogil:
+    """Solve contacts island by island from `own` (m) [N s], until one is above tol; counts as in `store_work_counts`."""
+    cdef const blocks_t* p = &s.over.p
+    cdef const islands_t* islands = s.v.p.islands
+    cdef const csr_t* a = s.over.a
+    cdef int32_t i, j, q, rows, m = 0, k = 0, n_bodies = s.over.r.n_bodies if a == NULL else 0
+    cdef int64_t entries = 0, count, numbers, integers, work, unchecked = 0
+    cdef friction_run_t o = friction_run_t(tol, swept, has_wide(), 0, 0, 0, 0.0, deadline, 0, 0), before
+    cdef island_index_t z
+    cdef arena_t arena
+    cdef const int32_t* block
+    cdef int32_t* at
+    cdef int32_t* order
+    cdef double* scratch
+    cdef island_t two[2]
+    cdef island_t* x
+    cdef bint good = True
+    # workspace of the largest island
+    for i in range(islands.n):
+        rows = count = 0
+        for j in range(islands.ptr[i], islands.ptr[i + 1]):
+            q = islands.order[j]
+            rows += p.ptr[q + 1] - p.ptr[q]
+            count += a.indptr[p.ptr[q + 1]] - a.indptr[p.ptr[q]] if a != NULL else 0
+        m, k, entries = max(m, rows), max(k, islands.ptr[i + 1] - islands.ptr[i]), max(entries, count)
+    numbers, integers = ISLAND_ROW_DOUBLES * m + ISLAND_BLOCK_DOUBLES * k + entries, m + 4 * k + 2 + entries
+    work = subproblem_work_size(m, min(2 * k, n_bodies))
+    if not grow_workspace_to(&workspaces.work, 2 * integers + m + p.n_rows + 5 * k + n_bodies, 2 * numbers + work):
+        return False
+    arena = make_arena(workspaces.work.real, workspaces.work.index)
+    z.row, z.place = take_integers(&arena, m), take_integers(&arena, p.n_rows)
+    z.contact, z.body, z.number = take_integers(&arena, k), take_integers(&arena, 2 * k), take_integers(&arena, n_bodies)
+    order, at, scratch = take_integers(&arena, k), take_integers(&arena, k), take_doubles(&arena, work)
+    memset(z.place, 255, p.n_rows * sizeof(int32_t))    # -1
+    memset(z.number, 255, n_bodies * sizeof(int32_t))
+    for i in range(islands.n):
+        # copy of the island
+        block, k, x = islands.order + islands.ptr[i], islands.ptr[i + 1] - islands.ptr[i], &two[i % 2]
+        copy_island(x, &s.over, own, block, k, &z, make_arena(arena.real + arena.n_real + (i % 2) * numbers,
+                                                              arena.index + arena.n_index + (i % 2) * integers))
+        # solution
+        if i > 0 and are_islands_identical(x, &two[1 - i % 2]):
+            memcpy(x.s.answer, two[1 - i % 2].s.answer, x.s.v.p.n_rows * sizeof(double))
+        else:
+            x.s.at, x.s.prepared, x.s.relative_at_zero = NULL, NULL, -1.0
+            if p.law == CONE:
+                for j in range(k):
+                    at[j] = s.at[block[j]]
+                x.s.at, x.s.prepared = at, s.prepared
+            o.max_sweeps = count_first_sweeps(&x.s.v.p, swept)
+            before = o
+            good = solve_subproblem(&x.s, &o, &workspaces.more, scratch, order)
+            unchecked += <int64_t>(o.factored - before.factored)
+            unchecked += (o.swept - before.swept) * (x.a.indptr[x.s.v.p.n_rows] if a != NULL else 24 * x.s.v.p.n_rows)
+            if unchecked > INTERRUPT_CHECK_WORK:
+                unchecked = 0
+                with gil:
+                    PyErr_CheckSignals()
+        # result
+        for j in range(k):
+            q = block[j]
+            memcpy(own + p.ptr[q], x.s.answer + x.s.v.p.ptr[j], (p.ptr[q + 1] - p.ptr[q]) * sizeof(double))
+            memset(z.place + p.ptr[q], 255, (p.ptr[q + 1] - p.ptr[q]) * sizeof(int32_t))
+        if not good:
+            break
+    store_work_counts(&o, islands.n, counts)
+    return good or has_passed(deadline, 0.0)
+
+
+cdef int32_t solve_small(small_problem_t* s, const small_rules_t* rules, double* own, bint cold, double tol, deadline_t* deadline,
+                         double* both, solve_workspaces_t* workspaces, int32_t* counts) except -1 nogil:
+    """Solve and judge from `own` (m) [N s], or from the zero impulse if `cold`, into `own`; return the result code.
+
+    both (2 m) receives the slack and the error of the result, counts the work (`store_work_counts`). At the deadline the
+    iterate is the result.
+    """
+    cdef int64_t m = s.v.p.n_rows, scratch = m + count_judge_scratch(&s.v)
+    memset(counts, 0, N_COUNTS * sizeof(int32_t))
+    if not grow_workspace_to(&workspaces.work, 0, scratch):
+        return RESULT_FAILED
+    if set_start_of_small_problem(s, rules, own, cold, tol, both, workspaces.work.real):
+        return RESULT_IS_START
+    if not (solve_by_pivoting(s, own, tol, rules.follows, deadline, workspaces, counts) if s.pivots
+            else solve_by_islands(s, own, tol, rules.swept, deadline, workspaces, counts) if s.by_island
+            else solve_by_sweeps(s, own, tol, rules.swept, deadline, workspaces, counts)):
+        return RESULT_FAILED
+    if not grow_workspace_to(&workspaces.work, 0, scratch):
+        return RESULT_FAILED
+    judge_result_within_bounds(s, own, tol, both, workspaces.work.real)
+    return RESULT_SOLVED if s.pivots or s.relative <= tol or has_passed(deadline, 0.0) else RESULT_FAILED
+
+
+cdef class Rules:
+    """Settings of the calls for small problems: `small_rules_t`."""
+
+    def __init__(self, int rows, int swept, double warm, bint pivots, bint follows):
+        self.at.rows, self.at.swept, self.at.warm, self.at.pivots, self.at.follows = rows, swept, warm, pivots, follows
+
+
 cdef class Small:
     """A problem with few rows. `data` must hold the residual of the zero impulse; `run` only reads the problem.
 
@@ -452,17 +486,18 @@ cdef class Small:
         Problem for the judge.
     over : Data
         Problem to solve; for bounded rows A in compressed rows.
+    by_island : bool
+        Whether to solve the islands one by one, which the judge has labelled; there are several, with friction.
     """
 
     cdef readonly Data data
-    cdef readonly int count                             # number of islands
     cdef Data over
     cdef small_problem_t at
     cdef workspace_t workspace
     cdef workspace_t kept                               # workspace of the last run, which the next run takes
 
-    def __init__(self, Data data, Data over):
-        self.data, self.over, self.count = data, over, 1
+    def __init__(self, Data data, Data over, bint by_island=False):
+        self.data, self.over, self.at.by_island = data, over, by_island
         self.at.v, self.at.over = data.get_pointers(), over.get_pointers()
         self.at.zero_residual[0], self.at.zero_residual[1] = data.reference_energy, data.reference_velocity
         self.at.zero_residual[2] = data.relative_at_zero
@@ -491,13 +526,15 @@ cdef class Small:
         cdef ndarray answer = make_read_only(new(m)), both = new(2 * m + 1)
         cdef double* own = <double*>answer.data
         cdef int32_t code
+        cdef bint cold = impulse is None
+        cdef deadline_t* until = get_pointer(deadline)
         memset(&workspaces, 0, sizeof(workspaces))
         self.exchange_kept_workspace(&workspaces.work)
-        if impulse is not None:
+        if not cold:
             memcpy(own, as_double_pointer(impulse, m), m * sizeof(double))
         try:
-            code = self.run_kernel(&s, &rules.at, own, impulse is None, tol, get_pointer(deadline), <double*>both.data, &workspaces,
-                                   counts)
+            with nogil:
+                code = solve_small(&s, &rules.at, own, cold, tol, until, <double*>both.data, &workspaces, counts)
         finally:
             if workspaces.work.n_real <= MAX_KEPT_DOUBLES:
                 self.exchange_kept_workspace(&workspaces.work)
@@ -505,135 +542,3 @@ cdef class Small:
             free_workspace(&workspaces.more)
         judged = make_judged(self.data, answer, both, &s.score, s.relative, s.floor) if code != RESULT_FAILED else None
         return judged, None if code == RESULT_IS_START else tuple([counts[i] for i in range(N_COUNTS)])
-
-    cdef int32_t run_kernel(self, small_problem_t* s, const small_rules_t* rules, double* own, bint cold, double tol,
-                            deadline_t* deadline, double* both, solve_workspaces_t* workspaces, int32_t* counts) except -1:
-        """Run `solve_small` without the interpreter."""
-        with nogil:
-            return solve_small(s, rules, own, cold, tol, deadline, both, workspaces, counts)
-
-
-cdef class Islands(Small):
-    """A problem with friction that is solved island by island.
-
-    Parameters
-    ----------
-    data : Data
-        Problem for the judge, which has labelled its islands; there are several.
-    over : Data
-        The same problem, or A of it.
-    """
-
-    cdef object size
-
-    def __init__(self, Data data, Data over):
-        Small.__init__(self, data, over)
-        cdef const int32_t* ptr = over.blocks.ptr
-        cdef const int32_t* label = data.islands_at.label
-        cdef int32_t i, q, k = over.blocks.n_blocks, rows, joints = over.rows.n_joints if over.factored else 0
-        self.count = data.islands_at.n
-        self.size = np.zeros((self.count, N_SIZES), np.int32)
-        cdef int32_t[:, ::1] size = self.size
-        cdef int32_t[::1] island = np.empty(ptr[k], np.int32)       # of each row
-        for i in range(k):
-            for q in range(ptr[i], ptr[i + 1]):
-                island[q] = label[i]
-        for i in range(k):
-            rows = ptr[i + 1] - ptr[i]
-            size[label[i], 0] += rows
-            size[label[i], 1] += 1
-            if not over.factored:
-                for q in range(over.csr.indptr[ptr[i]], over.csr.indptr[ptr[i + 1]]):
-                    size[label[i], 2] += island[over.csr.indices[q]] == label[i]
-            if i < joints:
-                size[label[i], 3] += rows
-                size[label[i], 4] += 1
-
-    cdef int32_t run_kernel(self, small_problem_t* s, const small_rules_t* rules, double* own, bint cold, double tol,
-                            deadline_t* deadline, double* both, solve_workspaces_t* workspaces, int32_t* counts) except -1:
-        cdef int64_t m = s.v.p.n_rows, scratch = m + count_judge_scratch(&s.v)
-        cdef friction_run_t o = friction_run_t(tol, rules.swept, rules.swept, has_wide(), 0, 0, 0, 0.0, deadline, 0, 0)
-        cdef bint good
-        if not grow_workspace_to(&workspaces.work, 0, scratch):
-            raise MemoryError(f"{m} rows")
-        if set_start_of_small_problem(s, rules, own, cold, tol, both, workspaces.work.real):
-            return RESULT_IS_START
-        good = self.solve_islands(own, &o, &workspaces.more)
-        memset(counts, 0, N_COUNTS * sizeof(int32_t))
-        store_work_counts(&o, self.count, counts)
-        if not good:
-            return RESULT_FAILED
-        judge_result_within_bounds(s, own, tol, both, workspaces.work.real)
-        return RESULT_SOLVED if s.relative <= tol or has_passed(deadline, 0.0) else RESULT_FAILED
-
-    cdef bint solve_islands(self, double* own, friction_run_t* o, workspace_t* r) except -1:
-        """Solve the islands one after the other from `own` (m) [N s], into `own`; return whether all are solved."""
-        cdef const blocks_t* p = &self.over.blocks
-        cdef const rows_t* rows = &self.over.rows
-        cdef bint over_bodies = self.over.factored
-        cdef const int32_t* block = self.data.islands_at.order
-        cdef const int32_t[:, ::1] size = self.size     # N_SIZES of each island
-        cdef int32_t n_bodies = rows.n_bodies if over_bodies else 0
-        cdef int32_t[::1] place = np.full(p.n_rows, -1, np.int32), at, order, integers, number, body
-        cdef double[::1] numbers, work
-        cdef int32_t i, j, q, m, k, n = -1
-        cdef int32_t largest[N_SIZES]
-        cdef arena_t counted = make_arena(NULL, NULL), arena
-        cdef int64_t swept, read, unchecked = 0
-        cdef double factored
-        cdef island_t two[2]
-        cdef island_t* x
-        cdef island_t* last
-        cdef bint good = True
-        m, k, q, _, _ = self.size.max(axis=0)
-        if over_bodies:
-            n = min(2 * k, n_bodies)
-        # The rows of joints take the most doubles of a row, contacts the most of a block.
-        largest[0], largest[1], largest[2], largest[3], largest[4] = m, k, q, m, 0
-        bind_island_arrays(&two[0], &counted, largest, n)
-        numbers, integers = np.empty(2 * counted.n_real), np.empty(2 * counted.n_index, np.int32)
-        work = np.empty(subproblem_work_size(m, max(n, 0)))
-        at, order = np.empty(k + 1, np.int32), np.empty(k, np.int32)
-        number, body = np.full(n_bodies + 1, -1, np.int32), np.empty(n + 2, np.int32)
-        two[1].n_numbers = -1
-        with nogil:
-            for i in range(self.count):
-                # Copy the data of island i.
-                x, last = &two[i % 2], &two[1 - i % 2]
-                m, k = size[i, 0], size[i, 1]
-                if over_bodies:
-                    n = number_island_bodies(rows, block, k, &number[0], &body[0])
-                arena = make_arena(&numbers[(i % 2) * counted.n_real], &integers[(i % 2) * counted.n_index])
-                bind_island_arrays(x, &arena, &size[i, 0], n)
-                copy_island_blocks(x, p, block, own, &place[0])
-                if over_bodies:
-                    copy_island_bodies(x, p, rows, block, &number[0], &body[0])
-                else:
-                    copy_island_matrix(x, p, &self.over.csr, block, &place[0])
-                if are_islands_identical(x, last):
-                    memcpy(x.s.answer, last.s.answer, m * sizeof(double))
-                else:
-                    x.s.split, x.s.at, x.s.prepared, x.s.relative_at_zero = size[i, 4], NULL, NULL, -1.0
-                    if p.law == CONE:
-                        for j in range(k):
-                            at[j] = self.at.at[block[j]]
-                        x.s.at, x.s.prepared = &at[0], self.at.prepared
-                    o.first = count_first_sweeps(&x.s.v.p, o.max_sweeps)
-                    swept, factored = o.swept, o.factored
-                    good = solve_subproblem(&x.s, o, r, &work[0], &order[0])
-                    if not good:
-                        break
-                    # Check for Ctrl-C.
-                    read = JOINT_ROW_DOUBLES * m if over_bodies else size[i, 2]
-                    unchecked += <int64_t>(o.factored - factored) + read * (o.swept - swept)
-                    if unchecked > INTERRUPT_CHECK_WORK:
-                        unchecked = 0
-                        with gil:
-                            PyErr_CheckSignals()
-                # Write the result back.
-                for j in range(k):
-                    q = block[j]
-                    memcpy(&own[p.ptr[q]], x.s.answer + x.s.v.p.ptr[j], (p.ptr[q + 1] - p.ptr[q]) * sizeof(double))
-                    memset(&place[p.ptr[q]], 255, (p.ptr[q + 1] - p.ptr[q]) * sizeof(int32_t))     # -1: in no island
-                block += k
-        return good

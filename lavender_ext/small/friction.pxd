@@ -1,7 +1,6 @@
-"""A few contacts, or one island of contacts: accelerated sweeps, alternating with Newton's method if they are slow.
+"""A few contacts, or one island of contacts: accelerated sweeps, then Newton's method if they are slow.
 
-One call solves a subproblem over A or over bodies in the caller's workspace. After a change of method both continue from
-their own last iterates.
+One call solves a subproblem over A or over bodies in the caller's workspace.
 """
 from libc.stdint cimport int32_t, int64_t, uint64_t
 from libc.string cimport memcmp, memcpy, memset
@@ -9,8 +8,8 @@ from libc.string cimport memcmp, memcpy, memset
 from lavender_ext.accelerate.accelerated cimport acceleration_t, lav_anderson
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE
 from lavender_ext.core.deadline cimport deadline_t, has_passed
-from lavender_ext.core.method cimport CERTIFICATE, MORE, NEEDS_WORKSPACE, options_t, workspace_t, info_t
-from lavender_ext.core.block_types cimport CONE, blocks_t
+from lavender_ext.core.method cimport MORE, NEEDS_WORKSPACE, options_t, workspace_t, info_t
+from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport NEWTON
 from lavender_ext.driver.host cimport start_method, step_method
@@ -22,8 +21,6 @@ from lavender_ext.sweep.serial cimport compute_sweep_velocities, sweep_context_t
 cdef enum:
     MIXING_MEMORY = 5           # number of sweeps that Anderson mixing combines
     MIN_CHECK_INTERVAL = 4      # Sweeps before the first check of the residual. Later checks follow after half as many as are done.
-    FIRST_FACTORISATIONS = 12   # Newton's method does up to this many factorisations before sweeps continue.
-    RESUMED_SWEEP_RATIO = 8     # The sweeps after them end at this multiple of `max_sweeps` in total.
     MAX_SUBPROBLEM_FACTORISATIONS = 120    # largest number of factorisations of one subproblem
     EXTRAPOLATION_FACTOR = 4    # Sweeps continue if the present rate reaches tol within this multiple of the remaining checks.
     SWEEP_NS_PER_ROW = 15       # estimated cost of a sweep with its mixing [ns] per row of A; in addition 1 ns per entry of A
@@ -44,8 +41,7 @@ cdef struct subproblem_t:
 
 cdef struct friction_run_t:     # settings and counters of a run over one or several subproblems
     double tol
-    int32_t max_sweeps          # largest number of sweeps before and during the alternation: an eighth of the limit
-    int32_t first               # number of sweeps before the first factorisation
+    int32_t max_sweeps          # largest number of sweeps of one subproblem, before the first factorisation
     int32_t wide
     int64_t swept               # counters over all subproblems
     int64_t undone
@@ -56,7 +52,7 @@ cdef struct friction_run_t:     # settings and counters of a run over one or sev
     int32_t longest             # largest number of sweeps plus factorisations of one subproblem
 
 
-cdef struct alternation_t:      # state of one subproblem
+cdef struct subproblem_run_t:      # state of one subproblem
     subproblem_t* s
     friction_run_t* o
     workspace_t* r              # workspace of Newton's method
@@ -71,7 +67,6 @@ cdef struct alternation_t:      # state of one subproblem
     options_t options
     workspace_t workspace
     info_t info
-    int32_t how
     double sweep                # estimated cost of a sweep, ns
 
 
@@ -80,7 +75,7 @@ cdef inline int64_t subproblem_work_size(int64_t m, int64_t n_bodies) noexcept n
     return (7 + 2 * MIXING_MEMORY) * m + 18 * n_bodies + CONTROL + MAX_MEMORY * MAX_MEMORY + 1
 
 
-cdef inline void bind_subproblem_arrays(alternation_t* t, double* work, int32_t* order, uint64_t* rng) noexcept nogil:
+cdef inline void bind_subproblem_arrays(subproblem_run_t* t, double* work, int32_t* order, uint64_t* rng) noexcept nogil:
     """Bind the arrays to work (`subproblem_work_size`) and order (k)."""
     cdef const view_t* v = &t.s.v
     cdef int64_t m = v.p.n_rows, n = v.r.n_bodies if v.r != NULL else 0
@@ -101,7 +96,7 @@ cdef inline void bind_subproblem_arrays(alternation_t* t, double* work, int32_t*
     t.sweeps.exact, t.sweeps.start, t.sweeps.prepared = t.s.at != NULL, t.s.at, t.s.prepared
 
 
-cdef inline double judge_subproblem_impulse(alternation_t* t, const double* lam) noexcept nogil:
+cdef inline double judge_subproblem_impulse(subproblem_run_t* t, const double* lam) noexcept nogil:
     """Return the relative residual of lam (m) [N s], relative to the subproblem's zero impulse."""
     cdef const view_t* v = &t.s.v
     cdef score_t score = make_empty_score()
@@ -120,52 +115,40 @@ cdef inline bint predicts_convergence(double before, double now, double tol, int
     return False
 
 
-cdef inline double continue_sweeps(alternation_t* t, double now, int32_t max_sweeps, bint extrapolate) noexcept nogil:
-    """Continue the sweeps of `swept` from its relative residual `now`, up to `max_sweeps` in total; return its new residual.
+cdef inline double run_sweeps(subproblem_run_t* t, double now) noexcept nogil:
+    """Sweep from the relative residual `now` of `swept`, and return the new one.
 
-    `extrapolate`: stop early if the extrapolated residual does not reach tol.
+    The sweeps end early if the extrapolated residual does not reach tol.
     """
     cdef double before, tol = t.o.tol
-    cdef int32_t step = MIN_CHECK_INTERVAL
+    cdef int32_t step = MIN_CHECK_INTERVAL, max_sweeps = t.o.max_sweeps
     while now > tol and t.c.iterations < max_sweeps and not has_passed(t.o.deadline, step * t.sweep):
         before = now
         lav_anderson(&t.c, t.swept, t.c.iterations == 0, step)
         now = judge_subproblem_impulse(t, t.swept)
         step = t.c.iterations // 2 if t.c.iterations // 2 > MIN_CHECK_INTERVAL else MIN_CHECK_INTERVAL
-        if extrapolate and not predicts_convergence(before, now, tol, EXTRAPOLATION_FACTOR * (max_sweeps - t.c.iterations) // step):
+        if not predicts_convergence(before, now, tol, EXTRAPOLATION_FACTOR * (max_sweeps - t.c.iterations) // step):
             break
     return now
 
 
-cdef inline double step_newton(alternation_t* t, int32_t steps) noexcept nogil:
-    """Run up to `steps` factorisations and return the relative residual of `answer`."""
-    if t.how == MORE or t.how == CERTIFICATE:
-        t.how = step_method(&t.s.v, &t.options, &t.workspace, steps, t.s.answer, &t.info)
-    return judge_subproblem_impulse(t, t.s.answer)
-
-
-cdef inline double alternate_sweeps_and_newton(alternation_t* t) noexcept nogil:
-    """Alternate after slow sweeps: Newton's method, sweeps again, Newton's method up to `MAX_SUBPROBLEM_FACTORISATIONS`."""
-    cdef double now
+cdef inline double run_newton(subproblem_run_t* t) noexcept nogil:
+    """Run up to `MAX_SUBPROBLEM_FACTORISATIONS` of Newton's method from `answer`, and return the relative residual."""
+    cdef int32_t how
     t.info.work = t.info.factorisations = 0
-    t.how = start_method(&t.s.v, &t.options, &t.workspace, t.s.answer, t.r, True)
-    if t.how == NEEDS_WORKSPACE:
-        t.how = start_method(&t.s.v, &t.options, &t.workspace, t.s.answer, t.r, False)
-    if t.how != MORE:
+    how = start_method(&t.s.v, &t.options, &t.workspace, t.s.answer, t.r, True)
+    if how == NEEDS_WORKSPACE:
+        how = start_method(&t.s.v, &t.options, &t.workspace, t.s.answer, t.r, False)
+    if how != MORE:
         return 1.0 / 0.0
-    now = step_newton(t, FIRST_FACTORISATIONS)
-    if now > t.o.tol and not has_passed(t.o.deadline, 0.0):
-        now = continue_sweeps(t, judge_subproblem_impulse(t, t.swept), RESUMED_SWEEP_RATIO * t.o.max_sweeps, t.s.v.p.law == CONE)
-        if now > t.o.tol:
-            return step_newton(t, MAX_SUBPROBLEM_FACTORISATIONS)
-        memcpy(t.s.answer, t.swept, t.s.v.p.n_rows * sizeof(double))
-    return now
+    step_method(&t.s.v, &t.options, &t.workspace, MAX_SUBPROBLEM_FACTORISATIONS, t.s.answer, &t.info)
+    return judge_subproblem_impulse(t, t.s.answer)
 
 
 cdef inline bint solve_subproblem(subproblem_t* s, friction_run_t* o, workspace_t* r, double* work, int32_t* order) noexcept nogil:
     """Solve a subproblem from `lam` into `answer`; return whether its relative residual is at most `tol`."""
     cdef score_t score_at_zero = make_empty_score()
-    cdef alternation_t t
+    cdef subproblem_run_t t
     cdef uint64_t rng
     cdef blocks_t* p = &s.v.p
     cdef double now = s.relative_at_zero
@@ -190,15 +173,15 @@ cdef inline bint solve_subproblem(subproblem_t* s, friction_run_t* o, workspace_
     else:
         now = zero_residual[2]
     t.sweep = SWEEP_NS_PER_ROW * p.n_rows + (s.v.a.indptr[p.n_rows] if s.v.a != NULL else SWEEP_NS_PER_BODY_ROW * p.n_rows)
-    # sweeps, then Newton's method and sweeps alternately
-    now = continue_sweeps(&t, now, o.first, True)
+    # sweeps, then Newton's method
+    now = run_sweeps(&t, now)
     if now <= o.tol or now < 1.0:
         memcpy(s.answer, t.swept, p.n_rows * sizeof(double))
     if now > o.tol and not has_passed(o.deadline, 0.0):
         o.factorised += 1
         t.options = options_t(NEWTON, MAX_SUBPROBLEM_FACTORISATIONS, 0, 0, o.wide, o.tol, t.e0, t.v0, 1.0 / 0.0, 0.0,
                               o.deadline)
-        now = alternate_sweeps_and_newton(&t)
+        now = run_newton(&t)
     # counters
     o.swept += t.c.iterations
     o.undone += <int64_t>t.c.control[UNDONE]

@@ -35,7 +35,7 @@ LINES = {
     "lavender/solving": 2863,
     "lavender/suite": 1812,
     "lavender_ext/accelerate": 1171,
-    "lavender_ext/batch lavender_ext/small": 2310,
+    "lavender_ext/batch lavender_ext/small": 2209,
     "lavender_ext/core": 6720,
     "lavender_ext/derivative": 778,
     "lavender_ext/factor": 3251,

@@ -156,6 +156,26 @@ def test_islands_of_bodies_with_joints(law, seed):
     assert found.success and "islands" in found.message
 
 
+@pytest.mark.parametrize("law", ["coulomb", "cone"])
+def test_islands_that_share_an_immovable_body_are_one_call(law):
+    """Columns on the ground, which is a body without inverse mass: it belongs to every island."""
+    columns = stacks(4, 4, 0.4, False, 3).relaxed(law)
+    rows, b = columns.rows, columns.b + 0.1 * np.random.default_rng(0).normal(size=columns.m)
+
+    def put_first(ground, values):
+        return np.concatenate([np.full((1, *values.shape[1:]), ground), values])
+
+    on_body = replace(
+        columns, b=b, rows=replace(
+            rows, inv_mass=put_first(0.0, rows.inv_mass), inv_inertia=put_first(0.0, rows.inv_inertia),
+            v_free=put_first(0.0, rows.v_free), contact_body=rows.contact_body + 1,
+        ),
+    )  # fmt: skip
+    found, expected = check(on_body, "auto"), check(replace(columns, b=b), "auto")
+    assert found.success and found.message == expected.message and "on 4 islands" in found.message
+    np.testing.assert_allclose(found.impulse, expected.impulse, atol=1e-6)  # The bodies have another order.
+
+
 def test_compiled_call_on_an_island_at_rest_returns_zero():
     """Of nine islands one leaves the ground: nothing is to be done for it, and the solution says what was done."""
     rng = np.random.default_rng(3)
