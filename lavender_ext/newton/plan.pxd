@@ -60,12 +60,12 @@ from lavender_ext.newton.damped_newton cimport (begin_damped_newton, begin_dampe
 from lavender_ext.newton.interior_phases cimport (augmented_shift, begin_interior_steps, begin_interior_with_newton,
                                                   compute_sliding_fraction, step_augmented_newton, step_interior_point,
                                                   step_interior_with_newton)
-from lavender_ext.newton.run cimport (ACTIVE_SET, AUGMENTED_NEWTON, DAMPED_NEWTON, DAMPED_STRETCHES, DE_SAXCE, FLOW, INTERIOR_POINT,
-                                      INTERIOR_WITH_NEWTON, MAX_INNER_STEPS, N_COUNTED, N_REFINEMENTS, UNLIMITED,
-                                      PLAN_CONVEX, PLAN_COULOMB, begin_separate_best, convex_residual,
+from lavender_ext.newton.run cimport (ACTIVE_SET, AUGMENTED_NEWTON, DAMPED_NEWTON, DAMPED_STRETCHES, DE_SAXCE, FLOW,
+                                      INTERIOR_POINT, INTERIOR_WITH_NEWTON, MAX_INNER_STEPS, N_COUNTED, N_REFINEMENTS,
+                                      UNLIMITED, PLAN_CONVEX, PLAN_COULOMB, begin_separate_best, convex_residual,
                                       compute_slack, copy_vector, de_saxce_t, end_separate_best, is_at_roundoff,
-                                      is_budget_spent, is_finished, is_over, newton_t, pop_phase, push_phase, restore_best_of_all,
-                                      restore_best_before_phase, judge_and_keep_best_point, store_earlier_best, write_unknown)
+                                      is_budget_spent, is_finished, is_over, newton_t, pop_phase, push_phase,
+                                      judge_and_keep_best_point, write_unknown)
 from lavender_ext.newton.steps cimport begin_interior_point, has_free_rows, compute_proximal_weight
 from lavender_ext.newton.system cimport (BARRIER, BODIES, factor_newton_system, has_passed_after_part, multiply_system_matrix,
                                          solve_newton_system)
@@ -245,12 +245,6 @@ cdef inline void begin_unbounded_point(newton_t* n) noexcept nogil:
         refine_point(n, n.trial, EXACT_POINT_REFINEMENTS, 1.0)
 
 
-cdef inline void begin_separate_active_set(newton_t* n, const double* z) noexcept nogil:
-    """Begin exchanges from z. The next phase does not start from their result if they do not finish."""
-    store_earlier_best(n)
-    begin_active_set(n, z)
-
-
 cdef inline bint has_rigid_joints(const newton_t* n) noexcept nogil:
     """Return whether rows may be nearly dependent, as in loops of rigid joints. It must not depend on the caller's factor."""
     return n.s.form == BODIES and n.s.e.m <= MAX_AUGMENTED_ROWS and has_free_rows(n)
@@ -264,18 +258,15 @@ cdef inline void enter_next_convex_state(newton_t* n) noexcept nogil:
     cdef int32_t state = n.stage
     cdef double* z
     n.stage = state + 1
-    if state == UNBOUNDED_ACTIVE_SET and not n.is_cold or state == ROWS_INTERIOR_POINT:
-        if not is_finished(n):
-            restore_best_before_phase(n)
     if state != START_ACTIVE_SET and state != FIRST_CONE_WEIGHT and is_over(n):
         state = CONVEX_END
     if state == START_ACTIVE_SET:
         if not n.is_cold:
-            begin_separate_active_set(n, n.best_z)
+            begin_active_set(n, n.best_z)
     elif state == UNBOUNDED_ACTIVE_SET:
         begin_unbounded_point(n)
         if not is_finished(n):
-            begin_separate_active_set(n, n.ip.unbounded_z)
+            begin_active_set(n, n.ip.unbounded_z)
     elif state == ROWS_INTERIOR_POINT:
         begin_interior_steps(n, True)
         n.stage = AUGMENTED_INTERIOR_POINT
@@ -289,21 +280,18 @@ cdef inline void enter_next_convex_state(newton_t* n) noexcept nogil:
         begin_interior_point(n, third_cone_weight(), 0.0)
         begin_interior_steps(n, False)
     elif state == AUGMENTED_INTERIOR_POINT:
-        restore_best_of_all(n)
         if n.best < 1e-3 and n.has_augmented and has_rigid_joints(n):   # Nearly dependent rows may prevent further progress.
             n.s.augmented = 1
             begin_interior_point(n, augmented_shift(), 0.0)
             n.s.augmented = 0
             begin_interior_with_newton(n, CONE, 1)
     elif state == CONVEX_DAMPED_NEWTON:
-        restore_best_of_all(n)
         # Of cones, the last interior point is nearer to a solution than the point with the lowest residual, unless its
         # steps failed at once, as with inactive rows of b = 1e60.
         z = n.best_z if n.s.bt == NULL or n.progress.steps < 2 else n.progress.best_z
         begin_damped_newton(n, z, CONE, 1e-3, MAX_INNER_STEPS)
         push_damped_newton(n, UNLIMITED)
     else:
-        restore_best_of_all(n)
         pop_phase(n)
 
 
@@ -374,8 +362,8 @@ cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
             multiply_system_matrix(&n.s, n.best_z, n.hz)
             if has_convex_law(n) and convex_residual(n, n.best_z, n.hz) < 0.01 * n.best:
                 n.has_convex_start = 1
-                copy_vector(n, n.saved_z, n.best_z)
-                n.mostly_slides = slides_mostly(n, n.saved_z)
+                copy_vector(n, n.convex_z, n.best_z)
+                n.mostly_slides = slides_mostly(n, n.convex_z)
                 if not n.mostly_slides:
                     begin_flow(n, n.best_z, CONVEX_START_FACTORISATIONS, CONVEX_START_FACTORISATIONS)
     elif state == START_DAMPED_NEWTON:
@@ -394,10 +382,10 @@ cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
     elif state == CONVEX_FLOW:
         if not n.has_convex_start and has_convex_law(n):
             n.has_convex_start = 1
-            copy_vector(n, n.saved_z, n.progress.best_z)
-            n.mostly_slides = n.mostly_slides or slides_mostly(n, n.saved_z)
+            copy_vector(n, n.convex_z, n.progress.best_z)
+            n.mostly_slides = n.mostly_slides or slides_mostly(n, n.convex_z)
         if n.has_convex_start and not n.mostly_slides:
-            begin_flow(n, n.saved_z, CONVEX_FLOW_FACTORISATIONS, CONVEX_FLOW_FACTORISATIONS)
+            begin_flow(n, n.convex_z, CONVEX_FLOW_FACTORISATIONS, CONVEX_FLOW_FACTORISATIONS)
     elif state == FIRST_PATH:
         if not has_rigid_joints(n):
             begin_path(n)
@@ -458,7 +446,7 @@ cdef inline void start_newton_solve(newton_t* n, const double* lam) noexcept nog
     """Start from lam (rows); problem, system, tol and budget are set."""
     cdef int32_t i
     cdef bint has_cones = n.s.e.n < n.s.e.m
-    n.stop = n.needs_check = n.proven = n.has_saved_best = n.depth = n.path.paths = 0
+    n.stop = n.needs_check = n.proven = n.depth = n.path.paths = 0
     n.has_convex_start = n.mostly_slides = 0
     n.flow.has_run = 0
     n.s.augmented = n.s.factorisations = 0

@@ -51,7 +51,7 @@ cdef enum:                      # counters
 
 cdef enum:
     MAX_PHASE_DEPTH = 8         # Phases nest at most four deep.
-    N_VECTORS = 30              # vectors (m) of `bind_vectors`
+    N_VECTORS = 29              # vectors (m) of `bind_vectors`
     UNLIMITED = 2147483647      # limit of factorisations that no phase reaches
     MAX_INNER_STEPS = 20        # Newton steps of one proximal iteration; more rarely end it.
 
@@ -203,19 +203,15 @@ cdef struct newton_t:           # bound to its workspace; it must not move
     int32_t is_cold             # the start is the zero impulse
     int32_t has_augmented       # the caller can factor the augmented system
     int32_t stage               # state of the plan (plan.pxd)
-    int32_t has_saved_best
-    int32_t has_convex_start    # Coulomb's law: saved_z solves the convex law, or nearly so if many contacts slide
-    int32_t mostly_slides       # Coulomb's law: many contacts slide at saved_z
+    int32_t has_convex_start    # Coulomb's law: convex_z solves the convex law, or nearly so if many contacts slide
+    int32_t mostly_slides       # Coulomb's law: many contacts slide at convex_z
     int32_t counts[N_COUNTED]
     int32_t stack[MAX_PHASE_DEPTH]
     int32_t depth
     double best                 # relative residual of best_z
-    double saved_best           # a best point from which no phase may start; it counts again at the end
-    double earlier_best         # the best point before a phase that is judged by its own progress
     double above_floor          # the part of the last judged residual that rounding does not explain
     double* best_z
-    double* saved_z
-    double* earlier_z
+    double* convex_z
     double* direction
     best_t island_best          # the best impulse of each island
     double* lam                 # (rows)
@@ -278,14 +274,14 @@ cdef inline void bind_vectors(newton_t* n, int64_t m, arena_t* a) noexcept nogil
     """Take the vectors (m)."""
     cdef double** at[N_VECTORS]
     cdef int32_t i
-    at[0], at[1], at[2], at[3] = &n.best_z, &n.saved_z, &n.earlier_z, &n.direction
+    at[0], at[1], at[2], at[3] = &n.best_z, &n.convex_z, &n.s.q, &n.direction
     at[4], at[5], at[6], at[7] = &n.f, &n.r, &n.da, &n.dz
     at[8], at[9], at[10], at[11] = &n.t1, &n.t2, &n.u, &n.psi
     at[12], at[13], at[14], at[15] = &n.c, &n.hz, &n.hdz, &n.trial
     at[16], at[17], at[18], at[19] = &n.slack, &n.ip.z, &n.ip.u1, &n.ip.u2
     at[20], at[21], at[22], at[23] = &n.ip.hz, &n.ip.unbounded_z, &n.active.z, &n.active.hz
     at[24], at[25], at[26], at[27] = &n.active.best_z, &n.progress.best_z, &n.augmented.z, &n.damped.z
-    at[28], at[29] = &n.s.t, &n.s.q
+    at[28] = &n.s.t
     for i in range(N_VECTORS):
         at[i][0] = take_doubles(a, m)
 
@@ -462,44 +458,20 @@ cdef inline bint is_over(newton_t* n) noexcept nogil:
 # -- the best point --------------------------------------------------------------------------------------------------
 
 
-cdef inline void restore_best_before_phase(newton_t* n) noexcept nogil:
-    """Continue from the best point before the last phase, and save the phase's own best point for `restore_best_of_all`."""
-    if n.best < n.earlier_best:
-        n.has_saved_best = 1
-        n.saved_best = n.best
-        copy_vector(n, n.saved_z, n.best_z)
-        n.best = n.earlier_best
-        copy_vector(n, n.best_z, n.earlier_z)
-
-
-cdef inline void restore_best_of_all(newton_t* n) noexcept nogil:
-    """Make the saved best point the best point if it is better."""
-    if n.has_saved_best and n.saved_best < n.best:
-        n.best = n.saved_best
-        copy_vector(n, n.best_z, n.saved_z)
-
-
-cdef inline void store_earlier_best(newton_t* n) noexcept nogil:
-    """Store the best point before a phase."""
-    n.earlier_best = n.best
-    copy_vector(n, n.earlier_z, n.best_z)
-
-
 cdef inline void begin_separate_best(newton_t* n) noexcept nogil:
     """Begin a phase with a best point of its own, which is compared with earlier points only at its end."""
-    store_earlier_best(n)
     n.best = 1.0 / 0.0
 
 
 cdef inline double end_separate_best(newton_t* n, double* z) noexcept nogil:
-    """End a phase of `begin_separate_best`, and keep the better of its best point and the earlier best point.
+    """End a phase of `begin_separate_best`, and keep the better of its best point and the best impulse of all.
 
     Return the lowest residual of the phase; z (m), unless NULL, receives its best point.
     """
-    cdef double best = n.best
+    cdef double best = n.best, all_phases = relative_residual_of_best(&n.island_best)
     if z != NULL:
         copy_vector(n, z, n.best_z)
-    if n.earlier_best <= best:
-        n.best = n.earlier_best
-        copy_vector(n, n.best_z, n.earlier_z)
+    if all_phases < best:
+        n.best = all_phases
+        write_unknown(n, n.island_best.impulse, n.best_z)
     return best

@@ -19,6 +19,7 @@ from lavender_ext.core.view cimport csr_t, rows_t, view_t
 from lavender_ext.judge.slack cimport compute_generalized_slack, compute_body_slack
 from lavender_ext.newton.cones cimport CONE_SCALING_SIZE
 from lavender_ext.newton.elements cimport elements_t
+from lavender_ext.velocity_newton.soft cimport has_bounded_rows_only
 
 
 cdef struct scaled_t:
@@ -39,11 +40,6 @@ cdef inline bint is_problem_supported(const blocks_t* p) noexcept nogil:
         if is_round_cone_contact(p, i):
             return False
     return True
-
-
-cdef inline bint is_row(const blocks_t* p, int32_t i) noexcept nogil:
-    """Return whether block i has bounded rows, or is a contact of a normal alone."""
-    return has_independent_rows(p, i) or p.ptr[i + 1] - p.ptr[i] == 1
 
 
 cdef inline double lower_bound(const blocks_t* p, int32_t i, int32_t j) noexcept nogil:
@@ -100,7 +96,7 @@ cdef inline bint is_fixed(const view_t* v, int32_t i, int32_t j, double* at) noe
     cdef const blocks_t* p = &v.p
     cdef double x, low, high
     at[0] = 0.0
-    if not is_row(p, i):
+    if not has_bounded_rows_only(p, i):
         return j > p.ptr[i] and get_component_coefficient(p, i, j) == 0.0
     low, high = lower_bound(p, i, j), upper_bound(p, i, j)
     if low == high:
@@ -151,12 +147,12 @@ cdef inline void index_unfixed_elements(scaled_t* s, const view_t* v) noexcept n
                 continue
             s.keep[m] = j
             m += 1
-            if is_row(p, i) or m == normal + 1:
+            if has_bounded_rows_only(p, i) or m == normal + 1:
                 ptr[n] = m - 1
                 s.block[n] = i
                 n += 1
                 part[n] = parts
-        if is_row(p, i):
+        if has_bounded_rows_only(p, i):
             continue
         get_friction_components(p, i, &own)
         normal += 1

@@ -51,8 +51,8 @@ cdef struct paused_t:           # an island with an ended step budget; the next 
     int32_t cold                # the run started from the zero impulse (Coulomb's law only)
     int32_t stage               # CONVEX_STAGE, COULOMB_STAGE or NEXT_ROUND, under Coulomb's law
     int32_t rounds              # completed rounds of Coulomb friction
-    double island_error         # error of `island_best`, including impulses at which a call ended
-    double best_error           # error of `island_best` without those impulses, so that interruptions do not change the path
+    double island_error         # lowest error of the island, including impulses at which a call ended
+    double best_error           # the same without those impulses, so that interruptions do not change the path
 
 
 cdef struct flow_t:
@@ -91,8 +91,7 @@ cdef struct flow_t:
     double* lam                 # (m) impulse lambda
     double* trial               # (m) impulse at the last point that was evaluated on a line
     double* best                # (m) best impulse of one descent
-    double* island_best         # (m) best impulse of one island under the problem's own law
-    double* paused_start        # (m) value of phi at the start of a paused descent; in COULOMB_STAGE its first impulse
+    double* start               # (m) impulse at which the next stage starts; phi while a descent of CONVEX_STAGE is paused
     double* w                   # (m) slack w of the point that was evaluated last
     double* e                   # (m)
     double* v                   # V at s

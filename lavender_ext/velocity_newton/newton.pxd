@@ -446,8 +446,8 @@ cdef inline void restart_island_from_impulse(flow_t* f, int32_t island, const do
         f.y[c] = lam[c] if f.is_over_rows else f.u[c]
 
 
-cdef inline bint keep_impulse_if_better(flow_t* f, int32_t island, const double* lam, bint moves) noexcept nogil:
-    """Keep lam in `island_best` if its error under the problem's own law is lower; phi must be 0.
+cdef inline bint keep_impulse_if_better(flow_t* f, int32_t island, const double* lam, bint moves, double* impulse) noexcept nogil:
+    """Copy lam to `impulse` if its error under the problem's own law is the lowest so far; phi must be 0.
 
     Return whether the error is lower than that of the points at which no call ended.
     """
@@ -457,7 +457,7 @@ cdef inline bint keep_impulse_if_better(flow_t* f, int32_t island, const double*
     over = compute_error_over_limits(f, energy, velocity)
     if over < f.paused.island_error:
         f.paused.island_error = over
-        copy_rows(f, island, lam, f.island_best)
+        copy_rows(f, island, lam, impulse)
     if over < f.paused.best_error:
         f.paused.best_error = over
         return True
@@ -465,50 +465,39 @@ cdef inline bint keep_impulse_if_better(flow_t* f, int32_t island, const double*
 
 
 cdef inline int32_t solve_coulomb(flow_t* f, int32_t island, double* impulse) noexcept nogil:
-    """Run the rounds of Coulomb's law (file header); a call continues where the last one ended.
-
-    Between calls `impulse` holds the best impulse, and `paused_start` the start of the paused descent: phi, or in the
-    second stage the impulse.
-    """
+    """Run the rounds of Coulomb's law (file header) into `impulse`; a call continues where the last one ended."""
     cdef paused_t* x = &f.paused
     cdef int32_t n
     cdef double least
+    cdef bint moves, is_lower
     if x.stage == CONVEX_STAGE:
-        copy_rows(f, island, f.paused_start, f.phi)
-    elif x.stage == COULOMB_STAGE:
-        copy_rows(f, island, f.paused_start, impulse)
+        copy_rows(f, island, f.start, f.phi)
     while x.rounds < MAX_COULOMB_ROUNDS:
         least = x.best_error
         if x.stage == NEXT_ROUND:
             f.rounds += 1
             x.stage = CONVEX_STAGE if x.rounds > 0 or x.cold else COULOMB_STAGE
-            if x.stage == COULOMB_STAGE:
-                restart_island_from_impulse(f, island, impulse)
             begin_descent(f, island, CONE if x.stage == CONVEX_STAGE else COULOMB, 1.0 / 0.0)
         f.p.law = CONE if x.stage == CONVEX_STAGE else COULOMB
         n = descend_island(f, island, 0.1 * least if x.stage == CONVEX_STAGE and least > 1e2 else 1.0)
         if x.stage == CONVEX_STAGE:
             if n == LOST or n == BROKEN:
                 return n
-            if n == MORE:
-                copy_rows(f, island, f.phi, f.paused_start)
-            copy_rows(f, island, f.best, impulse)
+            copy_rows(f, island, f.phi if n == MORE else f.best, f.start)
             clear_normal_shift(f, island)
-            keep_impulse_if_better(f, island, impulse, multiply_y_transpose(f, island, impulse, f.u))
-        else:
-            if n == MORE:
-                copy_rows(f, island, impulse, f.paused_start)
-            if n != LOST and keep_impulse_if_better(f, island, f.best, multiply_y_transpose(f, island, f.best, f.u)):
-                copy_rows(f, island, f.best, impulse)
+        moves = multiply_y_transpose(f, island, f.best, f.u)
+        is_lower = n != LOST and keep_impulse_if_better(f, island, f.best, moves, impulse)
+        if x.stage == COULOMB_STAGE and is_lower and n != MORE:
+            copy_rows(f, island, f.best, f.start)
         if x.best_error <= 1.0:
             return REACHED
         if n == MORE:
             x.best_error = least                        # An impulse at which a call ends must not change the path.
             return MORE
         if x.stage == COULOMB_STAGE:
-            compute_normal_shifts(f, island, impulse)
+            compute_normal_shifts(f, island, f.start)
             x.rounds += 1
-        restart_island_from_impulse(f, island, impulse)
+        restart_island_from_impulse(f, island, f.start)
         x.stage = COULOMB_STAGE if x.stage == CONVEX_STAGE else NEXT_ROUND
         if x.stage == COULOMB_STAGE:
             begin_descent(f, island, COULOMB, 1.0 / 0.0)
@@ -579,18 +568,18 @@ cdef inline int32_t solve_island(flow_t* f, int32_t island, double* impulse) noe
         if is_island_inactive(f, island, impulse):
             return REACHED
         restart_island_from_impulse(f, island, impulse)
+        copy_rows(f, island, impulse, f.start)
         clear_normal_shift(f, island)
         f.paused.stage, f.paused.rounds = NEXT_ROUND, 0
         f.paused.best_error = f.paused.island_error = 1.0 / 0.0
         if f.law != COULOMB and f.tol > 0.0 and f.energy_limit > 0.0 and is_zero_island_impulse(f, island):
             f.paused.best_error = 1.0 / f.tol           # the error that the limits refer to
-        elif not keep_impulse_if_better(f, island, impulse, not f.is_zero):
+        elif not keep_impulse_if_better(f, island, f.start, not f.is_zero, impulse):
             return LOST
         if f.paused.best_error <= 1.0:
             return REACHED
     if f.law == COULOMB:
         end = solve_coulomb(f, island, impulse)
-        copy_rows(f, island, f.island_best, impulse)
     else:
         if not waits:
             begin_descent(f, island, f.law, f.paused.best_error)
