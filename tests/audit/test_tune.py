@@ -181,7 +181,7 @@ def test_tune_measures_the_default_options_of_mujoco(boxes, monkeypatch):
     assert not any(m.setting.is_default for m in tune(boxes(), worlds=2, steps=10, repeats=1).measured)
 
 
-def test_ctrl_c_keeps_what_there_is(boxes, monkeypatch, tmp_path):
+def test_tune_stopped_by_ctrl_c_returns_the_measured_settings(boxes, monkeypatch, tmp_path):
     fewer(monkeypatch)
 
     def watch(event):

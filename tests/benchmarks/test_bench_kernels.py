@@ -12,7 +12,7 @@ from benchmarks.kernels.instructions import COUNTED
 
 
 @pytest.mark.parametrize("shuffle", [False, True])
-def test_the_bare_contact_sweep_is_sequential_impulses(shuffle):
+def test_bench_kernels_contact_sweep_is_sequential_impulses(shuffle):
     problem = core_problems.lattice_pile(200, shuffle=shuffle)
     contacts, bodies = problems.bare_contacts(problem)
     microbenchmarks.contact(contacts.view(np.uint8).reshape(-1), bodies.view(np.uint8).reshape(-1), 20)
@@ -26,7 +26,7 @@ def test_the_bare_contact_sweep_is_sequential_impulses(shuffle):
     assert not bodies["v"][0].any()
 
 
-def test_the_bare_row_sweep_is_pgs():
+def test_bench_kernels_row_sweep_is_pgs():
     problem = problems.tridiagonal(50)
     a, lam = problem.csr, problem.start()
     microbenchmarks.csr(a.indptr, a.indices, a.data, problem.b, problem.data.step.copy(), lam, 30)

@@ -41,7 +41,7 @@ def is_adapter(name):
 
 
 @pytest.mark.parametrize("kind", SMALL)
-def test_every_adapter_solves_the_same_problem(kind):
+def test_bench_peers_every_adapter_solves_the_same_problem(kind):
     # A wrong sign, bound or order of rows would leave a residual near 1.
     problem = suite.case(SMALL[kind]).problem
     for contestant in adapters.contestants():
@@ -142,7 +142,7 @@ def test_ratios_means_and_losses():
 # -- engines ---------------------------------------------------------------------------------------
 
 
-def test_the_command_steps_the_same_scene_in_every_engine_and_keeps_losses(tmp_path, monkeypatch):
+def test_bench_peers_command_steps_one_scene_in_every_engine_and_keeps_losses(tmp_path, monkeypatch):
     out, steps = tmp_path / "peers.json", []
 
     def short(scene, sweeps):

@@ -8,7 +8,7 @@ from benchmarks.stand import ENGINES, Tower, has_fallen, measure, missing
 
 
 @pytest.mark.parametrize("name", ENGINES)
-def test_a_box_stands_in_every_engine_that_is_installed(name):
+def test_bench_stand_of_a_box_stands_in_every_installed_engine(name):
     if missing(name):
         with pytest.raises(lv.InputError, match=name):
             measure(name, Tower(1, 1 / 60))
@@ -33,7 +33,7 @@ def test_bench_stand_of_lavender_has_the_parameters_of_the_scene():
     np.testing.assert_array_equal(engine.centres(), seen["positions"][1:])
 
 
-def test_a_tower_has_fallen_when_a_box_is_half_an_edge_lower_and_not_when_it_has_moved_sideways():
+def test_bench_stand_has_fallen_of_a_lower_box_is_true_and_of_a_moved_box_false():
     start = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 1.5]])
     for move, fallen in (
         ((3.0, 0.0, 0.0), False),

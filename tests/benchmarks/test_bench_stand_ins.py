@@ -60,6 +60,6 @@ def test_every_module_of_the_benchmarks_can_be_imported(name, monkeypatch):
         vars(parent).update(names)  # A second import binds the module to its name in the package.
 
 
-def test_each_solver_of_lavender_runs(problems):
+def test_bench_peers_runs_each_solver_of_lavender(problems):
     for contestant in adapters.ours():
         assert run_once(contestant, problems) < CLOSE, contestant.name

@@ -11,7 +11,6 @@ import time
 import numpy as np
 import pytest
 from stacks import idle_problem, stack
-from worked import python
 
 import lavender as lv
 from lavender import cli, io, report
@@ -114,19 +113,6 @@ class Finder:
 if "popen_loky" in " ".join(sys.orig_argv):
     sys.meta_path.insert(0, Finder())
 """
-
-
-@pytest.mark.nightly
-@pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="signals of POSIX")
-def test_ctrl_c_while_workers_start_is_handled_by_the_command_only(tmp_path):
-    """The terminal sends the signal to all of its processes, where the first worker begins its imports."""
-    (tmp_path / "sitecustomize.py").write_text(WORKER)
-    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    command = ("-m", "lavender", "report", *(f"granular(n=2, seed={i})" for i in range(20)), "--workers", 2)
-    more = ("--solvers", "pgs", "--no-figures", "--out", tmp_path / "out")
-    done = python(*command, *more, status=130, env=environment, start_new_session=True)
-    assert "Traceback" not in done.stderr
-    assert "continues from here" in done.stdout
 
 
 ARM = """<mujoco><option timestep="0.01"/><worldbody><geom type="plane" size="1 1 1"/>

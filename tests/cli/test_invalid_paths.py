@@ -244,7 +244,7 @@ def test_killed_writer_leaves_the_old_file_and_a_temporary_one(kind, tmp_path):
     assert TEMPORARY_NAME.fullmatch(part.name)
 
 
-def test_one_process_writes_records_and_a_dead_one_holds_no_lock(tmp_path):
+def test_store_is_written_by_one_process_and_released_by_a_dead_one(tmp_path):
     path = tmp_path / "records.jsonl"
     with report.Store(path) as store:
         for _ in range(2):  # The first refusal releases nothing.
@@ -260,7 +260,7 @@ def test_one_process_writes_records_and_a_dead_one_holds_no_lock(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_one_recording_at_a_time_is_written_into_a_folder(tmp_path):
+def test_folder_of_steps_is_written_by_one_recording_at_a_time(tmp_path):
     with lock_step_folder(tmp_path):
         for replace in (False, True):
             with pytest.raises(lv.InputError, match="is being written by another command"):

@@ -249,7 +249,7 @@ RUNS = {
 
 
 @pytest.mark.parametrize("case", RUNS)
-def test_a_run_in_parts_has_the_bits_of_the_whole(case):
+def test_solver_run_in_parts_has_the_bits_of_one_run(case):
     run, problems, whole, parts = RUNS[case]
     name = getattr(run, "keywords", {}).get("name", "newton")
     compared = 0

@@ -252,7 +252,7 @@ def test_unknown_attributes_raise_attribute_error_with_the_name(owner):
     assert raised.value.name == "nonsense"  # Python suggests the nearest name in the traceback.
 
 
-def test_a_status_is_equal_to_its_name_everywhere():
+def test_status_equals_its_name_when_compared_copied_or_written():
     solution = lv.solve(TINY)
     assert solution.status == "CONVERGED" and solution.status != "STALLED"
     assert (lv.solve_many([TINY] * 2).status == "CONVERGED").all()

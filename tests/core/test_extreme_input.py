@@ -144,7 +144,7 @@ def test_every_solver_gives_the_same_answer_in_other_units(kind, form, seed, exp
 
 
 @pytest.mark.parametrize("form", ["A", "J and M"])
-def test_a_row_below_the_smallest_entry_is_an_empty_row(form):
+def test_row_below_the_smallest_entry_is_solved_as_an_empty_row(form):
     """Its d is that of the other rows, and nothing is divided by its entry."""
     dust = 1e-61
     if form == "A":

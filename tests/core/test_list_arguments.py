@@ -36,7 +36,7 @@ class Halves:
         return lv.Claim(lv.Status.MAX_ITERATIONS, n)
 
 
-def test_a_solver_needs_no_base_class(register: Any) -> None:
+def test_register_of_a_class_without_base_is_accepted(register: Any) -> None:
     register(lv.SolverSpec(name="halves", factory=Halves, laws=frozenset({"lcp"}), summary=""))
     solution = lv.solve(lv.Problem.lcp([[1.0]], [1.0]), "halves", impulse=[8.0], tol=0.0, max_iter=3)
     assert solution.impulse.tolist() == [1.0]

@@ -52,7 +52,7 @@ def test_motion_error_is_the_energy_and_the_largest_speeds_of_the_velocity_diffe
     ],
     ids=["matrix", "asymmetric", "indefinite", "infeasible"],
 )
-def test_motion_error_without_velocities_is_none_with_a_note(problem, none, some, word):
+def test_motion_error_without_velocities_has_a_note(problem, none, some, word):
     e = lv.motion_error(problem, np.zeros(problem.m))
     assert [getattr(e, name) for name in none] == [None] * len(none)
     assert all(getattr(e, name) > 0.1 for name in some)
@@ -60,7 +60,7 @@ def test_motion_error_without_velocities_is_none_with_a_note(problem, none, some
 
 
 @pytest.mark.parametrize("light", [1.0, 1e16])
-def test_asymmetry_of_heavy_bodies_beside_lighter_ones_leaves_no_energy(light):
+def test_motion_error_of_an_asymmetric_matrix_has_no_energy(light):
     heavy = [[1.0, 0.9], [-0.9, 1.0]]
     problem = lv.Problem.lcp(sp.block_diag([sp.coo_array([[light]]), heavy]).toarray(), [1.0, 1.0, -0.5])
     assert not problem.is_symmetric and problem.asymmetry == pytest.approx(1.8)

@@ -186,7 +186,7 @@ def test_velocity_of_gravity_without_dt_is_reported_without_the_state(scenes, fo
 
 
 @pytest.mark.parametrize("has_round_inertia", [True, False])
-def test_a_kinematic_tree_is_not_mistaken_for_rigid_bodies(scenes, has_round_inertia):
+def test_diagnose_of_a_kinematic_tree_does_not_assume_rigid_bodies(scenes, has_round_inertia):
     """A base that hangs below its feet is no mistake if there are joints in between."""
     step = scenes["stack 0 2"]
     mass = step.mass.copy()
@@ -203,7 +203,7 @@ def test_a_kinematic_tree_is_not_mistaken_for_rigid_bodies(scenes, has_round_ine
     assert kinds(replace(flipped, jac=jac, mass=with_joint, v_free=None, **more).problem) == set()
 
 
-def test_a_conveyor_and_speeds_in_another_unit_are_not_reported(scenes):
+def test_diagnose_of_a_conveyor_or_another_unit_of_speed_reports_nothing(scenes):
     step = replace(scenes["ramp 11 2"], rows=None)
     target = step.target.copy()
     target[step.contacts[:, 0]], target[step.contacts[:, 1]] = 0.0, 0.8

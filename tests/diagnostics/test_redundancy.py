@@ -47,7 +47,7 @@ def test_redundancy_of_an_indefinite_matrix_has_its_rank(seed):
 
 
 @pytest.mark.parametrize("share", [1e-4, 1e-8, 1e-10])
-def test_a_row_that_is_new_by_more_than_tol_is_kept(share):
+def test_redundancy_keeps_a_row_that_differs_by_more_than_tol(share):
     """`tol` is a share of directions: 1e-12 of squares called rows redundant that were 1e-8 apart."""
     rng = np.random.default_rng(5)
     jac = rng.normal(size=(4, 6))
@@ -99,7 +99,7 @@ def test_rank_of_a_sparse_island_is_that_of_its_eigenvalues():
 
 @pytest.mark.parametrize("form", ["masses", "rows of J", "matrix"])
 @pytest.mark.parametrize("spread", [0, 30, 44, 50, 66, 88, 96])  # A_ii up to 1e59, the door is at 1e60
-def test_the_rank_is_that_of_exact_numbers_whatever_the_sizes(form, spread):
+def test_redundancy_rank_at_any_scale_is_that_of_exact_numbers(form, spread):
     """Powers of two, so that nothing is rounded: the rank of J is the rank of J M^-1 J^T, and of its rows scaled."""
     rng = np.random.default_rng(spread)
     seen = set()

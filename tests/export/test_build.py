@@ -39,7 +39,7 @@ LANGUAGES = {"C99": ["-std=c99"], "C++11": ["-std=c++11", "-x", "c++"], "C++17":
         pytest.param("clang", "C++11", ["-DLAV_SWEEPS_ONLY"], marks=pytest.mark.nightly),
     ],
 )
-def test_no_warning_in_either_language(folder, tmp_path, name, language, small):
+def test_exported_library_compiles_without_warnings_in_c_and_cpp(folder, tmp_path, name, language, small):
     command, quick = [name], ["-fsyntax-only"]
     if name == "clang" and shutil.which(name) is None:  # zig's compiler is clang's
         pytest.importorskip("ziglang", reason="neither clang nor ziglang is installed (extra: wasm)")
@@ -50,7 +50,7 @@ def test_no_warning_in_either_language(folder, tmp_path, name, language, small):
     run(*command, *LANGUAGES[language], *WARNINGS, *small, *quick, folder / "lavender.c")
 
 
-def test_no_python_header_and_nothing_but_sqrt_and_moves_of_memory(folder, shared):
+def test_exported_c_needs_only_sqrt_and_moves_of_memory(folder, shared):
     assert not re.search(r"Python\.h|PyObject|malloc|\bfree\(", (folder / "lavender.c").read_text())
     if shutil.which("nm") is None:
         pytest.skip("nm is not installed")
@@ -188,7 +188,7 @@ def test_examples_of_the_library_run(folder, shared, compiler, tmp_path, monkeyp
 
 
 @pytest.mark.slow
-def test_the_solver_of_box2d_is_replaced(folder, tmp_path):
+def test_example_box2d_with_its_solver_replaced_runs(folder, tmp_path):
     sources = os.environ.get("LAVENDER_BOX2D")
     if not sources or shutil.which("cmake") is None:
         pytest.skip("needs cmake, and LAVENDER_BOX2D that names a folder with the sources of Box2D v3")

@@ -53,7 +53,7 @@ def test_steps_and_images_have_the_bits_of_the_package(library, name):
     assert memory
 
 
-def test_an_image_with_a_changed_bit_is_refused(library):
+def test_c_engine_image_with_a_changed_bit_is_rejected(library):
     image = bytearray(engine_image(lv.Simulation(lv.Scene("stack"))))
     workspace = ct.c_uint64()
     image[len(image) // 2] ^= 4

@@ -114,7 +114,7 @@ ROWS = ("inv_mass", "inv_inertia", "contact_body", "normal", "tangent", "arm_a",
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_an_invalid_problem_is_rejected_with_the_place_of_its_mistake(library, mistake):
+def test_c_library_of_an_invalid_problem_returns_the_array_and_index_of_its_fault(library, mistake):
     solver, problem = open_solver(library)
     assert library.c.lav_set(solver.at, ct.byref(problem)) == 0
     problem.keep["order"] = np.arange(12, dtype=np.int32)
@@ -183,7 +183,7 @@ def test_too_little_memory_is_an_error_and_nothing_is_written_behind_it(library,
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_solver_moved_to_the_memory_it_needs_takes_a_larger_problem(library, method):
+def test_c_solver_moved_to_more_memory_takes_a_larger_problem(library, method):
     """It keeps the impulses that it had; sweeps are moved at most once, factors at most three times."""
     small, c = random_lcp(1, m=3), library.c
     bodies = random_contact_problem(3, bodies=4, contacts=6)
@@ -214,7 +214,7 @@ def test_a_solver_moved_to_the_memory_it_needs_takes_a_larger_problem(library, m
     assert grown
 
 
-def test_a_solver_that_is_running_rejects_other_calls(library):
+def test_c_solver_that_is_running_rejects_other_calls(library):
     # From within the clock, which stands for another thread: the solver is busy until the run returns.
     solver, problem = open_solver(library)
     assert library.c.lav_set(solver.at, ct.byref(problem)) == 0
@@ -271,7 +271,7 @@ REAL = st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=0, max_
 @pytest.mark.slow
 @pytest.mark.fuzz
 @given(st.data())
-def test_no_drawn_problem_makes_the_library_write_outside_its_memory(library, data):
+def test_c_library_on_drawn_problems_writes_inside_its_memory(library, data):
     problem, keep = Problem(), []
     form, method = data.draw(st.integers(1, 3)), data.draw(st.integers(1, 12))
     library.c.lav_default_problem(form, ct.byref(problem))
@@ -316,7 +316,7 @@ def test_no_drawn_problem_makes_the_library_write_outside_its_memory(library, da
     iterations=st.integers(0, 300),
     tol=st.sampled_from((0.0, 1e-6)),
 )
-def test_the_verdict_of_the_library_equals_that_of_the_package(library, seed, method, iterations, tol):
+def test_c_library_verdict_equals_that_of_the_package(library, seed, method, iterations, tol):
     bodies = random_contact_problem(seed, "cone" if seed % 2 else "coulomb", bodies=4, contacts=6, joints=1)
     for source in (bodies, as_matrix(bodies), random_lcp(seed, m=9)):
         problem, options = library.problem(source), library.options(method)
@@ -342,7 +342,7 @@ def test_the_verdict_of_the_library_equals_that_of_the_package(library, seed, me
 
 
 @pytest.mark.parametrize("method, tol", [("sequential_impulses", 0.1), ("anderson", 0.01), ("nncg", 0.01)])
-def test_a_budget_that_ends_within_tol_has_converged(library, method, tol):
+def test_c_library_budget_that_ends_within_tol_has_converged(library, method, tol):
     problem = self_test_problem()
     for n in range(1, 40):
         solver = library.open(library.problem(problem), library.options(method))

@@ -90,7 +90,7 @@ SWEPT = [*GIVEN, *dense_velocities()]
 UNSUPPORTED = -11
 
 
-def test_the_self_test_is_of_the_package(library):
+def test_c_library_self_test_has_the_hash_of_the_package(library):
     assert library.c.lav_self_test() == 0
     text = (library.path.parent / "lavender.c").read_text()
     assert f"TEST_HASH = {self_test_hash():#x}u" in text
@@ -103,7 +103,7 @@ def test_methods_are_numbered_and_named_as_in_the_header(library):
 
 
 @pytest.mark.parametrize("at", range(len(SWEPT)))
-def test_every_method_has_the_bits_of_the_package(library, at):
+def test_c_library_method_has_the_bits_of_the_package(library, at):
     """Where `solver.form` says that it swept over rows of A, on that matrix: `problem.csr` is the one to give."""
     given = SWEPT[at]
     start, ran, formed = given.start(), 0, 0
@@ -340,7 +340,7 @@ def test_newton_pile_slides_shifted_newton_has_the_bits_of_the_package(library):
     assert (solver.impulse().tobytes(), result.iterations) == (wanted.tobytes(), factorisations)
 
 
-def test_a_line_search_ends_singular_rows_on_which_exchanges_go_round(library):
+def test_c_library_newton_on_singular_rows_ends_by_a_line_search(library):
     descended = 0
     for seed in range(40):
         rng = np.random.default_rng(seed)
@@ -410,7 +410,7 @@ LAV_API int32_t dump(lav_solver *s, const lav_problem *q, const char *path) { re
 """
 
 
-def test_a_dumped_problem_is_the_problem_to_the_last_bit(library, folder, compiler, tmp_path):
+def test_c_library_dump_is_the_problem_to_the_last_bit(library, folder, compiler, tmp_path):
     (tmp_path / "dump.c").write_text(DUMP)
     flags = ["-Wall", "-Wextra", "-Wpedantic", "-Werror", "-DLAV_SHARED", "-fPIC", "-shared", "-I", folder]
     run(compiler, "-std=c99", *flags, tmp_path / "dump.c", library.path, "-o", tmp_path / "dump.so")

@@ -21,7 +21,7 @@ def accepted(method):
 
 @pytest.mark.parametrize("velocity_tol", [1e-2, 1e-4, 1e-7])
 @pytest.mark.parametrize("method", (*SWEEPS, "newton", "direct"))
-def test_a_run_to_a_velocity_error_is_that_of_the_package(library, method, velocity_tol):
+def test_c_library_to_a_velocity_error_has_the_bits_of_the_package(library, method, velocity_tol):
     problems = accepted(method)
     assert problems
     for problem in problems:
@@ -36,7 +36,7 @@ def test_a_run_to_a_velocity_error_is_that_of_the_package(library, method, veloc
             assert solver.impulse().tobytes() == solution.impulse.tobytes()
 
 
-def test_a_larger_relative_residual_is_accepted_if_the_velocity_error_is_small_enough(library):
+def test_c_library_to_a_velocity_error_accepts_a_larger_relative_residual(library):
     problem = as_matrix(self_test_problem())
     reference = lv.residual(problem, problem.start()).velocity_at_zero
     exceeds_guarantee = []  # whether the relative residual was above the one that guarantees the velocity error

@@ -63,7 +63,7 @@ APPROXIMATIONS = [DiscreteContactApproximation.kSap, DiscreteContactApproximatio
 
 
 @pytest.mark.parametrize("approximation", APPROXIMATIONS)
-def test_saps_impulses_give_its_next_velocity(approximation):
+def test_from_drake_impulses_of_sap_give_its_next_velocity(approximation):
     _, _, plant, context = robot(approximation)
     problem = lv.io.from_drake(plant, context, DT)
     assert (problem.operator, problem.law, problem.m) == ("generalized", "coulomb", 5 * 3 + 4)
@@ -77,7 +77,7 @@ def test_saps_impulses_give_its_next_velocity(approximation):
 
 
 @pytest.mark.parametrize(("ratio", "count", "seed", "steps"), [(1, 3, 2, 36), (1000, 4, 1, 10)])
-def test_states_at_which_sap_stopped_at_its_tolerance_are_taken(ratio, count, seed, steps):
+def test_from_drake_of_states_at_the_tolerance_of_sap_is_accepted(ratio, count, seed, steps):
     """Balls that fall on one another, the upper one heavier: what SAP leaves of one velocity's momentum is more."""
     rng, builder = np.random.default_rng(seed), DiagramBuilder()
     plant, _ = AddMultibodyPlantSceneGraph(builder, time_step=DT)
@@ -134,7 +134,7 @@ def test_v_free_is_the_step_without_contacts_and_limits():
 
 
 @pytest.mark.parametrize("approximation", APPROXIMATIONS)
-def test_the_rigid_answer_is_near_saps(approximation):
+def test_from_drake_rigid_answer_is_near_that_of_sap(approximation):
     """SAP's contacts are softer: on a body that comes to rest the velocities differ by a share of what contact does."""
     diagram, whole, plant, context = robot(approximation)
     simulator = Simulator(diagram, whole)

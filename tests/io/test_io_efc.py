@@ -28,7 +28,7 @@ def forwarded(model, state):
 
 @pytest.mark.parametrize("jacobian", ["dense", "sparse"])
 @pytest.mark.parametrize(("cone", "condim"), [("elliptic", 3), ("elliptic", 6), ("pyramidal", 3), ("elliptic", 1)])
-def test_a_state_of_many_is_the_problem_of_one(cone, condim, jacobian):
+def test_from_mujoco_many_of_a_state_equals_from_mujoco(cone, condim, jacobian):
     model = mj.MjModel.from_xml_string(scene(cone=cone, condim=condim, jacobian=jacobian))
     states = states_of(model, 6)
     batch, impulse = lv.io.from_mujoco_many(model, states, threads=2)
@@ -57,7 +57,7 @@ def test_a_state_of_many_is_the_problem_of_one(cone, condim, jacobian):
         assert found.velocity_error[i] == pytest.approx(one.velocity, rel=1e-3, abs=1e-9)
 
 
-def test_a_state_that_is_not_finite_harms_no_other():
+def test_from_mujoco_many_with_a_state_that_is_not_finite_reads_the_others():
     model = mj.MjModel.from_xml_string(scene())
     states = states_of(model, 5)
     clean = lv.io.from_mujoco_many(model, states)
@@ -159,7 +159,7 @@ def test_arrays_in_float32_are_judged_by_their_own_floor(cone, condim):
     assert lv.solve_many(rough.batch, tol=1e-6).success.all()
 
 
-def test_a_triangle_of_the_mass_and_the_time_step_in_an_array_make_the_same_worlds():
+def test_from_efc_of_a_triangle_of_m_or_an_array_of_the_step_makes_the_same_worlds():
     model = mj.MjModel.from_xml_string(scene())
     given = stacked(model, states_of(model, 3), np.float32)
     ptr = np.append(model.M_rowadr, len(model.M_colind))
@@ -189,7 +189,7 @@ def test_from_efc_does_not_read_rows_above_nefc(junk):
     np.testing.assert_array_equal(many.impulse, same.impulse)
 
 
-def test_the_law_of_contacts_can_be_coulombs():
+def test_from_efc_with_coulomb_law_changes_the_law_alone():
     model = mj.MjModel.from_xml_string(scene(cone="elliptic", condim=3))
     given = stacked(model, states_of(model, 4), np.float64)
     relaxed, rigid = lv.io.from_efc(**given), lv.io.from_efc(**given, friction="coulomb")

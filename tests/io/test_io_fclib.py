@@ -43,7 +43,7 @@ def soft(problem, compliance=0.0):
 
 @pytest.mark.parametrize("spacedim", [2, 3, 5])
 @pytest.mark.parametrize("suffix", [".hdf5", ".h5"])
-def test_a_local_file_keeps_everything_to_the_bit(tmp_path, spacedim, suffix):
+def test_fclib_local_file_keeps_every_bit(tmp_path, spacedim, suffix):
     problem = local_problem(spacedim)
     kind = "fclib_local_rolling" if spacedim == 5 else "fclib_local"
     impulse = np.linspace(0.0, 1.0, problem.m)
@@ -131,7 +131,7 @@ W = np.array([[2.0, 0.5, 0.0], [0.0, 1.0, 0.25], [0.125, 0.0, 3.0]])
 
 @pytest.mark.parametrize("spare", [0, 5])
 @pytest.mark.parametrize("nz", [-2, -1, 0])
-def test_every_storage_is_read(tmp_path, nz, spare):
+def test_load_of_fclib_in_every_matrix_storage_gives_the_same_problem(tmp_path, nz, spare):
     problem = lavender.io.load(make(tmp_path / "p.h5", W=encoded(W, nz, spare), q=np.arange(3.0), mu=[0.5]))
     assert np.array_equal(problem.dense(), W)
     assert np.array_equal(problem.b, -np.arange(3.0))
@@ -151,7 +151,7 @@ def test_repeated_triplets_are_summed(tmp_path):
     assert np.array_equal(problem.dense(), np.diag([1.0, 6.0, 3.0]))
 
 
-def test_a_global_file_whose_m_is_no_mass_matrix_is_condensed(tmp_path):
+def test_load_of_global_fclib_with_an_asymmetric_m_forms_a(tmp_path):
     m, h = np.diag([2.0, 4.0, 0.5]), W.T
     m[0, 1] = 1.0
     parts = {"M": encoded(m, -2), "H": encoded(h, -2)}
@@ -183,7 +183,7 @@ def test_equations_become_free_rows(tmp_path):
     assert (stored.impulse.tolist(), stored.slack.tolist()) == ([1.0, 0.2, 0.3, 7.0], [0.0, 0.5, 0.0, 0.0])
 
 
-def test_both_forms_are_read_as_local(tmp_path):
+def test_load_of_fclib_with_both_forms_reads_the_local_one(tmp_path):
     path = make(tmp_path / "p.h5", W=encoded(W, -2), q=np.zeros(3), mu=[0.5])
     with h5py.File(path, "a") as file:
         file.create_group("fclib_global")
@@ -268,7 +268,7 @@ def test_load_of_fclib_with_mixed_kinds_raises(tmp_path):
 GOOD = encoded(W, -2)
 
 
-def test_a_singular_mass_matrix_is_refused(tmp_path):
+def test_load_of_fclib_with_a_singular_mass_raises(tmp_path):
     parts = {"M": encoded(np.diag([1.0, 0.0]), -2), "H": encoded(np.ones((2, 3)), -2)}
     with pytest.raises(lv.InputError, match="invertible M"):
         lavender.io.load(make(tmp_path / "p.h5", f=np.zeros(2), w=np.zeros(3), mu=[0.5], **parts))

@@ -24,7 +24,7 @@ PGS = 1e-6  # its improvement of a whole sweep is small long before the distance
     ("cone", "condim"),
     [("elliptic", 3), ("elliptic", 4), ("elliptic", 6), ("elliptic", 1), ("pyramidal", 3), ("pyramidal", 6)],
 )
-def test_the_solution_of_newton_is_a_solution_here(cone, condim, jacobian):
+def test_from_mujoco_answer_of_newton_is_a_solution(cone, condim, jacobian):
     model, data = state(cone, condim=condim, jacobian=jacobian)
     problem = lv.io.from_mujoco(model, data)
     found = lv.residual(problem, adapter.impulse(model, data))
@@ -162,7 +162,7 @@ def test_softness_that_a_copy_did_not_fill_comes_from_its_inverse():
 
 
 @pytest.mark.parametrize("jacobian", ["dense", "sparse"])
-def test_a_model_that_was_edited_between_two_states_is_noticed(jacobian):
+def test_from_mujoco_of_an_edited_model_reads_the_new_values(jacobian):
     """What is kept with a model is compared before it serves: the same bits as from a model seen for the first time."""
     model, data = state(jacobian=jacobian)
     for change in ("body_mass", "dof_armature", "geom_friction", "dof_frictionloss"):
@@ -179,7 +179,7 @@ def test_a_model_that_was_edited_between_two_states_is_noticed(jacobian):
         assert found == lv.io.from_mujoco(fresh, other) != before
 
 
-def test_every_edge_of_a_flex_is_a_block_of_its_own():
+def test_from_mujoco_of_a_flex_has_a_block_for_each_edge():
     """Together its rows would reach every vertex, and each row of M^-1/2 J^T would be as long as the flex is large."""
     model = mj.MjModel.from_xml_string("""<mujoco><worldbody><geom type="plane" size="1 1 .1"/>
         <flexcomp name="cloth" type="grid" dim="2" count="5 5 1" spacing=".05 .05 .05" pos="0 0 .02" radius=".01"
@@ -237,7 +237,7 @@ def test_solve_of_a_flex_gives_the_acceleration_of_mujoco(cone, condim, kind):
 
 
 @pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
-def test_after_a_step_of_rk4_the_accelerations_are_the_mean_of_four_passes(cone):
+def test_from_mujoco_after_a_step_of_rk4_reads_the_mean_acceleration_of_four_passes(cone):
     """Of none is efc_force; after a forward pass they are those of its forces, as under any integrator.
 
     Before MuJoCo 4.0 they are those of the last pass.
@@ -274,7 +274,7 @@ def same_to_rounding(found, right):
 
 @pytest.mark.parametrize("way", ["EULER", "IMPLICITFAST", "RK4", "noslip"])
 @pytest.mark.parametrize("name", [*INDICES, *NUMBERS])
-def test_an_array_that_was_changed_is_refused_or_tells_the_same_problem(name, way):
+def test_from_mujoco_with_a_changed_array_raises_or_reads_the_same_problem(name, way):
     """Before an index is followed, and though the pattern of M was seen before; no integrator is blamed for it."""
     model, data = state(condim=4, jacobian="sparse")
     if way == "noslip":
@@ -301,7 +301,7 @@ def test_an_array_that_was_changed_is_refused_or_tells_the_same_problem(name, wa
     assert not any("integrator" in words for words in said)
 
 
-def test_of_a_model_only_what_cannot_change_is_kept_and_it_is_let_go():
+def test_from_mujoco_keeps_only_constant_arrays_of_a_model_and_releases_it():
     model, data = state()
     for name in ("body_parentid", "dof_bodyid"):
         lv.io.from_mujoco(model, data)
@@ -386,7 +386,7 @@ def test_another_choice_of_layout_after_the_forward_pass_is_refused(before):
 @pytest.mark.parametrize("moving", [False, True])
 @pytest.mark.parametrize("stepped", [False, True])
 @pytest.mark.parametrize("factor", [0.0, -1.0, 1.0 + 1e-6])
-def test_a_jacobian_that_did_not_make_the_data_is_refused(factor, stepped, moving, gravity):
+def test_from_mujoco_with_a_jacobian_of_other_data_raises(factor, stepped, moving, gravity):
     model, data = state()
     model.opt.gravity[:] = gravity
     if not moving:

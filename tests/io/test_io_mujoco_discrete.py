@@ -133,7 +133,7 @@ def test_from_mujoco_many_of_discrete_steps_equals_from_mujoco(name):
         assert world.b == pytest.approx(problem.b, abs=1e-12 * np.abs(problem.b).max())
 
 
-def test_from_mujoco_of_a_flex_whose_stiffness_is_not_stored_names_it():
+def test_from_mujoco_of_a_flex_without_stored_stiffness_raises():
     # Conjugate gradients multiply by the bending stiffness without storing it.
     model = mj.MjModel.from_xml_string(MODEL.format(options='solver="CG"', bodies=make_sheet("bend") + BALL, more=""))
     data = mj.MjData(model)

@@ -65,7 +65,7 @@ def variants():
 
 
 @pytest.mark.parametrize("problem", [pytest.param(problem, id=name) for name, problem in variants()])
-def test_a_saved_problem_is_the_same_problem(tmp_path, problem):
+def test_save_and_load_of_npz_keeps_the_problem(tmp_path, problem):
     path = tmp_path / "problem.npz"
     impulse = np.linspace(0.0, 1.0, problem.m)
     lavender.io.save(problem, path, impulse=impulse)
@@ -79,7 +79,7 @@ def test_a_saved_problem_is_the_same_problem(tmp_path, problem):
 
 
 @given(seeds)
-def test_every_kind_of_block_comes_back_in_every_form(tmp_path_factory, seed):
+def test_save_and_load_of_every_kind_of_block_keeps_it(tmp_path_factory, seed):
     path = tmp_path_factory.mktemp("npz") / "p.npz"
     bodies = [given_by(make(seed)) for make in CONTACTS.values() for given_by in FORMS.values()]
     for problem in (*bodies, random_lcp(seed), random_generalized_problem(seed, tangents=5)):
@@ -88,7 +88,7 @@ def test_every_kind_of_block_comes_back_in_every_form(tmp_path_factory, seed):
         assert stored.problem == pickle.loads(pickle.dumps(stored)).problem == problem
 
 
-def test_two_saves_give_the_same_bytes(tmp_path):
+def test_save_of_npz_twice_has_the_same_bytes(tmp_path):
     problem = random_contact_problem(5)
     for name in ("a.npz", "b.npz"):
         lavender.io.save(problem, tmp_path / name)
@@ -98,7 +98,7 @@ def test_two_saves_give_the_same_bytes(tmp_path):
 # -- writing --------------------------------------------------------------------------------------
 
 
-def test_what_cannot_be_written_is_named_and_leaves_nothing(tmp_path):
+def test_save_of_invalid_arguments_names_them_and_leaves_no_file(tmp_path):
     problem = random_lcp(1)
     for name in ("p.mat", "p"):
         with pytest.raises(lv.InputError, match=r"\.npz or \.hdf5"):
@@ -147,7 +147,7 @@ class Bomb:
         return (os.mkdir, (os.environ["LAVENDER_TEST_BOMB"],))
 
 
-def test_nothing_is_unpickled(tmp_path, monkeypatch):
+def test_load_of_an_npz_unpickles_nothing(tmp_path, monkeypatch):
     trace = tmp_path / "executed"
     monkeypatch.setenv("LAVENDER_TEST_BOMB", str(trace))
     for entry in (np.array(Bomb(), object), npy("|O", (1,), pickle.dumps(Bomb())), pickle.dumps(Bomb())):
@@ -157,7 +157,7 @@ def test_nothing_is_unpickled(tmp_path, monkeypatch):
     assert not trace.exists()
 
 
-def test_an_archive_that_hides_its_size_is_refused(tmp_path):
+def test_load_of_an_npz_with_a_false_size_raises(tmp_path):
     path = own(tmp_path)
     raw = bytearray(path.read_bytes())
     at = raw.index(b"PK\x01\x02")  # the first entry of the directory; its declared size is at 24
@@ -232,7 +232,7 @@ def test_box_matrices_may_be_sparse_and_of_any_number(tmp_path):
     assert whole.b.dtype == np.float64
 
 
-def test_the_documentation_lists_every_entry_of_our_format(tmp_path):
+def test_documentation_lists_every_entry_of_npz(tmp_path):
     text = (Path(__file__).resolve().parent.parent.parent / "docs" / "formats.md").read_text(encoding="utf-8")
     for _, problem in variants():
         lavender.io.save(problem, tmp_path / "p.npz", impulse=np.zeros(problem.m))

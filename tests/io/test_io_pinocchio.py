@@ -48,7 +48,7 @@ def problem_of(model, models, q, v, dt=0.01, **more):
     )
 
 
-def test_the_rows_are_the_constraints_and_the_velocity_is_pinocchios():
+def test_from_pinocchio_rows_and_velocity_are_those_of_pinocchio():
     model, models, q, v = robot()
     tau = np.random.default_rng(1).normal(size=model.nv)
     problem = problem_of(model, models, q, v, tau=tau)
@@ -75,7 +75,7 @@ def test_the_rows_are_the_constraints_and_the_velocity_is_pinocchios():
     np.testing.assert_array_equal(jac[6:, 6], [1.0, -1.0, 1.0])
 
 
-def test_a_step_under_the_solution_keeps_every_constraint():
+def test_from_pinocchio_solution_keeps_every_constraint_for_a_step():
     model, models, q, v = robot()
     v[2] = -1.0  # into the ground
     dt = 1e-3
@@ -159,7 +159,7 @@ def test_limits_and_friction_of_any_joint_hold_in_pinocchios_own_dynamics(seed):
 
 
 @pytest.mark.parametrize("kind", ["contact", "anchor"])
-def test_a_desired_velocity_is_the_targets(kind):
+def test_from_pinocchio_desired_velocity_is_the_target(kind):
     model, models, q, v = robot()
     one = models[1 if kind == "contact" else 0]
     without = problem_of(model, [one], q, v).b
@@ -170,7 +170,7 @@ def test_a_desired_velocity_is_the_targets(kind):
 
 @pytest.mark.parametrize("where", ["joint", "constraint"])
 @pytest.mark.parametrize("rotation", [2.0 * np.eye(3), np.diag([1.0, 1.0, -1.0]), np.full((3, 3), np.nan)])
-def test_a_placement_that_does_not_rotate_is_refused(where, rotation):
+def test_from_pinocchio_with_a_placement_that_is_not_a_rotation_raises(where, rotation):
     model, _, q, v = robot()
     placement = pin.SE3(rotation, np.zeros(3))
     if where == "joint":
@@ -182,7 +182,7 @@ def test_a_placement_that_does_not_rotate_is_refused(where, rotation):
         problem_of(model, models, q, v)
 
 
-def test_a_model_of_nothing_and_one_out_of_order():
+def test_from_pinocchio_of_an_empty_model_or_joints_out_of_order_is_read():
     assert problem_of(pin.Model(), [], np.zeros(0), np.zeros(0)).m == 0
     model = pin.Model()
     for i, parent in enumerate([0, 0, 1]):  # the child of the first comes after the second

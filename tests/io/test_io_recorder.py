@@ -34,7 +34,7 @@ def lines_of(folder):
     return [json.loads(line) for line in (folder / "engine.jsonl").read_text().splitlines()]
 
 
-def test_the_worst_answers_of_all_steps_are_kept(tmp_path):
+def test_recorder_keeps_the_worst_answers_of_all_steps(tmp_path):
     rng = np.random.default_rng(0)
     steps = rng.uniform(0.0, 0.4, (12, 5))
     with lv.io.Recorder(tmp_path / "worst", keep_worst=4) as recorder:
@@ -55,7 +55,7 @@ def test_the_worst_answers_of_all_steps_are_kept(tmp_path):
         assert state["position"].tolist() == [world]
 
 
-def test_every_and_when_select_beside_the_worst(tmp_path):
+def test_recorder_with_every_and_when_keeps_selected_and_worst_steps(tmp_path):
     with lv.io.Recorder(tmp_path / "a", every=3, keep_worst=1, when=lambda v: v.claimed and v.world == 1) as recorder:
         for _ in range(5):
             recorder.add(step_of([0.3, 0.01]))
@@ -65,7 +65,7 @@ def test_every_and_when_select_beside_the_worst(tmp_path):
     assert verdicts == 5
 
 
-def test_a_world_that_cannot_be_judged_has_one_line_and_stops_nothing(tmp_path):
+def test_recorder_with_a_world_of_nan_writes_one_line_for_it_and_continues(tmp_path):
     with lv.io.Recorder(tmp_path / "a", keep_worst=2) as recorder:
         for _ in range(3):
             verdicts = recorder.add(step_of([0.1, 0.2, 0.3], nan=[1]))

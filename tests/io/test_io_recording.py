@@ -12,7 +12,7 @@ from lavender.io import recorder, recording
 PGS = 1e-6  # as in test_io_mujoco.py
 
 
-def test_a_recording_is_a_folder_of_problems_with_the_engines_own_answer(tmp_path):
+def test_record_writes_a_folder_of_problems_with_the_answers_of_the_engine(tmp_path):
     model, data = state(steps=1)
     found = lv.io.record(model, data, tmp_path / "steps", 40, every=10)
     assert len(found.files) == 4
@@ -29,7 +29,7 @@ def test_a_recording_is_a_folder_of_problems_with_the_engines_own_answer(tmp_pat
         assert line["solver"] == "NEWTON"
 
 
-def test_a_step_on_which_mujoco_stopped_before_convergence_is_kept_and_told_in_metres_per_second(tmp_path):
+def test_record_of_a_step_stopped_before_convergence_has_its_error_in_metres_per_second(tmp_path):
     text = scene(cone="pyramidal").replace('iterations="2000"', 'iterations="1"')
     model = mj.MjModel.from_xml_string(text)
     found = lv.io.record(model, mj.MjData(model), tmp_path / "early", 30)
@@ -122,7 +122,7 @@ def test_record_with_noslip_separates_its_iterations(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["mj_step", "mj_forward"])
-def test_a_model_that_ends_mujoco_in_an_error_is_refused_by_its_words(tmp_path, monkeypatch, name):
+def test_record_of_a_model_that_ends_mujoco_in_an_error_raises_its_words(tmp_path, monkeypatch, name):
     def ends(*_):
         raise mj.FatalError("not supported")
 

@@ -118,7 +118,7 @@ def test_claims_have_the_headings_of_the_pages():
     assert HEADING.findall(CLAIMS_TEXT) == HEADING.findall(PAGE)
 
 
-def test_every_panel_is_one_of_its_example_with_the_order_that_draws_it():
+def test_chapter_panel_is_drawn_by_the_command_of_its_example():
     """Its picture is there without a build, and none is there that the page does not show."""
     pictures = ROOT / "docs" / "static" / "chapter"
     shown = re.findall(r"\(static/chapter/(\w+)\.png\)\n\n\*[^`]*\*\s`python examples/(\w+)\.py (\w+)\.png`", PAGE)
@@ -138,7 +138,7 @@ def test_every_panel_is_one_of_its_example_with_the_order_that_draws_it():
         assert all(f"{panel}.png" in module.__doc__ for panel in module.PANELS)
 
 
-def test_a_panel_computes_only_what_it_draws(tmp_path, monkeypatch, capsys):
+def test_chapter_panel_computes_only_its_own_curves(tmp_path, monkeypatch, capsys):
     module = example("engine_sweeps")
     for name in ("solve_first", "judge", "run", "compare_orders", "predict_residual", "run_without_friction"):
         monkeypatch.setattr(module, name, None)  # neither tables nor the other panels
@@ -150,14 +150,14 @@ def test_a_panel_computes_only_what_it_draws(tmp_path, monkeypatch, capsys):
         assert len(example(name).numbers()) >= 1 and callable(example(name).print_numbers)
 
 
-def test_every_python_block_runs_by_itself():
+def test_chapter_python_block_runs_by_itself():
     blocks = re.findall(r"^```python\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE)
     assert len(blocks) > 8
     for block in blocks:
         exec(compile(block, "chapter.md", "exec"), {})
 
 
-def test_a_file_named_after_a_panel_holds_it_alone(tmp_path):
+def test_chapter_figure_file_named_after_a_panel_holds_it_alone(tmp_path):
     module = example("two_particles")
     module.main(str(tmp_path / "two_particles.svg"))
     module.main(str(tmp_path / "distance.svg"))
@@ -165,7 +165,7 @@ def test_a_file_named_after_a_panel_holds_it_alone(tmp_path):
     assert [text.count('<g id="axes_') for text in (whole, alone)] == [len(module.PANELS), 1]
 
 
-def test_every_failure_has_a_command_that_shows_it():
+def test_chapter_failure_has_a_command_that_shows_it():
     tables = re.findall(r"^\| failure \| how it shows \| command \|\n\|[-|]+\|\n((?:\|.*\n)+)", PAGE, re.MULTILINE)
     assert len(tables) == 5  # one for each experiment
     rows = [re.split(r"(?<!\\)\| ", row.strip("|")) for table in tables for row in table.splitlines()]
@@ -180,6 +180,6 @@ def test_every_failure_has_a_command_that_shows_it():
     ("number", "shown"),
     [("5e-4", "8.0e-04"), ("15", "7.4"), ("45.4", "45.6"), ("0.40", "0.4060"), ("<1e-9", "1.1e-09")],
 )
-def test_the_comparison_sees_a_wrong_number(number, shown):
+def test_chapter_comparison_detects_a_wrong_number(number, shown):
     with pytest.raises(AssertionError, match="is printed"):
         check([number], "", "at most {} N s", f"first line\nat  most {shown} N s")

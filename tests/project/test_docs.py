@@ -177,7 +177,7 @@ def test_links_resolve_in_a_checkout(page):
 
 
 @pytest.mark.parametrize("page", LINKED, ids=lambda page: page.name)
-def test_a_forge_shows_no_markup_of_sphinx(page):
+def test_pages_shown_by_a_forge_have_no_markup_of_sphinx(page):
     text = page.read_text(encoding="utf-8")
     assert re.findall(r"^ *(?:`{3,}|:{3,}) *\{.*|^: .*|\{(?:doc|ref|numref)\}`.*", text, re.MULTILINE) == []
 
@@ -277,7 +277,7 @@ def test_the_page_on_failures_has_every_status_and_every_error():
         assert f"| `{name}` |" in text
 
 
-def test_every_column_of_records_is_told():
+def test_documentation_has_every_column_of_records():
     page = (ROOT / "docs" / "report.md").read_text(encoding="utf-8")
     table = page.partition("## The columns of records")[2].partition("\n## ")[0]
     lines = lv.report.run(["toy_stack"], ["pgs"], lv.report.Plan(tolerances=(1e-3,), budgets=(), orders=(), repeats=1))

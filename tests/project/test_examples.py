@@ -80,7 +80,7 @@ def test_friction_bounds_are_met_and_the_right_bounds_give_coulomb():
     np.testing.assert_allclose(found["coulomb"].impulse, rounds[-1], rtol=0.0, atol=1e-8)
 
 
-def test_residual_and_motion_error_part_as_the_theory_says(drawn):
+def test_example_residual_and_motion_error_follow_the_theory(drawn):
     module = drawn("residual_or_motion")
     found = module.numbers()
     factors = []
@@ -154,7 +154,7 @@ def test_saps_impulses_on_a_box_of_drake_are_near_the_rigid_ones():
     assert force == pytest.approx(9.81 * module.MASS, rel=1e-3)
 
 
-def test_mass_and_friction_are_found_to_what_the_noise_allows(drawn):
+def test_example_identification_finds_mass_and_friction_within_the_noise(drawn):
     module = drawn("recorded_slide")
     mass, mu, left = module.numbers()["way"][-1]
     # 60 speeds of 0.01 m/s noise determine either to a percent; the fit leaves less than the noise does.

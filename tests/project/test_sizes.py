@@ -60,7 +60,7 @@ def test_package_has_at_most_three_percent_more_lines_than_its_number(packages):
     assert 0 < lines <= 1.03 * LINES[packages]
 
 
-def test_every_package_has_a_number():
+def test_package_sizes_list_every_package():
     folders = [path for name in ("lavender", "lavender_ext") for path in (ROOT / name).iterdir() if path.is_dir()]
     packages = {"lavender", "lavender_ext"} | {path.relative_to(ROOT).as_posix() for path in folders}
     named = {package for package in packages if list_sources(package)}

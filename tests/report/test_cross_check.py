@@ -23,7 +23,7 @@ def bounded_problem(seed, stiff=0.3, contacts=8):
 # -- the inequality -------------------------------------------------------------------------------------
 
 
-def test_a_residual_that_is_too_small_breaks_the_inequality():
+def test_cross_check_with_a_residual_that_is_too_small_reports_a_breach():
     problem = bounded_problem(3)
     optimum = lv.solve(problem, "osqp", tol=1e-10)
     wrong = optimum.impulse + 0.1
@@ -46,7 +46,7 @@ def test_a_residual_that_is_too_small_breaks_the_inequality():
 # -- the reference --------------------------------------------------------------------------------------
 
 
-def test_coulomb_and_asymmetric_have_no_reference():
+def test_cross_check_under_coulomb_law_or_an_asymmetric_matrix_has_no_reference():
     coulomb = random_contact_problem(2, tangents=2, spin=False)
     table = cross_check(coulomb, ["pgs"], max_iter=20_000)
     assert table.reference is None
@@ -65,7 +65,7 @@ def test_coulomb_and_asymmetric_have_no_reference():
     assert "not positive semidefinite" in table.reference_note
 
 
-def test_a_named_reference_under_coulombs_law_is_refused_with_its_reason_and_errors_are_in_metres_per_second():
+def test_cross_check_under_coulomb_law_refuses_a_named_reference_and_shows_velocity_errors():
     coulomb = random_contact_problem(2, tangents=2, spin=False)
     table = cross_check(coulomb, ["newton", "pgs"], "osqp", max_iter=20)
     assert table.reference is None and "osqp takes laws linear, lcp" in table.reference_note
@@ -82,7 +82,7 @@ def test_a_named_reference_under_coulombs_law_is_refused_with_its_reason_and_err
     assert table.reference is None and "newton solves it, but several motions" in table.reference_note
 
 
-def test_relaxed_friction_is_compared_with_a_solver_of_cones_although_a_qp_solver_is_named():
+def test_cross_check_under_the_cone_law_uses_a_reference_of_cones():
     problem = suite.case("granular(n=2, friction=cone)").problem
     table = cross_check(problem, ["newton", "anderson"], "osqp", tol=1e-4)
     assert table.reference == "clarabel_cone"
@@ -117,7 +117,7 @@ def test_solve_reference_excuses_ten_floors_up_to_the_largest_excused_residual(r
 
 
 @pytest.mark.parametrize("kind", [RuntimeError, lv.InputError])
-def test_what_a_plug_in_raises_costs_its_own_row_and_as_reference_its_turn(plug_in, kind):
+def test_cross_check_with_a_plug_in_that_raises_loses_its_row_or_reference_only(plug_in, kind):
     def broken(problem, impulse):
         raise kind("boom")
 
@@ -130,7 +130,7 @@ def test_what_a_plug_in_raises_costs_its_own_row_and_as_reference_its_turn(plug_
     assert table["direct"].verdict == "agrees"
 
 
-def test_an_impulse_whose_energy_is_no_number_is_judged_without_a_warning(plug_in):
+def test_cross_check_of_an_overflowing_impulse_is_not_solved(plug_in):
     def huge(problem, impulse):
         impulse[:] = 1e300
         return lv.Claim(lv.Status.MAX_ITERATIONS, 1)
@@ -139,7 +139,7 @@ def test_an_impulse_whose_energy_is_no_number_is_judged_without_a_warning(plug_i
     assert table["plug-in"].verdict == check.NOT_SOLVED and table["plug-in"].relative == 1.0  # of its start
 
 
-def test_a_budget_that_is_too_small_is_no_lie():
+def test_cross_check_of_a_small_budget_is_not_solved_and_not_contradicted():
     table = cross_check(bounded_problem(2), ["pgs"], max_iter=1)
     assert table["pgs"].verdict == check.NOT_SOLVED
     assert not table.contradicted
@@ -147,14 +147,14 @@ def test_a_budget_that_is_too_small_is_no_lie():
     assert not cross_check(bounded_problem(2), ["pgs", "direct"], max_iter=1).ok
 
 
-def test_who_refuses_is_listed_and_leaves_the_others_right():
+def test_cross_check_with_a_refused_solver_lists_it_and_is_ok():
     problem = lv.Problem.contact(spd(3)[0], [1.0, 0.2, 0.1], [0.5])
     table = cross_check(problem, ["newton", "direct"])
     assert table.ok and [row.solver for row in table.refused] == ["direct"]
     assert not cross_check(problem, ["direct"]).ok  # nobody solved it
 
 
-def test_nothing_is_called_proved_beside_those_who_agree():
+def test_cross_check_of_a_nearly_infeasible_problem_has_solutions_or_proofs_only():
     """The same equation twice, 1e-9 apart: no exact solution, and one to any tolerance above that."""
     for gap, words in ((1e-9, {check.AGREES_UNCOMPARED}), (1e-3, {check.PROVED, check.NOT_SOLVED})):
         problem = lv.Problem.linear(np.ones((2, 2)), [1.0, 1.0 + gap])
@@ -164,7 +164,7 @@ def test_nothing_is_called_proved_beside_those_who_agree():
         assert not {check.PROVED, check.NEAR_NONE} & found or not {check.AGREES, *words} & found - words
 
 
-def test_default_is_every_solver_that_takes_the_problem():
+def test_cross_check_by_default_runs_every_available_solver():
     problem = bounded_problem(6)
     table = lv.cross_check(problem)
     assert [r.solver for r in table] == lv.available(problem)
@@ -175,7 +175,7 @@ def test_default_is_every_solver_that_takes_the_problem():
     assert len(text.splitlines()) == len(table) + 2
 
 
-def test_unknown_names():
+def test_cross_check_of_unknown_names_raises():
     problem = lv.Problem.lcp(*spd(3))
     with pytest.raises(lv.UnknownName, match="osqp"):
         cross_check(problem, ["osq"])
@@ -213,7 +213,7 @@ COMPARED = [
 
 
 @pytest.mark.parametrize("case", COMPARED, ids=lambda c: c.name)
-def test_suite_cases_have_a_reference_and_every_solver_agrees_with_it(case):
+def test_cross_check_of_suite_cases_has_a_reference_and_every_solver_agrees(case):
     names = [n for n in lv.available(case.problem) if n not in KNOWN_LIARS]
     table = cross_check(case.problem, names)
     assert table.reference is not None, table.reference_note
@@ -241,7 +241,7 @@ def test_cross_check_method_of_free_rows_runs_its_bounded_variant():
         lv.solve(table.problem, "gauss_seidel")
 
 
-def test_a_proof_that_there_is_no_solution_counts():
+def test_cross_check_of_a_problem_without_solution_reports_the_proofs():
     table = lv.cross_check(lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0]], [1.0, 1.0]), ["direct", "lemke", "pgs"])
     assert [row.verdict for row in table] == [check.PROVED, check.PROVED, check.NOT_SOLVED]
     assert table.reference is None
@@ -256,7 +256,7 @@ def test_cross_check_unsolved_problem_has_no_reference():
     assert lv.motion_error(problem, problem.start()).rows is None
 
 
-def test_an_impulse_no_better_than_none_is_excused_by_nobody():
+def test_cross_check_of_an_impulse_no_better_than_zero_does_not_agree():
     problem = lv.Problem.linear([[1.0, 1.0], [1.0, 1.0]], [1.0, 2.0], guess=[1e17, -1e17])
     assert lv.residual(problem, problem.guess).roundoff_floor > 1.0
     assert lv.motion_error(problem, [0.5, 0.0], reference=problem.guess).relative is None
@@ -286,7 +286,7 @@ def test_cross_check_idle_problem_neither_agrees_nor_fails():
 TINY = lv.Problem.lcp(np.eye(2), np.ones(2))
 
 
-def test_known_tells_of_everybody_and_available_of_those_that_can():
+def test_known_lists_every_solver_and_available_those_without_a_reason():
     known = lv.known(TINY)
     assert set(known) == set(registry.specs())
     assert [name for name, reason in known.items() if reason is None] == lv.available(TINY)

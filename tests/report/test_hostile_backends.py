@@ -151,7 +151,7 @@ PROC = pytest.mark.skipif(not os.path.exists("/proc/self/stat"), reason="process
 @pytest.mark.slow
 @PROC
 @pytest.mark.parametrize("how", ["fork", pytest.param("escape", marks=pytest.mark.nightly)])
-def test_a_backend_that_forks_and_hangs_keeps_nobody_waiting(hostile, watchdog, monkeypatch, how):
+def test_worker_with_a_backend_that_forks_and_hangs_is_killed_at_its_limit(hostile, watchdog, monkeypatch, how):
     """Its child ends with it, or has left the group and keeps the pipe; `watchdog` ends a test that waits."""
     monkeypatch.setattr(worker_module, "GRACE_TIME", 0.5)
     p = stack()
@@ -176,7 +176,7 @@ Worker().measure_task(p, task(p, "x_fork", time_limit=600.0))
 """
 
 
-def test_an_exception_is_named_by_its_type_and_text(hostile, watchdog):
+def test_worker_record_of_an_exception_has_its_type_and_text(hostile, watchdog):
     p = stack()
     with Worker() as worker:
         record, _ = worker.measure_task(p, task(p, "x_quit"))
@@ -208,7 +208,7 @@ def children(pid):
     return [c for child in found for c in (child, *children(child))]
 
 
-def test_a_whole_run_survives_its_backends(hostile, watchdog, monkeypatch):
+def test_report_run_with_harmful_backends_records_each_crash(hostile, watchdog, monkeypatch):
     monkeypatch.setattr("lavender.report.workers.GRACE_TIME", 0.5)
     plan = report.Plan(tolerances=(1e-3,), budgets=(), repeats=1, time_limit=1.0)  # a hundred times what they take
     runs = report.select_runs(report.run([stack(4)], ["x_talk", "x_hang", "x_segfault", "x_leave", "pgs"], plan))
@@ -218,7 +218,7 @@ def test_a_whole_run_survives_its_backends(hostile, watchdog, monkeypatch):
     assert runs["claim_check"][0] == "contradicted" and int(runs["message"][0]) != os.getpid()
 
 
-def test_a_check_survives_what_ends_its_process(hostile, watchdog, monkeypatch):
+def test_cross_check_with_solvers_that_end_the_process_reports_their_crash(hostile, watchdog, monkeypatch):
     died = ["CRASHED (exit status 3)", "CRASHED (SIGSEGV)", "CONVERGED"]
     table = lv.cross_check(stack(4), ["x_leave", "x_segfault", "pgs"], "x_leave")
     assert [row.status for row in table] == died
@@ -230,7 +230,7 @@ def test_a_check_survives_what_ends_its_process(hostile, watchdog, monkeypatch):
     assert row.status == "KILLED"
 
 
-def test_a_command_survives_what_ends_its_process(hostile, tmp_path, capsys):
+def test_command_with_a_solver_that_ends_the_process_reports_its_crash(hostile, tmp_path, capsys):
     cli = pytest.importorskip("lavender.cli", reason="the floor above is not here")
     stack(4).save(tmp_path / "stack.npz")
     with pytest.raises(SystemExit) as end:
@@ -241,7 +241,7 @@ def test_a_command_survives_what_ends_its_process(hostile, tmp_path, capsys):
     assert end.value.code == cli.EXIT_UNMET and "CRASHED (exit status 3)" in capsys.readouterr().out
 
 
-def test_memory_is_limited_without_asking(hostile, watchdog):
+def test_worker_limits_memory_by_default(hostile, watchdog):
     p = stack()
     with Worker() as worker:  # 320 GB, untouched: nothing but a limit refuses it
         record, _ = worker.measure_task(p, task(p, "x_eat"))
@@ -253,7 +253,7 @@ def test_memory_is_limited_without_asking(hostile, watchdog):
 
 @POSIX
 @pytest.mark.parametrize("how", ["forge", "flood"])
-def test_what_a_backend_writes_into_the_pipe_is_data_and_bounded(hostile, watchdog, monkeypatch, how):
+def test_worker_reads_forged_pipe_data_as_a_crash(hostile, watchdog, monkeypatch, how):
     monkeypatch.setattr(worker_module, "GRACE_TIME", 1.0)
     p = stack()
     with Worker() as worker:
@@ -263,7 +263,7 @@ def test_what_a_backend_writes_into_the_pipe_is_data_and_bounded(hostile, watchd
     assert not hostile.exists()
 
 
-def test_a_worker_says_what_this_process_says_and_judges_a_problem_that_no_backend_held(hostile, watchdog):
+def test_worker_measures_the_numbers_of_this_process_and_judges_an_unchanged_problem(hostile, watchdog):
     p = stack()
     start = np.linspace(0.0, 1.0, p.m)
     with Worker() as worker:
@@ -287,7 +287,7 @@ def test_a_worker_says_what_this_process_says_and_judges_a_problem_that_no_backe
         {"sizes": [2, 2]}, {"sizes": [None, 4]}, {"sizes": [4]}, {"sizes": 4},
     ],
 )  # fmt: skip
-def test_an_answer_that_is_none_is_refused(said):
+def test_parse_outcome_of_an_invalid_answer_raises(said):
     good = {
         "status": "CONVERGED", "iterations": 3, "work": {"sweeps": 3}, "message": "", "form": "",
         "setup_time": 0.01, "solve_time": 0.02, "times": [0.04], "calibration_time": 1e-4, "status_conflict": "",

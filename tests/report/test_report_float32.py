@@ -41,7 +41,7 @@ def test_a_recording_of_a_float32_engine_counts_its_early_answers(tmp_path):
         lv.io.record(model, mujoco.MjData(model), tmp_path / "other", 1, precision="half")
 
 
-def test_answers_of_an_engine_with_an_impulse_are_judged_whatever_their_line_has(tmp_path):
+def test_read_engine_answers_with_a_stored_impulse_judges_it(tmp_path):
     """As a dump of a C engine writes them, with the impulse in the problem file; and files without any list."""
     p = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, 1.0])
     early = lv.solve(p, "pgs", tol=0.0, max_iter=1).impulse

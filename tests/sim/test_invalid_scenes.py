@@ -275,7 +275,7 @@ def changed_snapshot(data, edits, header_edits, damage):
     header=st.lists(HEADER, max_size=1),
     damage=st.none() | st.none() | DAMAGE,
 )  # fmt: skip
-def test_a_changed_snapshot_is_rejected_or_stepped(name, how, steps, edits, header, damage, tmp_path_factory):
+def test_snapshot_with_changed_arrays_is_rejected_or_stepped(name, how, steps, edits, header, damage, tmp_path_factory):
     """What a forged state computes is not promised; that it reads and writes within its arrays is."""
     path = tmp_path_factory.getbasetemp() / "drawn.snapshot"
     simulation = after(steps, name, **GALLERY[name], **how | {"on_failure": "use"})
@@ -311,7 +311,7 @@ def test_every_array_of_a_snapshot_that_the_scene_gives_is_compared():
 
 
 @pytest.mark.parametrize(("name", "solver"), [("pile", {}), ("bridge", {}), ("pyramid", {"solver": "newton"})])
-def test_a_restored_snapshot_is_the_same_and_its_pairs_are_searched_again(name, solver):
+def test_restored_snapshot_has_the_same_bits_and_searches_pairs_again(name, solver):
     sim = after(30, name, **solver)
     shot = sim.snapshot()
     sim.restore(shot)

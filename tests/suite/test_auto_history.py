@@ -16,7 +16,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_the_history_has_all_stages_and_changes_no_bit(name):
+def test_auto_history_has_all_stages_and_changes_no_bit(name):
     problem = lv.suite.case(name).problem
     recorded, plain = lv.solve(problem, history=True), lv.solve(problem)
     history = recorded.history
@@ -35,13 +35,13 @@ def test_history_of_compiled_call_has_its_start_and_its_end():
     assert solution.history.iterations.tolist() == [0, solution.iterations]
 
 
-def test_a_start_that_is_a_solution_has_one_record():
+def test_history_of_a_start_that_is_a_solution_has_one_record():
     problem = lv.suite.case("granularF(n=3, sliding=0.5)").problem
     history = lv.solve(problem, impulse=lv.solve(problem).impulse, history=True).history
     assert (history.iterations.tolist(), history.solvers) == ([0], ("start",))
 
 
-def test_a_prepared_auto_records_only_if_requested():
+def test_prepared_auto_records_a_history_only_if_requested():
     problem = lv.suite.case("granularF(n=3, sliding=0.5)").problem
     prepared = lv.prepare(problem)
     first, second, third = (prepared.solve(history=True), prepared.solve(max_iter=500), prepared.solve(history=True))

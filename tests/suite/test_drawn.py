@@ -30,7 +30,7 @@ def structure(case):
     return case.reason.partition(",")[0]
 
 
-def test_a_seed_gives_the_same_bits(cases, name):
+def test_drawn_problem_of_a_seed_has_the_same_bits(cases, name):
     for seed in (0, 7, 31):
         again = family(name)[0](seed=seed, rows=300)
         assert again.problem == cases[seed].problem
@@ -38,7 +38,7 @@ def test_a_seed_gives_the_same_bits(cases, name):
     assert cases[0].problem != cases[1].problem
 
 
-def test_every_structure_is_drawn_and_none_is_one_of_another_family(cases, name):
+def test_drawn_problems_have_every_structure_of_their_family(cases, name):
     structures = set(family(name)[1].STRUCTURES)
     others = (family(other)[1].STRUCTURES for other in drawn.__all__ if other != name)
     assert {structure(case) for case in cases} == structures
@@ -48,7 +48,7 @@ def test_every_structure_is_drawn_and_none_is_one_of_another_family(cases, name)
 
 
 @pytest.mark.parametrize("seed", range(0, 200, 10))
-def test_a_drawn_problem_can_be_solved(cases, seed):
+def test_drawn_problem_is_solved(cases, seed):
     problem = cases[seed].problem
     assert np.isfinite(problem.b).all()
     if "given as asymmetric" in cases[seed].reason:

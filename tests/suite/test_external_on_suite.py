@@ -53,7 +53,7 @@ def test_backend_that_exceeds_its_limit_is_ended(clock):
 
 
 @pytest.mark.parametrize("name", installed("osqp", "clarabel", "piqp", "qpalm", "scs", "proxqp", "clarabel_cone"))
-def test_the_iteration_budget_reaches_the_backend(name):
+def test_backend_receives_the_iteration_budget(name):
     problem = suite.box_stack(10, 1e4).problem
     solution = lv.solve(problem, name, max_iter=2, form="impulse")
     assert solution.work["iterations"] <= 3  # qpalm counts the step it stops in

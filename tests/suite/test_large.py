@@ -68,7 +68,7 @@ def compute_residual(problem, impulse):
     return max((energy / energy_at_zero).max(), (speed / speed_at_zero).max())
 
 
-def test_the_set_is_built_with_about_3000_or_20000_rows_under_coulombs_law():
+def test_large_set_has_about_3000_or_20000_rows_under_coulomb_law():
     names = suite.SETS["large"]
     assert {*SOLVED, *SOLVED_NIGHTLY} < set(names)
     assert not set(names) & {*suite.SETS["default"], *suite.SETS["hard"]}

@@ -24,7 +24,7 @@ def test_admm_under_a_short_limit_forms_no_matrix():
     assert after.work == whole.work and after.impulse.tobytes() == whole.impulse.tobytes()
 
 
-def test_an_island_without_a_solution_is_a_certificate_of_the_whole():
+def test_solve_with_an_infeasible_island_has_a_certificate_of_the_whole():
     a = np.zeros((4, 4))
     a[:2, :2] = [[1.0, -1.0], [-1.0, 1.0]]  # y = (1, 1): A^T y = 0, b.y = 2
     a[2:, 2:] = [[2.0, 0.5], [0.1, 2.0]]
@@ -57,7 +57,7 @@ def test_auto_solves_few_rows_that_one_solver_alone_does_not(seed):
         (807, 64, 399, ()),
     ],
 )
-def test_newton_takes_few_factorisations_of_what_is_drawn(seed, sweeps, most, words):
+def test_newton_on_drawn_problems_takes_few_factorisations(seed, sweeps, most, words):
     problem, start = wild(seed=seed, rows=120 if seed == 807 else 3000).problem, None
     if sweeps:
         problem = as_matrix(problem)

@@ -25,7 +25,7 @@ LARGE = {"hang(n=10000)"}  # seconds
 
 
 @pytest.mark.parametrize("name", EVERY)
-def test_a_name_makes_the_same_case_again(name):
+def test_suite_case_by_its_name_has_the_same_bits(name):
     one = suite.case(name)
     assert one.name == one.problem.name == name  # spelled in the one way
     assert one.reason
@@ -38,7 +38,7 @@ def test_a_name_makes_the_same_case_again(name):
     assert one.parameters == two.parameters
 
 
-def test_a_function_and_its_name_agree():
+def test_suite_function_and_case_name_make_the_same_problem():
     case = suite.pyramid(4, mass_ratio=1e6, friction="coulomb", sliding=0.5)
     assert case.name == "pyramidF(k=4, mass_ratio=1e6, sliding=0.5)"
     assert suite.case(case.name).problem == case.problem
@@ -98,7 +98,7 @@ def test_sets_and_families_are_listed():
         *(f"anisotropic(ratio={ratio}, speed={v})" for ratio in (0.1, 100, 1e6) for v in (0.1, 100)),
     ],
 )
-def test_a_reference_is_a_solution(name):
+def test_suite_reference_is_a_solution(name):
     case = suite.case(name)
     reference = case.reference
     if reference is None:
@@ -118,7 +118,7 @@ def test_a_reference_is_a_solution(name):
     assert reference.compare in ("impulse", "slack", "error")
 
 
-def test_the_toy_stack_is_solved_by_trying_all_active_sets():
+def test_toy_stack_has_the_solution_of_enumeration():
     problem = suite.toy_stack().problem
     found = enumerate_lcp(problem.dense(), problem.b, problem.cones.lower, problem.cones.upper)
     assert len(found) >= 1

@@ -9,7 +9,7 @@ from lavender.suite import build, hard
 from lavender.suite.friction import painleve, ramp, threshold
 
 
-def test_the_set_is_listed_and_every_family_is_used():
+def test_hard_set_uses_every_family():
     assert suite.SETS["hard"] == hard.SET
     assert len(set(hard.SET)) == len(hard.SET)
     names = {suite.parse_case_name(name)[0] for name in hard.SET}
@@ -33,7 +33,7 @@ def test_hard_problems_have_their_documented_rank(name, rank):
 
 
 @pytest.mark.parametrize("angle", [5.0, 20.0, 26.5, 26.6, 30.0, 40.0])
-def test_a_cube_on_a_ramp_slides_with_the_speed_of_the_textbook(angle):
+def test_hard_set_cube_on_a_ramp_slides_with_the_textbook_speed(angle):
     case = ramp(angle=angle)
     a = np.deg2rad(angle)
     v = case.problem.velocity(case.reference.impulse)[0]
@@ -44,7 +44,7 @@ def test_a_cube_on_a_ramp_slides_with_the_speed_of_the_textbook(angle):
     assert judged.relative <= 2.0 * judged.roundoff_floor
 
 
-def test_the_threshold_is_between_stick_and_slip():
+def test_hard_set_threshold_is_between_stick_and_slip():
     for above in (-1e-9, 1e-9):
         case = threshold(above=above)
         w = case.problem.slack(case.reference.impulse)

@@ -197,7 +197,7 @@ def test_backend_with_a_time_limit_runs_in_a_separate_process(name, monkeypatch)
             assert other.impulse.tobytes() == plain.impulse.tobytes()
 
 
-def test_a_backend_that_does_not_end_is_ended_and_the_next_call_finds_another():
+def test_backend_beyond_its_time_limit_is_ended_and_the_next_call_starts_another_process():
     if "quadprog" not in BACKENDS:
         pytest.skip("quadprog is not installed")
     # A thousand rows: to send them takes longer than this limit.

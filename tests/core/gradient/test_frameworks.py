@@ -45,7 +45,7 @@ def test_gradient_of_broadcast_arguments_is_summed():
 
 
 @pytest.mark.parametrize("lead", [(), (2,), (0,), (2, 3)])
-def test_a_step_without_contacts_is_free_and_its_gradient_goes_to_the_free_velocity(lead):
+def test_layer_without_contacts_returns_the_free_velocity_and_its_gradient(lead):
     """And so of batches, of none too."""
     shapes = (0, 3), (3, 3), (3,), (0,), (0,), (0,)
     given = [np.zeros((*lead, *shape)) for shape in shapes]

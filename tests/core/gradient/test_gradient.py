@@ -153,7 +153,7 @@ def test_derivative_near_a_switch_is_flagged():
 # -- what is refused ---------------------------------------------------------------------------------------------
 
 
-def test_equal_bounds_move_together():
+def test_derivative_of_equal_bounds_moves_them_together():
     p = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, 1.0], [0.25, 0.0], [0.25, np.inf])
     d = lv.derivative(p, lv.solve(p, tol=1e-13))
     assert d.exists and d.distance[0] == np.inf
@@ -196,7 +196,7 @@ def test_arrays_of_a_batch_are_those_of_its_gradients():
             d.vjp(velocity=weights)
 
 
-def test_a_stacked_batch_and_solutions_of_other_problems():
+def test_derivatives_of_a_stacked_batch_equal_single_ones_and_reject_other_solutions():
     rng = np.random.default_rng(0)
     batch = lv.Batch(
         rng.standard_normal((3, 6, 7)),

@@ -90,7 +90,7 @@ def test_jacobian_in_float32_is_widened_exactly():
     assert forced.precision == "float32"
 
 
-def test_a_mass_matrix_summed_in_float32_need_not_be_symmetric_to_the_last_bit():
+def test_generalized_mass_summed_in_float32_may_be_asymmetric_in_the_last_bit():
     mass = np.array([[2.0, 0.3], [0.3, 1.0]], np.float32)
     mass[0, 1] = np.nextafter(mass[0, 1], np.float32(1))
     jac, v = np.eye(2, dtype=np.float32), np.zeros(2, np.float32)

@@ -158,7 +158,7 @@ def test_inactive_rows_change_no_relative_residual(form, friction, seed, sizes, 
 @pytest.mark.parametrize("form", ["matrix", "J and M"])
 @pytest.mark.parametrize("size", [1e3, 1e9, 1e15, 1e30, 1e60])
 @pytest.mark.parametrize("friction", ["coulomb", "cone"])
-def test_solvers_converge_beside_inactive_rows(friction, size, form):
+def test_solvers_with_inactive_rows_converge_as_without(friction, size, form):
     """What converges without inactive rows converges with them, with the same velocities within the tolerance."""
     tol, solved = 1e-6, 0
     convert = as_matrix if form == "matrix" else (lambda p: p)

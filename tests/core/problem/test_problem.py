@@ -100,7 +100,7 @@ def test_mu_alone_means_two_tangents_and_a_mu_without_friction_rows_is_refused()
         lv.Problem.from_rows(made, mu=0.5, tangents=0)
 
 
-def test_one_mu_for_each_contact_and_a_scalar_for_all():
+def test_from_rows_with_a_scalar_mu_or_one_for_each_contact_is_the_same():
     with pytest.raises(lv.InputError, match=r"mu has 3 values for 3 rows.*one mu for each contact"):
         lv.Problem.contact(np.eye(3), np.ones(3), mu=[0.5, 0.5, 0.5])
     assert lv.Problem.contact(np.eye(3), np.ones(3), mu=[0.0, 0.0, 0.0]).law == "lcp"

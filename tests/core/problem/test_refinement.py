@@ -99,13 +99,13 @@ def check_claims(name, law, condition, seed, tol):
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("name", OURS)
 @given(seed=seeds, tol=st.sampled_from([1e-6, 1e-9, 1e-12]))
-def test_no_claim_is_false_whatever_the_condition_of_m(name, law, condition, seed, tol):
+def test_solver_claims_with_any_condition_of_m_are_true(name, law, condition, seed, tol):
     check_claims(name, law, condition, seed, tol)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(set(lv.available()) - set(OURS)))
-def test_no_claim_about_a_backend_is_false_either(name):
+def test_backend_claims_with_any_condition_of_m_are_true(name):
     for seed, (condition, law) in enumerate(product(CONDITIONS, LAWS)):
         check_claims(name, law, condition, seed, 1e-9)
 
@@ -158,7 +158,7 @@ def test_a_refined_slack_is_exact_to_the_last_bits(condition, seed):
 
 
 @given(seed=seeds, condition=st.sampled_from([1e6, 1e8, 1e10]))
-def test_the_floor_bounds_what_the_first_pass_loses(seed, condition):
+def test_refinement_floor_bounds_the_loss_of_the_first_pass(seed, condition):
     problem = ill_problem(seed, condition)
     lam = lv.solve(problem, tol=1e-13).impulse
     first, found = judge_impulse(problem, lam), lv.residual(problem, lam, tol=0.0)
@@ -185,7 +185,7 @@ def test_residual_loose_tolerance_and_ill_conditioned_m_reports_the_error_in_lon
         assert floor == 0.0 or floor >= 0.1 * abs(judge_impulse(problem, lam).relative - truth.relative) - 1e-8
 
 
-def test_a_well_conditioned_m_is_not_refined():
+def test_residual_of_a_well_conditioned_m_is_not_refined():
     for seed in range(10):
         problem = ill_problem(seed, 1e2)
         solution = lv.solve(problem, tol=1e-9)

@@ -94,7 +94,7 @@ def test_a_limit_of_travel_stops_a_slider():
     assert (vx, vy, omega) == pytest.approx((0.03 / DT, 0.0, 0.0), abs=1e-9)
 
 
-def test_gears_turn_in_their_ratio_and_conserve_what_they_exchange():
+def test_gear_turns_in_its_ratio_and_conserves_exchanged_impulses():
     ratio, inertia = 3.0, np.array([2.0, 5.0])
     builder = lv.RowBuilder([1.0, 1.0], 1 / inertia, [(0, 0, 4.0), (0, 0, 0)], DT, np.array([(0, 0), (4, 0)]))
     builder.hinge(-1, 0, (0.0, 0.0))
@@ -207,7 +207,7 @@ PLACES = np.array([(1.0, 0.0), (2.0, 0.0), (3.0, 0.0), (4.0, 0.0)])
 VELOCITY = np.random.default_rng(0).normal(size=(4, 3)) - (0.0, 2.0, 0.0)
 
 
-def test_two_dimensions_are_a_plane_of_three():
+def test_row_builder_in_two_dimensions_equals_a_plane_in_three():
     flat = lv.RowBuilder([1.0, 0.5, 2.0, 1.0], [3.0, 1.0, 2.0, 0.5], VELOCITY, DT, PLACES)
     flat_keys = add_everything(flat, lambda x, y: (x, y), None)
     spread = np.zeros((4, 6))

@@ -36,7 +36,7 @@ def test_states_of_an_accurate_answer_are_those_of_a_more_accurate_one(kind):
         ([0.1, 0.0, 0.0], [0.1, 0.0, 0.0], "sticks", 0.05),
     ],
 )
-def test_margin_of_a_contact_is_what_its_impulse_may_change_by(impulse, b, name, margin):
+def test_states_margin_of_a_contact_is_the_allowed_change_of_its_impulse(impulse, b, name, margin):
     # A = 1/kg, so y = l - w = b: open below 0, sticks up to mu y_n = 0.5 y_n.
     problem = lv.Problem.contact(np.eye(3), b, mu=[0.5])
     state = compute_states(problem, np.array(impulse))[0]
@@ -51,7 +51,7 @@ def test_margin_is_that_of_the_impulse_and_not_of_a_solution():
     assert compute_states(problem, np.array([-3.0, 0.0])).names == ("free", "free")
 
 
-def test_equal_bounds_have_no_other_state():
+def test_states_of_equal_bounds_have_no_margin():
     problem = lv.Problem.lcp(np.eye(2), [1.0, 1.0], [0.5, 0.0], [0.5, 3.0])
     states = lv.solve(problem, tol=1e-12).states
     assert states[0].margin == np.inf and str(states[0]) == "at a bound, no other state"

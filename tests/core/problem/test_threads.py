@@ -20,7 +20,7 @@ from lavender.base.errors import InUse
 KERNELS = Path(lavender_ext.__file__).parent
 
 
-def test_a_prepared_solver_refuses_a_second_thread():
+def test_prepared_solver_in_a_second_thread_raises():
     solver = lv.prepare(random_lcp(1), "pgs")
     inside, leave = threading.Event(), threading.Event()
 
@@ -113,7 +113,7 @@ def test_process_forked_during_a_solve_solves_the_same_problem():
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="forks are of POSIX")
-def test_a_fork_has_threads_of_its_own():
+def test_forked_process_has_threads_of_its_own():
     """Two calls of `work` that wait for each other: a child's is not left to a thread that it has not."""
     script = """if True:
         import os, threading

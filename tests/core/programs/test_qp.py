@@ -66,7 +66,7 @@ def sparse(qp, make=sp.csc_matrix):
 
 
 @given(seed=seeds)
-def test_the_answer_has_no_residual_and_no_gap(seed):
+def test_solve_qp_answer_has_no_residual_and_no_gap(seed):
     qp = drawn(seed)
     answer = lv.solve_qp(lv.Problem.from_qp(**qp))
     # Relative to v* or x, of programs whose entries are near 1; multipliers divide by rows that are nearly dependent.
@@ -220,7 +220,7 @@ def test_gaps_of_rows_with_opposite_signs_do_not_cancel():
     assert off.duality_gap <= 1e-9 and off.error >= 0.9e-3
 
 
-def test_an_answer_within_the_programs_tolerance_has_converged(plug_in):
+def test_solve_qp_within_the_tolerance_of_the_program_has_converged(plug_in):
     """Residuals of the constraint problem are relative to its own start; those of the program decide."""
 
     def run(problem, impulse):
@@ -267,7 +267,7 @@ def test_contradicting_rows_are_infeasible_with_a_certificate_by_every_solver_th
         assert solution.claim_check == "confirmed" and solution.certificate is not None
 
 
-def test_the_residual_of_an_infeasible_program_is_that_of_its_impulse():
+def test_solve_qp_of_an_infeasible_program_has_the_residual_of_its_impulse():
     """Of more than 64 rows an interior point proves it; impulses are within their bounds and judged as they are."""
     rng, n = np.random.default_rng(0), 40
     root, G = rng.normal(size=(n, n)), rng.normal(size=(120, n))
@@ -289,7 +289,7 @@ def test_the_residual_of_an_infeasible_program_is_that_of_its_impulse():
     ],
 )
 @pytest.mark.parametrize("tol", [1e-3, 1e-6, 1e-9])
-def test_an_unbounded_program_has_a_ray(hessian, q, rows, tol):
+def test_solve_qp_of_an_unbounded_program_returns_a_ray(hessian, q, rows, tol):
     answer = lv.solve_qp(lv.Problem.from_qp(hessian, q, **rows), tol=tol)
     assert not answer.found
     assert str(answer).startswith("unbounded: the objective decreases without end")
@@ -302,7 +302,7 @@ def test_an_unbounded_program_has_a_ray(hessian, q, rows, tol):
 
 @pytest.mark.parametrize("solver", ["auto", "osqp"])
 @pytest.mark.parametrize("tol", [1e-3, 1e-9])
-def test_no_solver_calls_a_program_unbounded_that_has_no_feasible_point(solver, tol):
+def test_infeasible_program_is_never_called_unbounded(solver, tol):
     """x_0 falls for ever; rows ask x_1 + x_2 <= -1 and >= 1, and x_2 <= 1 + x_0 for a coupling."""
     rows = np.array([[0.0, 1.0, 1.0], [0.0, -1.0, -1.0], [-1.0, 0.0, 1.0]])
     program = {"P": np.diag([0.0, 1.0, 0.0]), "q": [-1.0, 0.5, 0.0], "G": rows}
@@ -383,7 +383,7 @@ def test_singular_programs_are_batched_and_continued():
 
 
 @pytest.mark.parametrize("limit", [1e-6, 5.0])
-def test_a_time_limit_holds_for_a_singular_program(limit):
+def test_solve_qp_of_a_singular_program_ends_at_its_time_limit(limit):
     answer = lv.solve_qp(SINGULAR, time_limit=limit)
     assert answer.found if limit > 1.0 else answer.solution.status.name in ("TIME_LIMIT", "CONVERGED")
 

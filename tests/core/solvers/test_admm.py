@@ -11,7 +11,7 @@ from lavender.solvers import admm
 
 
 @pytest.mark.parametrize("law", ["linear", "lcp", "coulomb", "cone"])
-def test_every_factorisation_gives_the_same(law):
+def test_admm_with_every_factorisation_gives_the_same_impulse(law):
     base = random_contact_problem(51, friction="cone" if law == "cone" else "coulomb", contacts=14, bodies=4)
     cones = base.cones
     if law == "linear":
@@ -70,7 +70,7 @@ def test_admm_factor_beyond_index_range_raises(monkeypatch):
         assert failed.status is lv.Status.NUMERICAL_ERROR and "entries" in failed.message
 
 
-def test_without_memory_it_is_plain_admm_by_hand():
+def test_admm_without_memory_equals_plain_admm_by_hand():
     """Five iterations against the formulas in NumPy with a dense inverse."""
     problem = random_lcp(4, m=7)
     root = np.sqrt(problem.d)

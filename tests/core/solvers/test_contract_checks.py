@@ -330,7 +330,7 @@ def test_checks_apply_to_listed_capabilities_only():
     assert "problems_are_solved" in names
 
 
-def test_every_check_has_a_requirement_in_words():
+def test_contract_check_has_a_requirement_in_words():
     for check in contract.CHECKS.values():
         assert check.requirement.endswith(".") and check.requirement[0].isupper()
         assert check.applies_to

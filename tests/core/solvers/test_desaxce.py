@@ -50,7 +50,7 @@ def test_slip_is_de_saxces_term_and_psi_its_derivative(seed):
 @pytest.mark.parametrize("compliant", [True, False])
 @pytest.mark.parametrize("form", ["velocity", "impulse", "sparse", "augmented"])
 @given(seed=seeds)
-def test_the_system_of_a_step_is_solved(form, compliant, seed):
+def test_de_saxce_step_solves_its_linear_system(form, compliant, seed):
     problem = problem_of(seed, compliant)
     system = system_in(problem, "velocity" if form == "augmented" else form)
     sc = solve = system.solve

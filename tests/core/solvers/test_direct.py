@@ -56,7 +56,7 @@ LINEAR = {
 
 
 @pytest.mark.parametrize("case", LINEAR)
-def test_every_factorisation_reaches_rounding(case):
+def test_direct_with_every_factorisation_reaches_rounding(case):
     a, form = LINEAR[case]
     problem = lv.Problem.linear(a, np.random.default_rng(1).normal(size=a.shape[0]))
     solution = lv.solve(problem, "direct", tol=1e-9)
@@ -90,7 +90,7 @@ def test_larger_semidefinite_problems_need_descent(m, shape):
     assert solution.work["shifts"] >= 1
 
 
-def test_a_stack_takes_one_factorisation():
+def test_direct_on_a_stack_takes_one_factorisation():
     """Impulses pass through the whole stack in the sweeps that guess the free rows."""
     m = 2000
     a = sp.lil_array(tridiagonal(m, 2.0))
@@ -140,7 +140,7 @@ def test_inconsistent_linear_systems_are_infeasible_with_a_certificate(kind, sol
 
 @pytest.mark.parametrize("solver", ["direct", "lemke", "newton", "auto"])
 @given(seed=seeds, m=st.integers(2, 14))
-def test_an_lcp_without_a_solution_gets_a_certificate(solver, seed, m):
+def test_direct_on_an_lcp_without_solution_returns_a_certificate(solver, seed, m):
     problem = without_solution(seed, m)
     left = np.abs(np.linalg.svd(problem.dense())[0][:, -1])
     assume(check_certificate(problem, left) is None)  # where not even this is a proof to rounding, nothing is

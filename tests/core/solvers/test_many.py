@@ -232,7 +232,7 @@ def test_a_world_has_the_bits_of_its_single_solve(name):
             assert found[i].verdict == one.verdict
 
 
-def test_a_batch_reads_the_arrays_that_it_was_given():
+def test_batch_reads_its_arrays_at_each_solve():
     wide = np.zeros((2, 14, 20))
     jac, mass, free = worlds(2)
     wide[:, :12, :18] = jac

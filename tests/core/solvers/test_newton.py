@@ -85,7 +85,7 @@ def test_newton_path_follows_folds():
 
 
 @pytest.mark.parametrize("compliance", [1e-6, 1e-4, 1e-2])
-def test_a_compliance_costs_interior_points_no_more_steps(compliance):
+def test_newton_interior_point_with_compliance_takes_no_more_steps(compliance):
     """V = (W + theta)^-1 = B B^T on soft contacts, too: without B they stalled, and took three times as many."""
     rigid = bricks(8, 2e-2).relaxed("cone")
     soft = replace(rigid, compliance=compliance * rigid.d)
@@ -129,7 +129,7 @@ def random_columns(rng, node, n, s):
 
 @pytest.mark.parametrize("s", [1, 2, 3, 6])
 @pytest.mark.parametrize(("n", "m"), [(40, 110), (40, 45), (3, 9), (2, 7)])
-def test_factors_of_a_graph_of_bodies_solve_what_a_dense_matrix_solves(s, n, m):
+def test_factor_of_a_graph_of_bodies_solves_as_a_dense_matrix(s, n, m):
     """Symmetric and with row exchanges; the bits are the same with any number of lanes."""
     rng = np.random.default_rng(100 * s + m)
     body = rng.integers(-1, n, (m, 2))
@@ -240,7 +240,7 @@ def test_cones_with_a_solution_are_never_proven_to_have_none(form, seed):
 
 
 @pytest.mark.parametrize("law", ["lcp", "cone"])
-def test_the_height_of_a_stack_at_rest_does_not_matter(law):
+def test_newton_on_a_stack_at_rest_takes_the_same_steps_at_any_height(law):
     """The number of factorisations does not grow with the height, because all contacts act from the first step on."""
     counts = []
     for n in (10, 80):

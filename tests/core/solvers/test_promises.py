@@ -141,7 +141,7 @@ def balls_beside_jams(kind, friction, jams=1):
 
 @pytest.mark.parametrize("friction", ["coulomb", "cone"])
 @pytest.mark.parametrize("name", OWN)
-def test_islands_beside_one_without_a_solution_meet_the_tolerance(name, friction):
+def test_islands_next_to_an_infeasible_one_meet_the_tolerance(name, friction):
     for kind in JAMS:
         problem = balls_beside_jams(kind, friction, 1 if kind != "motors" else 5)
         if registry.get(name).refuses(problem) is not None:

@@ -50,7 +50,7 @@ def test_solver_with_a_missing_factory_raises_an_error_that_names_it(register, t
         lv.solve(TINY, "half")
 
 
-def test_solver_whose_refusal_raises_is_refused_alone(register):
+def test_solver_with_a_refusal_that_raises_is_refused_alone(register):
     register(named("unsure", refusal=lambda problem: 1 / 0))
     register(named("sure", refusal=lambda problem: False))
     reason = "cannot say whether it takes the problem: ZeroDivisionError: division by zero"
@@ -133,7 +133,7 @@ def test_available_selects_by_capabilities():
 # -- from outside -----------------------------------------------------------------------------------
 
 
-def test_register_takes_a_name_once_unless_told_to_replace(register):
+def test_register_of_a_name_twice_raises_without_replace(register):
     lv.register(named("mine"))
     assert lv.solve(TINY, "mine", tol=1e-9).solver.name == "mine"
     with pytest.raises(lv.InputError, match="replace=True"):

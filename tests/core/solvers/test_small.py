@@ -215,7 +215,7 @@ ATTEMPTED = {
 
 
 @pytest.mark.parametrize("name", ATTEMPTED)
-def test_a_limit_that_does_not_bind_changes_no_bit(name):
+def test_compiled_call_within_a_limit_that_does_not_bind_has_the_same_bits(name):
     problem = ATTEMPTED[name]()
     without, within = lv.solve(fresh(problem)), lv.solve(fresh(problem), time_limit=60.0)
     assert without.success or without.certificate is not None

@@ -13,7 +13,7 @@ from lavender_ext.sweep import serial
 
 @pytest.mark.parametrize("kind", CONTACTS)
 @given(seed=seeds)
-def test_a_sweep_is_the_update_written_densely_in_every_form(kind, seed):
+def test_sweep_in_every_form_equals_the_dense_update(kind, seed):
     problem = CONTACTS[kind](seed)
     lam, twin = problem.start(), judge_twin.Problem(judge_twin.spec_of(problem))
     for _ in range(5):
@@ -102,7 +102,7 @@ def test_safe_damping_is_below_the_limit_of_convergence(seed):
 
 
 @given(seed=seeds)
-def test_the_damping_is_the_same_in_every_unit(seed):
+def test_jacobi_damping_is_the_same_in_every_unit(seed):
     problem, rng = random_lcp(seed, m=12), np.random.default_rng(seed)
     size = 2.0 ** rng.integers(-8, 9, 12)  # each row in a unit of its own; rounds by the square roots alone
     other = lv.Problem.lcp(size[:, None] * problem.dense() * size, size * problem.b)

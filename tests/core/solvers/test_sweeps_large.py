@@ -45,7 +45,7 @@ def test_writing_out_keeps_joints_spin_and_warm_starts(seed, monkeypatch):
         )
 
 
-def test_a_stalled_run_gives_its_best_iterate_in_the_problems_order(pile, monkeypatch):
+def test_written_out_sweeps_that_stall_return_the_best_iterate_in_the_given_order(pile, monkeypatch):
     monkeypatch.setattr(layout, "MIN_CONTACTS_FOR_COPY", 1)
     solver = lv.prepare(pile, "sequential_impulses", order="local")
     solver.solve(tol=1e-30, max_iter=40)
@@ -54,7 +54,7 @@ def test_a_stalled_run_gives_its_best_iterate_in_the_problems_order(pile, monkey
 
 
 @pytest.mark.parametrize("order", ORDERS)
-def test_an_unfinished_run_gives_its_impulses_in_the_problems_order(order, pile, monkeypatch):
+def test_written_out_sweeps_that_are_unfinished_return_impulses_in_the_given_order(order, pile, monkeypatch):
     plain = lv.solve(pile, NAME, order=order, tol=1e-9, max_iter=60)
     monkeypatch.setattr(layout, "MIN_CONTACTS_FOR_COPY", 1)
     copied = lv.solve(pile, NAME, order=order, tol=1e-9, max_iter=60)

@@ -20,7 +20,7 @@ def test_closed_simulation_raises_and_keeps_its_settings():
     sim.close()  # once more
 
 
-def test_an_error_inside_the_block_closes_and_passes_on():
+def test_simulation_closes_when_its_block_raises():
     with pytest.raises(ZeroDivisionError), lv.Simulation("stack") as sim:
         raise ZeroDivisionError
     with pytest.raises(lv.LavenderError, match="closed"):

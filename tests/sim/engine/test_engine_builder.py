@@ -57,7 +57,7 @@ def rebuild(sim, state, recorded, h):
     return builder.problem()
 
 
-def test_the_builder_gives_the_recorded_rows():
+def test_row_builder_rebuilds_the_rows_of_a_scene():
     scene = make_scene()
     sim = lv.Simulation(scene)
     for _ in range(12):

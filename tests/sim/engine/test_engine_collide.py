@@ -93,7 +93,7 @@ def test_box_box_agrees_with_the_slow_twin(numbers):
         assert len(set(found["key"].tolist())) == len(found["key"])
 
 
-def test_a_box_on_a_box_has_its_four_corners_in_the_order_of_a_plane():
+def test_collide_of_a_box_on_a_box_gives_the_four_corners_in_the_order_of_a_plane():
     for below in (("plane", (0, 0, 1), {}), ("box", (2, 2, 2), {"position": (0, 0, -1), "mass": 0, "static": True})):
         found = manifold(below, ("box", (1, 0.6, 0.4), {"position": (0, 0, 0.2 - 1e-3)}))
         np.testing.assert_allclose(found["gap"], -1e-3, atol=1e-15)
@@ -134,7 +134,7 @@ def test_collide_of_a_sphere_with_any_shape_gives_the_exact_contact(flip):
     np.testing.assert_allclose(found["normal"], [[3**-0.5] * 3], atol=1e-15)
 
 
-def test_a_centre_inside_a_box_leaves_by_the_nearest_face():
+def test_collide_of_a_sphere_center_inside_a_box_leaves_by_the_nearest_face():
     found = manifold(("box", (2, 2, 2), {}), ("sphere", 0.1, {"position": (0.2, -0.9, 0.1)}))
     assert found["gap"] == pytest.approx(-0.2, abs=1e-15)
     np.testing.assert_allclose(found["normal"], [[0, -1, 0]], atol=1e-15)
@@ -174,7 +174,7 @@ def overlapping(sim):
     spread=st.floats(1.0, 30.0),
     decades=st.floats(0.0, 6.0),
 )
-def test_the_pair_list_is_that_of_testing_all(seed, n, spread, decades):
+def test_broad_phase_pairs_equal_those_of_testing_all(seed, n, spread, decades):
     rng = np.random.default_rng(seed)
     scene = lv.Scene(gravity=0.0)
     scene.add_plane((1, 2, 3), -1.0)
@@ -200,7 +200,7 @@ def test_far_away_bodies_do_not_break_the_grid():
     assert pairs_of(sim) == overlapping(sim)
 
 
-def test_two_thousand_bodies_cost_ten_times_two_hundred():
+def test_broad_phase_time_grows_with_the_number_of_bodies():
     def work(n):
         sim = lv.Simulation(lv.Scene("pile", n=n, walls=False))
         sim.prepare_substep()
@@ -210,7 +210,7 @@ def test_two_thousand_bodies_cost_ten_times_two_hundred():
     assert work(2000) < 1.5 * work(200) < 20
 
 
-def test_jointed_bodies_touch_only_when_asked_to():
+def test_jointed_bodies_touch_only_if_enabled():
     for collide, contacts in ((False, 0), (True, 1)):
         scene = lv.Scene(gravity=0.0)
         a, b = scene.add_sphere(0.5), scene.add_sphere(0.5, position=(0.9, 0, 0))
@@ -254,7 +254,7 @@ def test_warm_start_entry_far_from_the_contact_is_dropped():
     assert sim.step()[0]["solver"][3] == n
 
 
-def test_a_point_whose_key_changes_keeps_its_impulse():
+def test_warm_start_of_a_contact_whose_key_changes_keeps_its_impulse():
     # A box slid over the corner of the one below: its corners become crossings of edges.
     scene = lv.Scene(friction=0.0, gravity=10.0, substeps=1)
     scene.add_box((2, 2, 1), position=(0, 0, -0.5), static=True)

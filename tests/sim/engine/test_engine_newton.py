@@ -25,7 +25,7 @@ def impulses(sim, observation):
 
 
 @pytest.mark.parametrize(("name", "more"), SCENES)
-def test_a_step_is_what_solve_returns(name, more):
+def test_scene_step_by_newton_has_the_bits_of_solve(name, more):
     sim = lv.Simulation(lv.Scene(name, solver="newton", **more))
     judged = 0
     for step in range(45):
@@ -51,7 +51,7 @@ def test_a_step_is_what_solve_returns(name, more):
     assert judged >= 15  # the scenes touch something from the first half second on
 
 
-def test_a_warm_start_within_tol_comes_back_as_it_is():
+def test_scene_step_from_a_warm_start_within_tol_returns_it():
     sim = after(100, "pyramid", base=4)
     problem = sim.constraint_problem()
     exact = lv.solve(problem, "newton", tol=1e-10).impulse
@@ -98,7 +98,7 @@ def test_bridge_whose_hinges_nearly_depend_on_each_other(step, friction, law):
     assert good(solution, 1e-8), str(solution)
 
 
-def test_the_best_point_is_kept_when_a_walk_apart_finds_nothing_better():
+def test_scene_step_by_newton_keeps_the_best_point():
     problem = problem_in("table", 1, friction=1.0)
     budgets = [lv.solve(problem, "newton", tol=1e-8, max_iter=n).residual.relative for n in (30, 60, 120, 240)]
     assert all(later <= earlier for earlier, later in itertools.pairwise(budgets))

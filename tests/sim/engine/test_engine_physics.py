@@ -106,7 +106,7 @@ def test_joints_of_a_scene_stay_closed(name):
     assert worst < 0.025
 
 
-def test_a_motor_turns_and_its_torque_is_bounded():
+def test_scene_motor_turns_its_joint_within_its_torque():
     sim = lv.Simulation(lv.Scene("four_bar", motor=2.0, solver_iterations=64))
     speed = np.linalg.norm(run(sim, 240)["velocities"][0, 3:])
     assert speed == pytest.approx(2.0, rel=1e-3)

@@ -182,7 +182,7 @@ def test_step_after_a_failed_solve_follows_on_failure(policy):
 # -- every row judged ------------------------------------------------------------------------------
 
 
-def test_the_residual_of_all_rows_is_the_judges():
+def test_scene_residual_of_all_rows_is_that_of_the_judge():
     sim = lv.Simulation(lv.Scene("bridge", n=6, patch_radius=0.05, substeps=1), report_residual=True)
     for _ in range(50):
         problem = sim.constraint_problem()

@@ -54,7 +54,7 @@ def test_ball_without_friction_does_not_roll():
     assert not ball(friction=0.0).constraint_problem().cones.has_rolling
 
 
-def test_bodies_without_a_patch_roll_beside_those_with_one():
+def test_ball_without_a_patch_rolls_next_to_balls_with_one():
     scene = lv.Scene(rolling_radius=0.05, substeps=1)
     scene.add_plane(patch_radius=0.1)
     for i, patch in enumerate((0.1, 0.0)):

@@ -157,7 +157,7 @@ def test_bad_parts_and_parameters_are_refused_and_nothing_is_added(call, words):
     ("solver", "velocity", "spin"),  # of the second, rows whose impulses are far from all others
     [("sequential_impulses", (1e60, 0, 0), 0), ("pgs", (1e60, 0, -1e55), 1e55), ("newton", (1e60, 0, 0), 0)],
 )
-def test_a_state_that_is_lost_is_named_and_ends_the_simulation(solver, velocity, spin):
+def test_step_with_a_lost_state_names_its_body_and_ends_the_simulation(solver, velocity, spin):
     scene = lv.Scene(solver=solver)
     scene.add_plane()
     scene.add_sphere(position=(0, 0, 0.5), name="fine")
@@ -217,7 +217,7 @@ def test_scene_changed_later_does_not_change_earlier_simulations():
         changed.with_parameters(n=5)
 
 
-def test_a_builder_registers_itself_and_is_a_scene_like_those_of_the_gallery(monkeypatch):
+def test_registered_scene_builder_makes_a_scene_like_the_gallery(monkeypatch):
     from lavender.sim.scene import scene as table
 
     monkeypatch.setattr(table, "SCENES", dict(table.SCENES))

@@ -23,7 +23,7 @@ def boxes(velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0), **paramete
 @pytest.mark.parametrize(
     "parameters", [{}, {"solver": "newton"}, {"restitution": 0.5}], ids=lambda parameters: str(*parameters.values())
 )
-def test_a_run_has_the_bits_of_a_scene_that_begins_with_this_velocity(parameters, body):
+def test_set_velocity_gives_the_bits_of_a_scene_that_begins_with_it(parameters, body):
     sim = lv.Simulation(boxes(**parameters))
     sim.set_velocity(body, LINEAR)
     sim.set_velocity(body, angular_velocity=ANGULAR)  # the linear part stays
@@ -67,7 +67,7 @@ def test_set_velocity_of_a_wrong_value_raises_and_changes_nothing():
     assert sim.snapshot().real.tobytes() == before.real.tobytes()
 
 
-def test_a_run_that_has_ended_is_not_continued_by_a_velocity():
+def test_set_velocity_does_not_continue_an_ended_simulation():
     sim = lv.Simulation(boxes())
     sim.set_velocity(2, (1e60, 0.0, 0.0))
     while not sim.step()[2]:

@@ -103,7 +103,7 @@ def test_contacts_of_an_alternating_scene_turn_round_every_substep():
     assert sim.step()[0]["solver"][3] == len(seen[0])
 
 
-def test_a_bearing_contact_is_in_place_within_the_slop():
+def test_bearing_contact_within_the_slop_is_in_place():
     """Target of the normal row, equations (1) and (2) of the engine's contacts, read from the problem."""
     sim = lv.Simulation(lv.Scene("stack", n=1, substeps=1, dt=0.01, gravity=10.0))
     p, beta = sim.scene.parameters, sim.state.setting[SETTING["beta"]]

@@ -78,7 +78,7 @@ SIGNS = {"libm": "symbol: sin", "a parallel loop": "PyEval_SaveThread"}  # else:
 
 @needs_compiler
 @pytest.mark.parametrize("kind", BAD)
-def test_a_kernel_that_needs_more_does_not_link(tmp_path, kind):
+def test_wasm_kernel_that_needs_python_does_not_link(tmp_path, kind):
     path = tmp_path / "bad.pyx"
     path.write_text(HEAD + BAD[kind])
     with pytest.raises(wasm.BuildFailed, match=SIGNS.get(kind, "the Python part")):
@@ -90,7 +90,7 @@ GOOD = HEAD + "cdef public int32_t lav_good(int32_t x) noexcept nogil:\n    retu
 
 
 @needs_compiler
-def test_the_same_sources_give_the_same_bytes_and_pointers_of_the_module_s_machine(tmp_path):
+def test_wasm_build_of_the_same_sources_has_the_same_bytes(tmp_path):
     path = tmp_path / "good.pyx"
     path.write_text(GOOD)
     for name in ("one.wasm", "two.wasm"):
@@ -103,7 +103,7 @@ def test_the_same_sources_give_the_same_bytes_and_pointers_of_the_module_s_machi
 
 
 @pytest.mark.parametrize("name", list(wasm.PARTS))
-def test_a_module_has_the_size_that_the_page_says_and_room_to_grow(name, request):
+def test_wasm_module_has_the_documented_size_and_can_grow(name, request):
     size = len(request.getfixturevalue({"lavender": "module", "newton": "newton_module"}[name]))
     page = (ROOT / "docs" / "engine.md").read_text(encoding="utf-8")
     (told,) = re.findall(rf"`{name}\.wasm` \((\d+) kB\)", page)
@@ -111,7 +111,7 @@ def test_a_module_has_the_size_that_the_page_says_and_room_to_grow(name, request
     assert size < 0.95 * wasm.MAX_MODULE_BYTES
 
 
-def test_without_compiler_a_missing_or_stale_module_says_what_to_do(tmp_path, monkeypatch):
+def test_wasm_module_missing_or_stale_without_compiler_raises_the_remedy(tmp_path, monkeypatch):
     monkeypatch.setattr(wasm, "explain_missing_requirement", lambda: "no compiler")
     monkeypatch.setattr(pages, "SHIPPED", tmp_path)
     with pytest.raises(LavenderError, match="lavender is not in this installation and cannot be built: no compiler"):

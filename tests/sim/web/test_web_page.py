@@ -232,7 +232,7 @@ def test_web_tour_shows_native_numbers(visit, start):
     ("preset", "phone"),
     [*((preset, {}) for preset in EXPERIMENTS), (EXPERIMENTS[0], {"viewport": {"width": 390, "height": 844}})],
 )
-def test_an_experiment_opens_by_its_link_and_tells_its_numbers(visit, preset, phone):
+def test_web_page_opened_by_the_link_of_an_experiment_shows_its_numbers(visit, preset, phone):
     v = visit("#" + preset["name"], **phone)
     v.js("lavender.play(false)")
     v.page.click("#reset")
@@ -286,7 +286,7 @@ def test_plots_hold_the_native_errors(visit):
     assert v.js("lavender.charts.settings.data")[3] == [16] * 10
 
 
-def test_a_run_of_its_own_shows_one_step_when_it_pauses(visit):
+def test_web_page_paused_shows_one_step(visit):
     """While it runs few steps are watched and the page follows in parts; a pause shows all of its last step."""
     v = visit()
     v.js(
@@ -371,7 +371,7 @@ def test_web_page_runs_on_a_phone_without_network(visit):
     assert all(colors_in(v, i) > 10 for i in (0, 1))  # background, faces, edges, marks: something is drawn
 
 
-def test_a_lost_state_is_named(visit):
+def test_web_page_of_a_lost_state_names_it(visit):
     v = visit()
     v.js("lavender.sides[1].simulation.array('v')[6] = Infinity")
     v.page.click("#second")
@@ -380,7 +380,7 @@ def test_a_lost_state_is_named(visit):
     assert v.page.locator("#failure").is_hidden()
 
 
-def test_without_the_module_of_newton_both_sides_sweep(new_page, address):
+def test_web_page_without_the_newton_module_sweeps_on_both_sides(new_page, address):
     page = new_page()
     page.route("**/newton.wasm", lambda route: route.fulfill(status=404))
     page.goto(address + "#newton-against-sweeps")
@@ -390,7 +390,7 @@ def test_without_the_module_of_newton_both_sides_sweep(new_page, address):
     page.wait_for_function("lavender.steps > 3")
 
 
-def test_a_body_can_be_pulled_at_and_both_sides_are_pulled_alike(visit):
+def test_web_page_pull_at_a_body_acts_on_both_sides(visit):
     v = visit("#scene=heavy_on_light&a=16,warm,given&b=16,warm,given")
     box = v.side(0).locator("canvas").bounding_box()
     upper = v.js("lavender.sides[0].view.places.find((place) => place.body === 2).middle")
