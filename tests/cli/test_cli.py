@@ -294,6 +294,17 @@ def test_check_judges_a_stored_answer_for_the_precision_it_was_made_in(lavender,
     assert code == cli.EXIT_BAD_INPUT and "'half' is not one of 'float64', 'float32'" in err
 
 
+@pytest.mark.parametrize(("threshold", "code"), [("1e-3", 0), ("1e-5", 1), ("0", 1)])
+def test_check_of_a_stored_answer_ends_with_1_only_if_its_error_exceeds_the_threshold(
+    lavender, tmp_path, threshold, code
+):
+    problem = robot(2)
+    impulse = lv.solve(problem, tol=1e-11).impulse * (1.0 + 1e-4)
+    assert 1e-5 < lv.residual(problem, impulse).velocity < 1e-3
+    lv.io.save(problem, tmp_path / "p.npz", impulse=impulse)
+    assert lavender("check", tmp_path / "p.npz", "--solvers", "auto", "--threshold", threshold)[0] == code
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [

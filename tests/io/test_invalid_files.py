@@ -375,7 +375,7 @@ def damaged_files(draw, folder):
 WORDS = {
     "data": "values|A|J|M", "indices": "indices|M", "indptr": "pointers", "i": "indices", "p": "pointers",
     "x": "values", "m": "rows|x|f", "n": "columns|x|w|rows", "lo": "lower", "hi": "upper", "b": "lo",
-    "inv_mass": "inv_inertia", "v_free": "compressed matrix", "A": "A_shape", "start": "cone_dim",
+    "nz": "compressed", "inv_mass": "inv_inertia", "v_free": "compressed", "A": "A_shape", "start": "cone_dim",
 }  # fmt: skip
 
 
@@ -386,11 +386,12 @@ def list_replacements(x):
                 "a column": x.reshape(-1, 1, 1), "a scalar": np.array(2.5)}.items()  # fmt: skip
     if x.dtype.kind in "iuf":
         yield from {"text": np.full(x.shape, "a"), "complex": x.astype(complex)}.items()
-        for value in (-7, 99, 2**31 - 1) if x.dtype.kind in "iu" else (np.nan, np.inf, -1.0):
+        above = int(np.max(x, initial=0)) + 1 if x.dtype.kind in "iu" else 0  # the first number out of range
+        for value in (-1, above, 2**31 - 1) if above else (np.nan, np.inf, -1.0):
             with np.errstate(all="ignore"):
                 y = x.astype(x.dtype)
                 y.reshape(-1)[-1:] = np.array(value).astype(x.dtype)
-            yield f"last {value}", y
+            yield "last one too large" if value == above else f"last {value}", y
     if x.dtype.kind in "iu":
         yield from {"floats": x.astype(float), "reversed": flat[::-1]}.items()
 

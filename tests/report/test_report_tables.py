@@ -72,6 +72,8 @@ SCENARIOS = [
     ], {}, "rank claims failures"),
     ("7 % within the noise of 8 % is a tie with auto first", repeated(NOISY, 1.0, 1.04, 1.08), {}, "rank"),
     ("7 % above the noise of 4 % is no tie", NOISY, {}, "rank"),
+    ("7 % within the noise of the slower solver alone is a tie", [
+        *all_of("ab", ("pgs", 1.0)), *repeated(all_of("ab", ("auto", 1.07)), 1.0, 1.04, 1.08)], {}, "rank"),
     ("another solver of fewer cases changes no mean", [
         record("a", "pgs", 1e-3, 1e-8), record("b", "pgs", 1e-2, 1e-8), record("a", "slow", 1.9, 1e-8),
     ], {}, "rank"),
@@ -168,7 +170,8 @@ def test_report_has_its_approved_recommendation_and_tables(tmp_path, name, made,
         folder = tmp_path / "steps"
         folder.mkdir()
         answer_lines = [json.dumps({"file": f"{case}.npz", "rows": 3, **answer}) for case, answer in answers.items()]
-        (folder / "engine.jsonl").write_text("\n".join(answer_lines))
+        earlier = [json.dumps({"file": f"{case}.npz", "seconds": 1.0, "relative": 1.0}) for case in answers]
+        (folder / "engine.jsonl").write_text("\n".join(earlier + answer_lines))  # The later line of a file counts.
         more["cases"] = {case: {"source": str(folder / f"{case}.npz")} for case in answers}
     lines = lines_of(*made, **more)
     report = Report(lines, old, times, read_engine_answers([], lines))
