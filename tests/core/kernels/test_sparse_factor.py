@@ -261,3 +261,18 @@ def test_a_signal_ends_a_long_factorisation_and_leaves_no_factor():
     assert system.factor(a.data) == 0
     x = np.ones(system.n)
     np.testing.assert_allclose(a @ system.solve(x), x, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("is_sparse", [False, True])
+@pytest.mark.parametrize("seed", range(6))
+def test_factor_has_the_sign_of_the_determinant_and_counts_infinite_pivots_as_lost(seed, is_sparse):
+    rng, n = np.random.default_rng(seed), 7 + seed
+    pattern = mirrored(rng, n, 2, 0.6) if is_sparse else sp.csr_array(rng.normal(size=(n, n)))
+    a = pattern.toarray()
+    system = LinearSystem(raw(pattern), True) if is_sparse else LinearSystem(n, True)
+    assert system.factor(pattern.data.copy() if is_sparse else a.copy(), lu=True) == 0
+    assert system.sign == np.linalg.slogdet(a)[0]
+    for value in (np.inf, -np.inf, np.nan):
+        data = pattern.data.copy() if is_sparse else a.copy()
+        data.flat[seed] = value
+        assert system.factor(data, lu=True) > 0

@@ -9,7 +9,12 @@ from scipy.optimize import linprog
 
 import lavender as lv
 from lavender import registry
-from lavender.judge.certificates import prove_infeasibility
+from lavender.judge.certificates import (
+    check_certificate,
+    format_lower_bound,
+    list_conflicting_blocks,
+    prove_infeasibility,
+)
 
 OURS = lv.available(external=False)
 
@@ -182,3 +187,31 @@ def test_empty_row_of_bodies_of_rounding_size_needs_no_impulse():
             target[0] = dust
             problem = form(lv.Problem.from_rows(given, target=target, tangents=0))
             assert lv.solve(problem).status.name == status
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-9, -1e-7])
+def test_certificate_with_noise_on_a_soft_row_proves_without_that_row(noise):
+    """Two rigid rows of one velocity contradict each other; every certificate is 0 on a soft row."""
+    problem = lv.Problem.from_jacobian(
+        np.ones((3, 1)), [[2.0]], [0.0], target=[0.0, 1.0, 0.5], cones=lv.Cones.free(3), compliance=[0.0, 0.0, 0.1]
+    )
+    assert check_certificate(problem, [-1.0, 1.0, noise]) is None
+
+
+def test_format_lower_bound_has_one_digit_and_is_never_above_the_bound():
+    rng = np.random.default_rng(0)
+    for bound in (*10.0 ** rng.uniform(-30.0, 30.0, 200), 9.999, 1.0, 0.95, 1e22):
+        text = format_lower_bound(bound)
+        assert 0.5 * bound < float(text) <= bound and float(text) == float(f"{float(text):.0e}"), (bound, text)
+
+
+def test_proof_names_the_rows_and_the_contacts_that_contradict():
+    """A free row holds a velocity at 0, and the normal of a contact requires 1 m/s of it."""
+    jac = np.zeros((8, 4))
+    jac[[0, 1, 2, 3, 4, 5, 6, 7], [0, 1, 0, 2, 3, 2, 0, 1]] = 1.0
+    problem = lv.Problem.from_jacobian(
+        jac, np.eye(4), np.zeros(4), target=np.eye(8)[2], cones=lv.Cones.free(2) + lv.Cones.contacts(0.5, count=2)
+    )
+    proof = prove_infeasibility(problem, -np.eye(8)[0] + np.eye(8)[2])
+    assert (proof.impulse_bound, proof.message) == (np.inf, "no solution, proved: row 0 against contact 0")
+    assert list_conflicting_blocks(problem, proof.y) == ((0,), (2,))

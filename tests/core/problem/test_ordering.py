@@ -71,6 +71,15 @@ def test_levels_count_from_the_ground():
         compute_block_order(matrix, "bottom_up")
 
 
+def test_blocks_of_floating_bodies_are_above_the_blocks_of_bodies_on_the_ground():
+    rows = touching(np.array([(3, 4), (-1, 0), (0, 1), (4, 5)]))
+    problem = lv.Problem.from_rows(rows)
+    level = compute_block_levels_from_ground(problem)
+    assert level.tolist()[1:3] == [0, 1] and min(level[0], level[3]) > 1
+    assert compute_block_order(problem, "bottom_up").blocks.tolist() == [1, 2, 0, 3]
+    assert compute_block_order(problem, "top_down").blocks.tolist() in ([0, 3, 2, 1], [3, 0, 2, 1])
+
+
 def test_symmetric_is_forwards_then_backwards():
     problem = random_lcp(4)
     forwards = lv.solve(problem, "pgs", tol=0.0, max_iter=1)

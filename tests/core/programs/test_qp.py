@@ -1,8 +1,11 @@
 """Quadratic programs: signs as in OSQP and qpsolvers, errors by a judge of its own, no solution, a singular P."""
 
+from time import perf_counter
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from calls import installed
 from hypothesis import given
 from hypothesis import strategies as st
 from kkt_truth import OF_PROGRAM as NAMES
@@ -458,3 +461,21 @@ def test_solve_qp_with_a_contradicted_claim_is_not_found(plug_in):
     answer = lv.solve_qp(problem, plug_in(run))
     assert answer.solution.claim_check == "contradicted" and "CONTRADICTED" in str(answer)
     assert not answer.found and not str(answer).startswith("solved")
+
+
+def test_solve_qp_limits_reach_the_solver_and_a_start_that_is_a_solution_is_returned():
+    rng, n = np.random.default_rng(0), 40
+    half = rng.normal(size=(n, n))
+    problem = lv.Problem.from_qp(
+        half @ half.T + 1e-6 * np.eye(n), rng.normal(size=n), rng.normal(size=(60, n)), rng.uniform(0.1, 1.0, 60)
+    )
+    begin = perf_counter()
+    answer = lv.solve_qp(problem, "pgs", tol=1e-15, time_limit=0.05, max_iter=10**8)
+    assert answer.solution.status is lv.Status.TIME_LIMIT and perf_counter() - begin < 10.0
+    answer = lv.solve_qp(problem, "pgs", tol=1e-12, max_iter=3)
+    assert answer.solution.status is lv.Status.MAX_ITERATIONS and answer.solution.work == {"sweeps": 3}
+    solved = lv.solve_qp(problem)
+    for name in ("auto", *installed("osqp", "clarabel")):
+        again = lv.solve_qp(problem, name, tol=1e-6, impulse=solved.impulse)
+        assert again.found and not any(again.solution.work.values()), name
+        np.testing.assert_allclose(again.x, solved.x, atol=1e-12)

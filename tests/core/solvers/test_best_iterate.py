@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
-from random_problems import random_contact_problem
+import scipy.sparse as sp
+from random_problems import random_contact_problem, spd
 
 import lavender as lv
+from lavender.judge.residuals import combine_best_islands
 from lavender.solvers.islands import find_islands
 
 DT = 1.0 / 60.0
@@ -121,3 +123,21 @@ def test_solve_start_of_problem_at_rest_begins_at_zero():
     for name in ("pgs", "newton", "auto", "jacobi", "admm"):
         solution = lv.solve(problem, name, impulse=[0.3, 0.2], tol=1e-9, max_iter=1)
         np.testing.assert_array_equal(solution.impulse, 0.0, err_msg=name)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_combine_best_islands_takes_the_smallest_objective_of_each_island(seed):
+    """1/2 l.A l - b.l of each of three islands, of impulses within their bounds that are no solutions."""
+    rng, size = np.random.default_rng(seed), 4
+    blocks = [spd(size, seed=10 * seed + k) for k in range(3)]
+    a = sp.block_diag([matrix for matrix, _ in blocks])
+    problem = lv.Problem.lcp(a, np.concatenate([b for _, b in blocks]))
+    near = lv.solve(problem, tol=1e-9).impulse
+    points = np.vstack([near * rng.uniform(0.3, 1.5, (4, 3 * size)), problem.start()])
+    values = [
+        [0.5 * x @ matrix @ x - b @ x for (matrix, b), x in zip(blocks, np.split(point, 3), strict=True)]
+        for point in points
+    ]
+    found = combine_best_islands(problem, points[0], list(points[1:4]), 1e-12)  # The last is always compared, too.
+    best = np.argmin(values, axis=0)
+    np.testing.assert_array_equal(found, np.concatenate([np.split(points[i], 3)[k] for k, i in enumerate(best)]))
