@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.optimize import linprog
 from worked import after
 
 import lavender as lv
@@ -295,3 +296,20 @@ def test_contact_that_moves_by_at_most_five_margins_in_a_step_keeps_its_warm_sta
     simulation, at = lv.Simulation(scene), lv.SOLVER_FIELDS.index("cache_matches")
     matches = [simulation.step()[0]["solver"][at] for _ in range(3)]
     assert matches == [0, expected, expected]
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_manifold_of_eight_points_keeps_the_deepest(seed):
+    """A slab lies turned by 45 degrees and a little tilted on another; a linear program finds the deepest point."""
+    rng = np.random.default_rng(seed)
+    turn, tilt = np.pi / 4 + rng.uniform(-0.2, 0.2), 0.002 * rng.normal(size=2)
+    q = np.array([np.cos(turn / 2), *(0.5 * tilt), np.sin(turn / 2)])
+    q /= np.linalg.norm(q)
+    place = np.array([*rng.uniform(-0.1, 0.1, 2), 0.395])
+    found = manifold(("box", (2, 2, 0.4), {}), ("box", (2.2, 2.2, 0.4), {"quaternion": q, "position": place}))
+    r = convert_to_rotation_matrix(q)
+    below = place - 0.2 * r[:, 2]  # the centre of the lower face, whose points are below + r[:, :2] (u, v)
+    inside = np.vstack([r[:2, :2], -r[:2, :2]]), np.concatenate([1.0 - below[:2], 1.0 + below[:2]])
+    deepest = linprog(r[2, :2], *inside, bounds=[(-1.1, 1.1)] * 2)
+    assert len(found["gap"]) == 4
+    assert found["gap"].min() == pytest.approx(below[2] + deepest.fun - 0.2, abs=1e-3 * abs(below[2] - 0.2))
