@@ -10,6 +10,7 @@ from worked import ROOT
 
 def load_command():
     """Import `.ci/mutants`, which has no suffix."""
+    sys.path.insert(0, str(ROOT / ".ci"))  # for the module that it imports
     loader = importlib.machinery.SourceFileLoader("mutants", str(ROOT / ".ci" / "mutants"))
     module = importlib.util.module_from_spec(importlib.util.spec_from_loader("mutants", loader))
     sys.modules["mutants"] = module  # NamedTuple looks its module up
@@ -70,3 +71,46 @@ def test_apply_fault_finds_indented_lines_after_its_anchor_and_rejects_repeated_
     for changed in (text.replace("b = a\n", "b = 2 * a\n"), text + "a = 1\nb = a\n"):
         with pytest.raises(ValueError, match=r"does not apply: its lines occur [02] times"):
             mutants.apply_fault(fault, changed)
+
+
+KERNEL = """from libc.math cimport fabs
+
+cdef inline double f(double x, int n) noexcept nogil:
+    cdef int i
+    if x > 0.0:                 # a condition
+        x += 1.0
+    for i in range(n):
+        x = fabs(x,
+                 1.0) + n
+    return x
+"""
+
+
+@pytest.mark.parametrize(
+    ("lines", "expected"),
+    [
+        (["-if x > 0.0:                 # a condition", "+if x > 1.0:"], ["if ((x > 1.0) if N else (x > 0.0)):"]),
+        (["-for i in range(n):", "+for i in range(n - 1):"], ["for i in range(((n - 1) if N else (n))):"]),
+        (["-    x += 1.0", "+    x -= 1.0"], ["    if N:", "        x -= 1.0", "    else:", "        x += 1.0"]),
+        (["-             1.0) + n", "+             1.0)"],
+         ["    if N:", "        x = fabs(x,", "                 1.0)", "    else:", "        x = fabs(x,"]),
+        (["-if x > 0.0:                 # a condition", "-    x += 1.0", " for i in range(n):"],
+         ["if N:", "    pass", "else:", "    if x > 0.0:                 # a condition", "        x += 1.0"]),
+        (["-cdef int i", "+cdef long i"], None),
+        (["-if x > 0.0:                 # a condition", "+while x > 0.0:"], None),
+    ],
+)  # fmt: skip
+def test_switch_fault_makes_branches_of_whole_statements_or_refuses(lines, expected):
+    fault = mutants.Fault("name", "A sentence.", "path", "cdef inline double f", lines)
+    switched = mutants.switch_fault(fault, KERNEL, 7)
+    assert (switched is None) == (expected is None)
+    if expected is not None:
+        block = "\n".join("    " + line for line in expected).replace("N", "fault_number() == 7")
+        assert block in switched and mutants.insert_import(switched).startswith("from lavender_ext.core.fault cimport")
+
+
+def test_nearly_all_faults_of_kernels_can_be_switched():
+    """Each other one costs a compilation of minutes."""
+    kernels = [fault for fault in FAULTS if fault.is_kernel]
+    single = [f.name for f in kernels if mutants.switch_fault(f, (ROOT / f.path).read_text(), 1) is None]
+    assert len(single) <= 5, single

@@ -121,6 +121,15 @@ def test_substeps_are_steps_of_a_fraction():
     assert one.time == pytest.approx(two.time, rel=1e-15)
 
 
+def test_reset_keeps_the_iterations_and_the_warm_start_that_were_set():
+    sim = lv.Simulation(lv.Scene("stack", n=2))
+    sim.set_solver_iterations(32)
+    sim.set_warm_start(False)
+    for seed in (None, 3):
+        sim.reset(seed=seed)
+        assert (sim.solver_iterations, sim.warm_start) == (32, False)
+
+
 def test_reset_starts_again_and_a_seed_builds_the_scene_anew():
     sim = lv.Simulation(lv.Scene("pile", n=10, seed=1))
     first = sim.reset()[0]["positions"]

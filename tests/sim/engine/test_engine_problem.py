@@ -198,6 +198,21 @@ def test_scene_residual_of_all_rows_is_that_of_the_judge():
     assert share["joint"] == pytest.approx(energy[: len(problem.rows.jac)].sum() / energy.sum(), rel=1e-12)
 
 
+def test_shares_of_the_residual_of_rolling_contacts_are_those_of_numpy():
+    scene = lv.Scene(rolling_radius=0.03, patch_radius=0.02, substeps=1)
+    scene.add_plane()
+    for i in range(6):
+        scene.add_sphere(0.2, position=(0.1 * i, 0.2 * i % 0.3, 0.2 + 0.3 * i), angular_velocity=(1.0, 2.0, 3.0))
+    sim = lv.Simulation(scene, report_residual=True)
+    for _ in range(40):
+        problem = sim.constraint_problem()
+        observation, *_, info = sim.step()
+    energy = problem.d * lv.residual(problem, observation["contacts"]["impulses"].ravel()).error ** 2
+    sums = energy.reshape(-1, 6).sum(axis=0) / energy.sum()
+    expected = {"joint": 0.0, "normal": sums[0], "disk": sums[1:3].sum(), "spin": sums[3], "rolling": sums[4:].sum()}
+    assert info["residual"]["share"] == pytest.approx(expected, rel=1e-9) and expected["rolling"] > 0.0
+
+
 def test_recorded_problems_are_the_problems_of_the_steps(tmp_path):
     sim, twin = (lv.Simulation(lv.Scene("ramp")) for _ in range(2))
     paths = sim.record(tmp_path / "ramp", 3)
