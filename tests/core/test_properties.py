@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 from dataclasses import replace
 from functools import partial
 
@@ -20,7 +21,7 @@ from lavender.judge.certificates import check_certificate
 from lavender.problem.cones import project_impulse
 from lavender.solvers import direct
 from lavender.solvers.islands import find_islands, get_rows_of_blocks, restrict_to_blocks
-from lavender.solvers.polyhedral import convert_to_bounded_rows
+from lavender.solvers.polyhedral import BoundedRowSolver, convert_to_bounded_rows
 from lavender.solving import log, loop
 from lavender_ext.judge.measure import is_residual_at_floor
 
@@ -403,6 +404,27 @@ def test_converted_rows_keep_their_start_and_are_never_worse(name, friction):
             assert found.residual.relative <= max(before, 2.0 * found.residual.roundoff_floor) * (1 + 1e-9), seed
 
 
+def test_converted_rows_add_the_work_of_the_solver_that_continues():
+    class Works:
+        def __init__(self, work, status, then=None):
+            self.work, self.status, self.then = work, status, then
+
+        def prepare(self, problem):
+            return problem
+
+        def fallback(self):
+            return self.then
+
+        def run(self, state, z, max_iter, tol, time_limit=None):
+            return lv.Claim(self.status, 1, self.work)
+
+    second = Works({"pivots": 5, "paths": 1}, lv.Status.STALLED)
+    solver = BoundedRowSolver(Works({"pivots": 3, "factorisations": 2}, lv.Status.STALLED, second))
+    problem = lv.Problem(np.ones(3), lv.Cones.contacts(0.5, shape="box"), np.eye(3) + 0.1)
+    claim = solver.run(solver.prepare(problem), problem.start(), 10, 1e-9)
+    assert claim.work == {"pivots": 8, "factorisations": 2, "paths": 1}
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_direct_of_an_ill_conditioned_asymmetric_matrix_ends_at_its_floor(seed):
     rng = np.random.default_rng(seed)
@@ -600,6 +622,7 @@ def test_island_cut_out_has_its_block_of_the_matrix_and_its_answer(kind):
         blocks = np.flatnonzero(label == island)
         rows = get_rows_of_blocks(problem, blocks)
         part = restrict_to_blocks(problem, blocks, rows)
+        assert [part.block_name(i) for i in range(len(blocks))] == [problem.block_name(int(i)) for i in blocks]
         np.testing.assert_allclose(part.csr.toarray(), a[np.ix_(rows, rows)], atol=1e-13)
         np.testing.assert_array_equal(part.b, problem.b[rows])
         if problem.rows is not None:
@@ -637,6 +660,50 @@ def test_solution_message_of_an_unfinished_solve_names_its_worst_island(kind):
     label, worst = solution.residual.islands[0], solution.residual.worst_island
     name = problem.block_name(int(np.flatnonzero(label == worst)[0]))
     assert not solution.success and f"island {worst} ({name}" in solution.message
+
+
+@pytest.mark.parametrize("name", ["pgs", "jacobi"])
+def test_iterations_that_a_message_predicts_are_about_those_that_are_needed(name):
+    n = 60
+    problem = lv.Problem.lcp(2.02 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1), np.ones(n))
+    stopped, solved = (lv.solve(problem, name, tol=1e-9, max_iter=limit) for limit in (150, 10**5))
+    predicted = float(re.search(r"tol needs about (\S+) more", stopped.message)[1])
+    assert solved.success and 0.5 < (predicted + 150) / solved.iterations < 2.0
+
+
+@pytest.mark.parametrize("name", ["auto", "direct", "newton"])
+def test_stages_begin_at_the_start_and_end_at_the_result(name):
+    for seed in range(3):
+        problem = random_contact_problem(seed) if name != "direct" else lv.Problem.lcp(*spd(6, seed=seed))
+        start = 0.5 * lv.solve(problem, tol=1e-9).impulse
+        for given in (None, start):
+            solution = lv.solve(problem, name, impulse=given, tol=1e-7)
+            before = lv.residual(problem, problem.start() if given is None else project_impulse(problem.cones, given))
+            if solution.stages:
+                assert solution.stages[0].before == pytest.approx(before.relative, rel=1e-9)
+                assert solution.stages[-1].after == pytest.approx(solution.residual.relative, rel=1e-9)
+            assert solution.stages or name != "auto"
+
+
+@pytest.mark.parametrize("signs", [(1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)])
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_auto_proves_an_infeasible_island_of_any_signs_at_any_place(place, signs):
+    """Two rows of one velocity contradict each other; limits on the other side turn both signs."""
+    rows, one, other = [], *signs
+    for island in range(3):
+        target = [one, 0.0] if island == place else [-one, -0.5 * other]
+        low, high = (np.where(np.array([one, -other]) > 0.0, x, -y) for x, y in ((0.0, np.inf), (np.inf, 0.0)))
+        jac = [[one, 0.2 * one], [other, 0.2 * other]]
+        cones = lv.Cones.bounded(low, high)
+        rows.append(lv.Problem.from_jacobian(jac, np.eye(2), [0.0, 0.0], target=target, cones=cones))
+    jac, b = sp.block_diag([p.generalized.jac for p in rows]), np.concatenate([p.b for p in rows])
+    cones = lv.Cones.bounded(*(np.concatenate([getattr(p.cones, n) for p in rows]) for n in ("lower", "upper")))
+    whole = lv.Problem.from_jacobian(jac, np.eye(6), np.zeros(6), target=b, cones=cones)
+    for problem in (whole, lv.Problem(whole.b, whole.cones, whole.csr)):
+        solution = lv.solve(problem)
+        assert solution.status is lv.Status.INFEASIBLE and solution.claim_check == "confirmed", str(solution)
+        assert np.flatnonzero(solution.certificate).tolist() == [2 * place, 2 * place + 1]
+        np.testing.assert_array_equal(solution.impulse, project_impulse(cones, solution.impulse))
 
 
 @pytest.mark.parametrize("order", ["colored", "bottom_up", "top_down", "given"])
