@@ -95,3 +95,22 @@ def test_records_of_a_plug_in_have_the_version_of_its_package(install, tmp_path)
     python("-m", "lavender", *words, env=install("good = plugin_module:GOOD"))
     runs = lv.report.select_runs(lv.report.read(tmp_path / "o"))
     assert len(runs) and runs["versions"].astype(str).str.contains("many-solvers 1.2").all()
+
+
+def test_report_with_workers_names_a_broken_plug_in_once(install, tmp_path):
+    words = (
+        "report",
+        "toy_stack",
+        "--solvers",
+        "pgs",
+        "jacobi",
+        "--workers",
+        "2",
+        "--tolerances",
+        "1e-3",
+        "--budgets",
+        "4",
+    )
+    environment = install("broken = no_such_module:SPEC")
+    done = python("-m", "lavender", *words, "--out", str(tmp_path / "o"), env=environment)
+    assert done.stderr.count("solver plug-in 'broken'") == 1
