@@ -169,12 +169,13 @@ def test_diagnose_with_state_finds_every_planted_mistake(scenes):
                 assert count == total, (mistake, form)  # the state of the engine reveals every planted mistake
 
 
-@pytest.mark.parametrize("mistake", SHOWN_BY_STATE)
-def test_mistake_that_the_state_shows_is_reported_of_a_stack(scenes, mistake):
+@pytest.mark.parametrize("mistake", [mistake for mistake in MISTAKES if mistake != NONE])
+def test_diagnose_of_a_stack_with_a_planted_mistake_reports_it(scenes, mistake):
     step = scenes["stack 0 2"]
     assert kinds(step.problem, **step.state) == set()
     wrong = MISTAKES[mistake](step)
-    assert SHOWN_BY_STATE[mistake] in kinds(wrong.problem, **wrong.state)
+    found = kinds(wrong.problem, **wrong.state)
+    assert found and SHOWN_BY_STATE.get(mistake, "") in {*found, ""}
 
 
 @pytest.mark.parametrize("form", ["bodies", "J and M"])

@@ -7,7 +7,6 @@ import os
 import re
 import shlex
 import shutil
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -22,7 +21,6 @@ else:
 
 import lavender
 import lavender_ext
-from lavender.io.stored import write_atomically
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 
@@ -184,52 +182,6 @@ def test_build_without_a_compiler_fails_before_translation(tmp_path):
     assert "apt install python3-dev" in python("-c", code, status=1, env=env, timeout=60.0).stderr
 
 
-def test_manifest_of_temporary_files_excludes_them(tmp_path):
-    # The names that both writers use, beside files of the package.
-    names = []
-    write_atomically(tmp_path / "a.c", lambda part: part.write_text(names.append(part.name) or ""))
-    code = "from pathlib import Path; from lavender.sim.web import compile; "
-    code += "Path.write_bytes = lambda *what: print(*what); "
-    done = python(
-        "-c", code + "Path.replace = Path.unlink = lambda *_, **__: 0; compile.write_atomically(Path('a.wasm'), b'')"
-    )
-    names += [done.stdout.split()[0], "a.h", "a.wasm"]
-    for folder in ("lavender/sim/web", "docs"):
-        (tmp_path / folder).mkdir(parents=True)
-        for name in names:
-            (tmp_path / folder / name).write_text("")
-    rules = [line for line in (ROOT / "MANIFEST.in").read_text("utf-8").splitlines() if line and line[0] != "#"]
-    code = "from setuptools.command.egg_info import FileList; files = FileList(); "
-    code += f"[files.process_template_line(line) for line in {rules}]; print(*sorted(files.files))"
-    done = python("-c", code, cwd=tmp_path)
-    kept = ("docs/a.h", "docs/a.wasm", "lavender/sim/web/a.h", "lavender/sim/web/a.wasm")
-    assert done.stdout.split() == [*kept]
-
-
-def test_build_that_is_killed_leaves_no_stamp(tmp_path):
-    pytest.importorskip("Cython", reason="the build translates the kernels (extra: test)")
-    for folder in ("lavender", "lavender_ext"):
-        (tmp_path / folder).symlink_to(ROOT / folder)
-    for name in ("setup.py", "pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(ROOT / name, tmp_path)
-    stamp = tmp_path / "build" / "cython" / "how.json"
-    stamp.parent.mkdir(parents=True)
-    code = """if True:
-        import os, signal, runpy, sys
-        import Cython.Build
-
-        def cythonize(*_, **__):
-            os.kill(os.getpid(), signal.SIGKILL)
-
-        Cython.Build.cythonize = cythonize
-        sys.argv = ["setup.py", "-q", "build_ext"]
-        runpy.run_path("setup.py", run_name="__main__")"""
-    stamp.write_text("as it is asked for now")
-    env = {**os.environ, "CC": shlex.quote(sys.executable)}  # which is never called
-    python("-c", code, cwd=tmp_path, status=-signal.SIGKILL, env=env)
-    assert not stamp.exists()
-
-
 def test_build_wasm_ships_both_modules(tmp_path, module, newton_module):
     pytest.importorskip("Cython", reason="the build translates the kernels (extra: test)")
     # As `pip wheel --no-build-isolation` runs it: built, or taken from the checkout where it is of these sources.
@@ -238,24 +190,3 @@ def test_build_wasm_ships_both_modules(tmp_path, module, newton_module):
     subprocess.run(command, check=True, cwd=ROOT)
     assert (shipped / "lavender.wasm").read_bytes() == module
     assert (shipped / "newton.wasm").read_bytes() == newton_module
-
-
-def test_editable_install_compiles_in_the_folders_of_a_build_in_place(monkeypatch):
-    """pip gives an editable install temporary folders, in which each later install would compile every kernel again."""
-    pytest.importorskip("Cython", reason="setup.py imports it (extra: test)")
-    code = """
-import setuptools
-from distutils.core import run_setup
-commands = []
-for mode in ("inplace", "editable_mode"):
-    distribution = run_setup("setup.py", stop_after="init")
-    if mode == "editable_mode":
-        build = distribution.get_command_obj("build")
-        build.build_lib = build.build_platlib = build.build_temp = "temporary"
-    command = distribution.get_command_obj("build_ext")
-    setattr(command, mode, True)
-    command.ensure_finalized()
-    commands.append((command.build_lib, command.build_temp))
-assert commands[0] == commands[1] and "temporary" not in commands[1], commands
-"""
-    python("-c", code)
