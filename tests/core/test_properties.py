@@ -134,6 +134,30 @@ def test_verdict_of_a_diverged_impulse_in_a_scene_at_rest_is_wrong():
     assert given.rounds and given.verdict == "wrong"
 
 
+@pytest.mark.parametrize("islands", [1, 2])
+def test_relative_residual_of_an_impulse_that_hides_b_is_at_least_its_floor(islands):
+    problem = lv.Problem.lcp(
+        sp.block_diag([[[1.0, -1.0], [-1.0, 1.0]]] + [np.eye(2)] * (islands - 1)), -np.ones(2 * islands)
+    )
+    for power in range(10, 19):
+        found = lv.residual(problem, np.r_[10.0**power, 10.0**power, np.zeros(2 * islands - 2)])
+        assert found.relative >= found.roundoff_floor or found.roundoff_floor < 1e-3
+        assert found.relative >= 1.0
+
+
+@pytest.mark.parametrize("target", [1.0 + 2.0**-52, 1.0 - 2.0**-53, 0.3])
+def test_row_that_no_impulse_moves_is_compared_with_its_target_and_the_velocity_of_its_body(target):
+    """b = target - J v* is the rounding of both, for a driven body of infinite mass."""
+    rows = lv.Rows(
+        inv_mass=[0.0, 1.0], inv_inertia=[np.zeros((3, 3)), np.eye(3)],
+        v_free=[[0.0, 0.0, 0.1 * 3 if target == 0.3 else 1.0, 0.0, 0.0, 0.0], np.zeros(6)],
+        jac=np.tile(np.eye(12)[8], (2, 1)), joint_ptr=[0, 1, 2], joint_body=[(-1, 0), (-1, 1)],
+    )  # fmt: skip
+    problem = lv.Problem.from_rows(rows, target=[target, 0.0])
+    found = lv.residual(problem, problem.start())
+    assert problem.b[0] != 0.0 and found.relative == pytest.approx(abs(problem.b[0]) / (2.0 * target), rel=1e-12)
+
+
 @pytest.mark.parametrize("form", ["bodies", "J and M", "matrix"])
 def test_floor_energy_of_free_rows_is_that_of_numpy(form):
     """F = 2^-53 (|J| |M^-1| |J|^T |lambda| + c |lambda| + |b|), or with |A|; its energy is sqrt(sum F^2 / d)."""
@@ -669,6 +693,15 @@ def test_iterations_that_a_message_predicts_are_about_those_that_are_needed(name
     stopped, solved = (lv.solve(problem, name, tol=1e-9, max_iter=limit) for limit in (150, 10**5))
     predicted = float(re.search(r"tol needs about (\S+) more", stopped.message)[1])
     assert solved.success and 0.5 < (predicted + 150) / solved.iterations < 2.0
+
+
+@pytest.mark.parametrize("name", ["pgs", "jacobi", "block_gauss_seidel", "anderson"])
+def test_sweeps_solve_a_slow_island_although_another_has_no_solution(name):
+    n = 60
+    slow = 2.02 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
+    problem = lv.Problem.lcp(sp.block_diag([[[1.0, -1.0], [-1.0, 1.0]], slow]), np.ones(n + 2))
+    solution = lv.solve(problem, name, tol=1e-9, max_iter=20_000)
+    assert not solution.success and solution.residual.islands.relative[1] <= 1e-9, str(solution)
 
 
 @pytest.mark.parametrize("name", ["auto", "direct", "newton"])
