@@ -120,7 +120,7 @@ def test_slip_of_a_gripped_box_depends_on_the_grip_force(grip, cause):
     assert dominant(explanation) == cause
 
 
-def test_advice_lists_only_settings_whose_simulated_slip_is_smaller():
+def test_slip_advice_lists_only_settings_that_reduce_simulated_slip():
     soft = explain_slip_of_states(block(0.3, option='cone="elliptic"'), steps=600).explanations[0]
     as_it_is, *others = soft.remedies
     advised = [line.strip().rpartition(": ")[0] for line in soft.advice[1:]]

@@ -137,7 +137,7 @@ def test_tuning_has_its_approved_recommendation(name):
     check_text("tune.txt", name, "\n".join(part for part in parts if part))
 
 
-def test_errors_on_the_worlds_held_back_do_not_change_the_choice():
+def test_tuning_choice_does_not_depend_on_the_worlds_held_back():
     """The second of two equally fast siblings was not judged on the worlds held back."""
     now, first = measured(10.0, 24.0), measured(9.0, 10.8, solver="CG", iterations=3)
     second = measured(8.99, 10.80000001, solver="CG", iterations=3, ls_tolerance=1e-3)

@@ -47,7 +47,7 @@ def test_bench_pile_has_its_documented_overlap():
 
 
 @pytest.mark.parametrize("case", ["impulses", "pgs-tridiagonal", "block", "solve-8", "engine-box"])
-def test_cases_give_time_work_and_residual(case):
+def test_bench_kernels_cases_give_time_work_and_residual(case):
     rows = list(run([case], seconds=0.01))
     for row in rows:
         assert row.seconds > 0.0 and row.work > 0

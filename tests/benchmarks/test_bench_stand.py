@@ -8,7 +8,7 @@ from benchmarks.stand import ENGINES, Tower, has_fallen, measure, missing
 
 
 @pytest.mark.parametrize("name", ENGINES)
-def test_bench_stand_of_a_box_stands_in_every_installed_engine(name):
+def test_bench_stand_of_a_box_at_rest_keeps_its_place_in_every_installed_engine(name):
     if missing(name):
         with pytest.raises(lv.InputError, match=name):
             measure(name, Tower(1, 1 / 60))

@@ -42,7 +42,7 @@ def test_regret_is_the_ratio_to_the_fastest_that_solved():
     assert np.isnan(compute_regret(line)[0])
 
 
-def test_exponent_of_a_power_is_its_power():
+def test_bench_scale_exponent_of_a_power_law_is_its_power():
     rows = np.array([3e3, 1e4, 1e5])
     assert abs(fit_exponent(rows, 2e-6 * rows**1.25) - 1.25) < 1e-12  # rounding of logarithms
 

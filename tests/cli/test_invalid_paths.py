@@ -144,7 +144,7 @@ def test_file_call_with_a_value_that_is_not_a_path_raises_and_writes_nothing(suf
 
 
 @each_reader
-def test_files_of_ten_gigabytes_are_rejected_before_they_are_read(suffix, call, results, tmp_path):
+def test_file_of_ten_gigabytes_is_rejected_before_it_is_read(suffix, call, results, tmp_path):
     path = tmp_path / f"long{suffix}"
     with path.open("wb") as stream:
         stream.truncate(10**10)  # which takes no space

@@ -43,7 +43,7 @@ def test_register_of_a_class_without_base_is_accepted(register: Any) -> None:
 
 
 @pytest.mark.parametrize("bodies", [0, 2])
-def test_empty_lists_mean_no_contacts_joints_or_bodies(bodies: int) -> None:
+def test_rows_of_empty_lists_have_no_contacts_joints_or_bodies(bodies: int) -> None:
     """A loop over the contacts of a step gives empty lists if there are none."""
     mass, inertia, free = [1.0] * bodies, [np.eye(3)] * bodies, [np.ones(6)] * bodies
     rows = lv.Rows(

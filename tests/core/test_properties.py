@@ -611,7 +611,7 @@ def test_generalized_reordered_mass_is_shifted_in_the_given_order():
     np.testing.assert_allclose(moved.mass.toarray(), mass.toarray() + np.diag(shift))
 
 
-def test_permuted_velocities_give_the_same_matrix_and_answers():
+def test_problem_of_permuted_velocities_has_the_same_matrix_and_answers():
     plain = build_chain(np.arange(40))
     for seed in range(3):
         order = np.random.default_rng(seed).permutation(40)
@@ -637,7 +637,7 @@ def list_problems_with_islands():
 
 
 @pytest.mark.parametrize("kind", range(3))
-def test_island_cut_out_has_its_block_of_the_matrix_and_its_answer(kind):
+def test_restrict_to_an_island_of_a_tree_has_its_block_of_the_matrix_and_its_answer(kind):
     problem = list_problems_with_islands()[kind]
     count, label = find_islands(problem)
     assert count > 1
@@ -740,7 +740,7 @@ def test_auto_proves_an_infeasible_island_of_any_signs_at_any_place(place, signs
 
 
 @pytest.mark.parametrize("order", ["colored", "bottom_up", "top_down", "given"])
-def test_pinned_body_that_turns_is_moving_in_every_order(order):
+def test_sweeps_move_a_pinned_body_that_turns_in_every_order(order):
     """Two bodies on a wheel whose centre is fixed: a colour must not contain both of its contacts."""
     rows = lv.Rows(
         inv_mass=[0.0, 1.0, 1.0], inv_inertia=np.array([np.eye(3)] * 3),

@@ -67,7 +67,7 @@ def test_motion_error_of_an_asymmetric_matrix_has_no_energy(light):
     assert lv.motion_error(problem, np.zeros(3)).energy is None
 
 
-def test_default_reference_under_coulombs_law_starts_from_the_impulse():
+def test_motion_error_under_coulomb_law_solves_its_reference_from_the_impulse():
     problem = lv.suite.case("painleve").problem
     sticks = np.linalg.solve(problem.dense(), problem.b)
     assert lv.motion_error(problem, np.zeros(2)).rows == 0.0
@@ -75,7 +75,7 @@ def test_default_reference_under_coulombs_law_starts_from_the_impulse():
     assert lv.motion_error(problem, sticks, reference=np.zeros(2)).rows == pytest.approx(3.0)
 
 
-def test_given_reference_is_an_impulse_or_a_solution_and_is_judged():
+def test_motion_error_judges_a_given_reference_impulse_or_solution():
     p = cone_problem(6)
     own = lv.solve(p, "newton", tol=1e-12)
     errors = [lv.motion_error(p, p.start(), reference=x) for x in (own, own.impulse)]
@@ -86,7 +86,7 @@ def test_given_reference_is_an_impulse_or_a_solution_and_is_judged():
         lv.motion_error(p, p.start(), reference=[1.0])
 
 
-def test_reference_that_ctrl_c_ended_is_not_kept(monkeypatch):
+def test_motion_error_reference_ended_by_ctrl_c_is_not_kept(monkeypatch):
     module = import_module("lavender.diagnostics.motion_error")
     p, real = cone_problem(8), module.solve
 
@@ -101,7 +101,7 @@ def test_reference_that_ctrl_c_ended_is_not_kept(monkeypatch):
 
 
 @pytest.mark.parametrize("form", ["matrix", "bodies"])
-def test_rows_of_friction_ellipses_are_the_problems_own(form):
+def test_motion_error_of_ellipses_is_in_the_given_rows(form):
     p = lv.Problem.contact(np.eye(3), [10.0, 9.0, 9.0], mu=[(0.5, 0.005)], friction="cone")
     if form == "bodies":
         p = lv.Problem.from_jacobian(np.eye(3), np.eye(3), np.zeros(3), target=p.b, cones=p.cones, friction="cone")
@@ -139,13 +139,13 @@ def test_motion_errors_of_huge_impulses_scale_with_them_or_are_none(form):
             assert value == pytest.approx(getattr(near, name) * 2.0**120, rel=1e-9)
 
 
-def test_empty_problem_has_no_error():
+def test_motion_error_of_an_empty_problem_is_zero():
     e = lv.motion_error(lv.Problem.lcp(np.zeros((0, 0)), []), [])
     assert e.energy == 0.0 and e.row_name == ""
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.5])
-def test_motion_of_an_engine_step_is_the_motion_error_of_its_problem(friction):
+def test_measure_motion_of_an_engine_step_equals_motion_error(friction):
     scene = lv.Scene("stack", friction=friction, solver_iterations=4, substeps=1, order="given")
     sim = lv.Simulation(scene, report_motion=True)
     for _ in range(20):

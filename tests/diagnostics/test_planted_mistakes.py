@@ -214,7 +214,7 @@ def test_diagnose_of_a_conveyor_or_another_unit_of_speed_reports_nothing(scenes)
 
 
 @pytest.mark.parametrize(("offset", "kinds"), [(0.5, []), (5.0, ["joint targets"])])  # m, at 60 steps per second
-def test_anchors_in_a_wrong_frame_are_reported(offset, kinds):
+def test_diagnose_of_anchors_in_a_wrong_frame_reports_them(offset, kinds):
     builder = lv.RowBuilder([1.0], np.eye(3)[None], np.zeros((1, 6)), 1 / 60, [(1.0, 0.0, 0.0)])
     builder.hinge(-1, 0, (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), anchor_b=(0.0, 0.0, offset))
     found = lv.diagnose(builder.problem())

@@ -80,7 +80,7 @@ def test_redundancy_of_an_island_beyond_memory_raises():
         redundancy(problem)
 
 
-def test_rank_of_a_sparse_island_is_that_of_its_eigenvalues():
+def test_redundancy_rank_of_a_sparse_island_is_that_of_its_eigenvalues():
     rng, m = np.random.default_rng(1), 300
     jac = sp.csr_array(sp.random_array((m, 240), density=4.0 / 240, rng=rng))
     jac = jac[np.diff(jac.indptr) > 0]
@@ -127,7 +127,7 @@ def test_redundancy_rank_at_any_scale_is_that_of_exact_numbers(form, spread):
 
 
 @pytest.mark.parametrize("form", ["matrix", "J, M and compliance"])
-def test_tangents_of_unlike_units_that_share_a_d_are_two_rows(form):
+def test_redundancy_of_tangents_of_unlike_units_keeps_both_rows(form):
     """A_tt = diag(s^2, 1): the mean of both hid the smaller one, at s^2 = 2^48, and its row counted as redundant."""
     size = np.array([1.0, 2.0**24, 1.0])
     jac = size[:, None] * np.array([[1.0, 0.0, 0.0], [0.5, 1.0, 0.0], [0.5, 0.5, 1.0]])

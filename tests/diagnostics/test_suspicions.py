@@ -145,7 +145,7 @@ def test_diagnose_of_extreme_numbers_does_not_raise(what, size):
         assert all(isinstance(s.reason, str) for s in lv.diagnose(problem, np.full(problem.m, 1e300)))
 
 
-def test_velocities_of_a_planar_engine_are_accepted():
+def test_diagnose_with_velocities_of_a_planar_engine_finds_wrong_ones():
     dt, velocity = 0.01, np.array([(0.3, -0.2, 1.0), (0.0, 0.0, 0.0)])
 
     def diagnose(after, given):
@@ -165,7 +165,7 @@ def test_velocities_of_a_planar_engine_are_accepted():
 
 
 @pytest.mark.parametrize(("mass", "size"), [(100.0, 1.0), (1000.0, 2.0)])
-def test_masses_in_place_of_inverse_masses_are_found_in_space_only(mass, size):
+def test_diagnose_of_masses_as_inverse_masses_reports_them_in_space_only(mass, size):
     """Check the statement of docs/failures.md."""
     inertia, dt, corners = mass * size**2 / 6, 1 / 60, (-size / 2, size / 2)
     plane = lv.RowBuilder([mass], [inertia], [(0.0, -9.81 * dt, 0.0)], dt, [(0.0, size / 2)])
@@ -212,7 +212,7 @@ def pressed(law, form):
 
 @pytest.mark.parametrize("form", ["bodies", "J and M", "A"])
 @pytest.mark.parametrize("law", ["lcp", "coulomb", "cone"])
-def test_conflict_names_its_blocks_and_compliance_removes_it(law, form):
+def test_diagnose_of_a_conflict_names_its_blocks_and_compliance_removes_it(law, form):
     problem = pressed(law, form)
     for name in ("auto",) if law == "coulomb" else ("auto", "newton"):
         solution = lv.solve(problem, name)
@@ -230,7 +230,7 @@ def test_conflict_names_its_blocks_and_compliance_removes_it(law, form):
     assert not [s for s in lv.diagnose(softer) if s.kind == "conflict"]
 
 
-def test_conflict_of_contacts_in_a_pile_is_proved():
+def test_prove_relaxation_infeasible_of_a_tight_pile_returns_a_proof():
     """Walls leave these balls no space; the first step depends on no earlier solve."""
     problem = Pile(17).problem()
     proof = prove_relaxation_infeasible(problem, 1e-6)

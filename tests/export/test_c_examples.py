@@ -65,7 +65,7 @@ def test_planar_engine_disks_on_a_slope_roll_by_the_closed_form(planar):
     assert spin == pytest.approx(-speed / 0.5, rel=1e-9)
 
 
-def test_dumped_answer_of_the_engine_is_judged_as_its_own_impulse(planar):
+def test_c_example_dumped_answer_is_judged_as_its_impulse(planar):
     lines = [json.loads(line) for line in (planar[1] / "engine.jsonl").read_text().splitlines()]
     assert len(lines) == 60 and lines[7] == {"file": "step_007.npz", "rows": 6, "seconds": 0, "solver": "own PGS"}
     stored = read_npz(planar[1] / "step_007.npz")

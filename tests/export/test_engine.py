@@ -33,7 +33,7 @@ def of_package(simulation):
 
 
 @pytest.mark.parametrize("name", ["stack", "chain"])
-def test_steps_and_images_have_the_bits_of_the_package(library, name):
+def test_c_engine_steps_and_images_have_the_bits_of_the_package(library, name):
     scene = lv.Scene(name)
     simulation = lv.Simulation(scene)
     at, memory = opened(library, engine_image(simulation))

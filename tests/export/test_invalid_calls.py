@@ -140,7 +140,7 @@ def test_c_library_of_an_invalid_problem_returns_the_array_and_index_of_its_faul
     assert library.c.lav_set(solver.at, ct.byref(library.problem(self_test_problem()))) == 0  # and goes on
 
 
-def test_null_and_memory_without_a_solver_have_different_errors(library):
+def test_c_library_of_null_and_of_memory_without_a_solver_returns_different_errors(library):
     c, q, o, r = library.c, Problem(), Options(), Result()
     assert c.lav_set(None, ct.byref(q)) == c.lav_run(None, None, None) == c.lav_impulse(None, None, 0) == -1
     assert c.lav_workspace_size(None, None, None) == c.lav_open(None, ct.c_uint64(8), None, None, None) == -1
@@ -166,7 +166,7 @@ def test_null_and_memory_without_a_solver_have_different_errors(library):
 
 
 @pytest.mark.parametrize("method", ["sequential_impulses", "block_gauss_seidel", "anderson", "nncg", "newton", "admm"])
-def test_too_little_memory_is_an_error_and_nothing_is_written_behind_it(library, method):
+def test_c_library_with_too_little_memory_returns_an_error_and_writes_inside_it(library, method):
     problem, options = library.problem(self_test_problem()), library.options(method)
     seen, workspace = set(), library.workspace(problem, options).value
     for bytes_ in [*range(0, workspace, workspace // 40), workspace]:
@@ -239,7 +239,7 @@ def test_c_solver_that_is_running_rejects_other_calls(library):
 
 
 @pytest.mark.parametrize("form, method", [(1, "direct"), (2, "anderson"), (3, "newton")])
-def test_counting_memory_reads_only_where_the_joints_end(library, form, method):
+def test_c_library_counting_memory_reads_only_the_ends_of_joints(library, form, method):
     # Addresses that nothing may be read from: whoever does ends this process.
     problem, options = Problem(), library.options(method)
     ptr = np.arange(0, 39, 3, dtype=np.int32)

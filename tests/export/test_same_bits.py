@@ -230,7 +230,7 @@ def test_c_workspace_of_pivots_counts_unmoved_bodies(library, method, n_bodies):
     assert library.c.lav_needed(library.open(problem, options).at) <= library.workspace(problem, options).value
 
 
-def test_impulses_are_carried_by_key(library):
+def test_c_library_carries_impulses_by_key(library):
     given = self_test_problem()
     key = np.arange(12, dtype=np.uint64) + np.uint64(100)
     solver = library.open(library.problem(given, key=key), library.options("sequential_impulses"))
@@ -246,7 +246,7 @@ def test_impulses_are_carried_by_key(library):
     assert not solver.impulse().any()
 
 
-def test_velocities_are_those_of_the_problem(library):
+def test_c_library_velocities_are_those_of_the_package(library):
     given = self_test_problem()
     solver = library.open(library.problem(given), library.options("sequential_impulses"))
     solver.run(30, 0.0)

@@ -76,7 +76,7 @@ def solve(wrap):
 
 
 @pytest.mark.parametrize("wrap", [HostArray, DeviceArray])
-def test_arrays_of_other_libraries_give_the_same_answers(wrap):
+def test_solve_with_arrays_of_other_libraries_gives_the_same_answers(wrap):
     expected = solve(np.asarray)
     many = solve(wrap)
     np.testing.assert_array_equal(many.impulse, expected.impulse)
@@ -88,20 +88,20 @@ def test_arrays_of_other_libraries_give_the_same_answers(wrap):
     assert lv.solve(problem, tol=1e-9).impulse.tolist() == pytest.approx([1.0, 1.0])
 
 
-def test_host_arrays_are_read_in_place():
+def test_solve_with_host_arrays_reads_them_in_place():
     jac = ARRAYS["J"].copy()
     batch = lv.Batch(HostArray(jac), ARRAYS["M"], ARRAYS["v_free"], cones=CONES)
     jac[0, 0, 1] = 5.0
     assert batch[0].jacobian.toarray()[0, 1] == 5.0
 
 
-def test_device_arrays_are_copied_once():
+def test_solve_with_device_arrays_copies_them_once():
     jac = DeviceArray(ARRAYS["J"])
     lv.Batch(jac, ARRAYS["M"], ARRAYS["v_free"], cones=CONES)
     assert jac.copies == 1
 
 
-def test_arrays_that_cannot_be_read_are_rejected_by_name():
+def test_solve_with_an_unreadable_array_raises_its_name():
     with pytest.raises(lv.InputError, match=r"J is a UnreadableArray on device cuda:0 that cannot be read"):
         lv.Batch(UnreadableArray(ARRAYS["J"]), ARRAYS["M"], ARRAYS["v_free"], cones=CONES)
     differentiable = HostArray(ARRAYS["M"])
@@ -110,7 +110,7 @@ def test_arrays_that_cannot_be_read_are_rejected_by_name():
         lv.Batch(ARRAYS["J"], differentiable, ARRAYS["v_free"], cones=CONES)
 
 
-def test_tensors_of_pytorch():
+def test_solve_with_tensors_of_pytorch_gives_the_same_answers():
     torch = pytest.importorskip("torch")
     np.testing.assert_array_equal(solve(torch.from_numpy).impulse, solve(np.asarray).impulse)
     with pytest.raises(lv.InputError, match="requires a gradient"):
@@ -153,7 +153,7 @@ def check_results(like, to_numpy, rtol=0.0):
     return lv.solve_many(batch, tol=1e-9, like=like)
 
 
-def test_results_return_in_the_callers_library():
+def test_solve_returns_arrays_of_the_library_of_its_arguments():
     many = check_results(StandardArray(np.zeros(1)), lambda x: x.array)
     assert "3 to 1e-09" in repr(many)
     assert isinstance(lv.solve_many(lv.Batch(*ARRAYS.values(), cones=CONES), like=np.zeros(1)).impulse, np.ndarray)
@@ -200,11 +200,11 @@ def test_results_return_as_arrays_of_warp():
     check_results(warp.zeros(1, dtype=warp.float32, device="cpu"), lambda x: x.numpy(), 1e-6)
 
 
-def test_view_with_a_negative_bit_is_read_with_its_sign():
+def test_solve_with_a_view_of_a_negative_bit_reads_its_sign():
     assert to_numpy("x", NegativeView(np.array([1.0, -2.0]))).tolist() == [-1.0, 2.0]
 
 
-def test_imaginary_part_of_a_conjugated_tensor_is_read_with_its_sign():
+def test_solve_with_the_imaginary_part_of_a_conjugated_tensor_reads_its_sign():
     torch = pytest.importorskip("torch")
     view = torch.tensor([1.0 + 2.0j, 3.0 - 4.0j]).conj().imag
     assert view.is_neg() and to_numpy("x", view).tolist() == [-2.0, 4.0]

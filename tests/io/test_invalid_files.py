@@ -224,7 +224,7 @@ def contents(mass, h):
     return fclib.Contents("fclib_global", 3, parts | {"mu": np.full(m // 3, 0.5)})
 
 
-def test_factors_of_a_mass_matrix_beyond_the_memory_limit_are_rejected():
+def test_load_of_fclib_with_a_mass_factor_beyond_memory_raises():
     n = 1200
     rng = np.random.default_rng(2)
     h = np.zeros((n, 3))

@@ -104,7 +104,7 @@ def test_from_drake_of_states_at_the_tolerance_of_sap_is_accepted(ratio, count, 
         context.SetDiscreteState(0, np.array(plant.EvalUniquePeriodicDiscreteUpdate(context).value()))
 
 
-def test_rows_are_relative_velocities_of_the_surfaces():
+def test_from_drake_rows_are_relative_velocities_of_the_surfaces():
     _, _, plant, context = robot()
     problem = lv.io.from_drake(plant, context)
     box = plant.GetBodyByName("box")
@@ -121,7 +121,7 @@ def test_rows_are_relative_velocities_of_the_surfaces():
     np.testing.assert_allclose(problem.cones.mu[:5], [2 * 0.3 * 0.5 / 0.8] * 4 + [0.5])
 
 
-def test_v_free_is_the_step_without_contacts_and_limits():
+def test_from_drake_v_free_is_the_step_without_contacts_and_limits():
     _, _, plant, context = robot()
     plant.SetFreeBodyPose(context, plant.GetBodyByName("box"), RigidTransform([0.0, 1.0, 5.0]))
     plant.GetJointByName("slide").set_translation(context, 0.0)

@@ -143,7 +143,7 @@ def stacked(model, states, dtype):
 
 
 @pytest.mark.parametrize(("cone", "condim"), [("elliptic", 3), ("elliptic", 6), ("pyramidal", 3)])
-def test_arrays_in_float32_are_judged_by_their_own_floor(cone, condim):
+def test_from_efc_in_float32_is_judged_by_its_own_floor(cone, condim):
     model = mj.MjModel.from_xml_string(scene(cone=cone, condim=condim))
     states = states_of(model, 12)
     exact, rough = (lv.io.from_efc(**stacked(model, states, dtype)) for dtype in (np.float64, np.float32))

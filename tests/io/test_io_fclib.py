@@ -144,7 +144,7 @@ def test_load_of_fclib_in_every_matrix_storage_gives_the_same_problem(tmp_path, 
     assert np.array_equal(problem.b, -(np.ones(3) + h.T @ np.linalg.inv(m) @ np.arange(4.0)))  # powers of two: exact
 
 
-def test_repeated_triplets_are_summed(tmp_path):
+def test_load_of_fclib_sums_repeated_triplets(tmp_path):
     parts = {n: np.array([v], np.int32) for n, v in {"m": 3, "n": 3, "nz": 4, "nzmax": 4}.items()}
     parts |= {"p": np.array([0, 1, 2, 1]), "i": np.array([0, 1, 2, 1]), "x": np.array([1.0, 2.0, 3.0, 4.0])}
     problem = lavender.io.load(make(tmp_path / "p.h5", W=parts, q=np.zeros(3), mu=[0.0]))
@@ -160,7 +160,7 @@ def test_load_of_global_fclib_with_an_asymmetric_m_forms_a(tmp_path):
     np.testing.assert_allclose(problem.dense(), h.T @ np.linalg.inv(m) @ h, rtol=1e-14, atol=1e-15)
 
 
-def test_equations_become_free_rows(tmp_path):
+def test_load_of_fclib_equations_become_free_rows(tmp_path):
     """Local V, R, s and global G, b: the same mechanism, joined rigidly at one row."""
     m, h, g = (np.diag([2.0, 4.0, 0.5, 1.0]), np.vstack([W, np.ones(3)]), np.array([[1.0], [0.0], [0.0], [-1.0]]))
     f, w, b = np.arange(4.0), np.ones(3), np.array([0.25])

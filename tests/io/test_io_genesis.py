@@ -58,7 +58,7 @@ class Box:
 @pytest.mark.parametrize(
     ("plane", "box", "is_hidden"), [(None, 0.2, True), (0.3, 0.2, False), (None, 1.5, False), (None, None, False)]
 )
-def test_friction_below_the_default_of_a_plane_is_warned_of(plane, box, is_hidden):
+def test_from_genesis_with_friction_below_the_default_of_a_plane_warns(plane, box, is_hidden):
     scene = make_genesis("convex")
     pairs = ((Plane(), plane), (Box(), box))
     scene.entities = [SimpleNamespace(morph=m, material=SimpleNamespace(friction=x)) for m, x in pairs]

@@ -59,7 +59,7 @@ def test_from_kamino_problems_equal_the_matrix_of_the_engine(model):
 
 
 @pytest.mark.parametrize("model", ["mixed", "dvi"])
-def test_verdicts_agree_with_own_arithmetic(model):
+def test_from_kamino_verdicts_agree_with_complementarity_by_numpy(model):
     """The judge's velocity error against complementarity, cone and momentum computed here from the engine's D."""
     solver = make_kamino(model)
     step = lv.io.from_kamino(solver)
@@ -82,7 +82,7 @@ def test_verdicts_agree_with_own_arithmetic(model):
         assert 0.5 * judged[i] - 1e-6 <= worst <= 2.0 * judged[i] + 1e-6, (i, worst, judged[i])
 
 
-def test_immovable_bodies_keep_their_velocity():
+def test_from_kamino_immovable_bodies_keep_their_velocity():
     def fix(array):
         array[1::2] = 0.0  # the upper box of each stack
         return array

@@ -45,7 +45,7 @@ def test_solve_of_a_mujoco_step_gives_its_acceleration():
     assert np.abs(adapter.acceleration(model, data, adapter.impulse(model, data)) - data.qacc).max() < 1e-6
 
 
-def test_matrix_and_vector_equal_the_arrays_of_mujoco():
+def test_from_mujoco_matrix_and_b_equal_the_arrays_of_mujoco():
     model, data = state(jacobian="sparse")
     problem = lv.io.from_mujoco(model, data)
     jac, mass = adapter.jacobian(model, data).toarray(), np.zeros((model.nv, model.nv))
@@ -58,7 +58,7 @@ def test_matrix_and_vector_equal_the_arrays_of_mujoco():
     assert problem.asymmetry == 0.0
 
 
-def test_blocks_are_named_and_of_their_kind():
+def test_from_mujoco_blocks_have_names_and_kinds():
     model, data = state(condim=4)
     problem = lv.io.from_mujoco(model, data)
     c = problem.cones
@@ -77,7 +77,7 @@ def test_blocks_are_named_and_of_their_kind():
 
 
 @pytest.mark.parametrize("condim", [3, 4, 6])
-def test_coefficients_that_differ_are_made_round_without_changing_the_problem(condim):
+def test_from_mujoco_with_unequal_coefficients_scales_rows_to_a_round_cone(condim):
     text = scene(condim=condim)
     pair = '<contact><pair geom1="low" geom2="high" condim="{}" friction="0.6 0.2 0.02 0.003 0.001"/></contact>'
     model = mj.MjModel.from_xml_string(text.replace("<equality>", pair.format(condim) + "<equality>"))
@@ -151,7 +151,7 @@ def test_from_mujoco_after_an_early_stop_has_the_same_problem(jacobian, solver, 
         assert np.array_equal(lv.io.from_mujoco(model, data).b, problem.b)
 
 
-def test_softness_that_a_copy_did_not_fill_comes_from_its_inverse():
+def test_from_mujoco_without_efc_r_reads_its_inverse():
     model, data = state()
     right = lv.io.from_mujoco(model, data)
     data.efc_R[:] = 0.0
@@ -361,7 +361,7 @@ def test_find_layout_of_another_layout_returns_no_offsets(monkeypatch):
 
 
 @pytest.mark.parametrize("n_rows", [1, 2])
-def test_rows_claimed_without_a_forward_pass_are_refused(n_rows):
+def test_from_mujoco_with_rows_of_no_forward_pass_raises(n_rows):
     """A pass without constraints leaves no arrays of rows, though the arena has memory in use."""
     model = mj.MjModel.from_xml_string(
         "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>"
@@ -374,7 +374,7 @@ def test_rows_claimed_without_a_forward_pass_are_refused(n_rows):
 
 
 @pytest.mark.parametrize("before", ["dense", "sparse"])
-def test_another_choice_of_layout_after_the_forward_pass_is_refused(before):
+def test_from_mujoco_with_another_jacobian_layout_than_the_data_raises(before):
     model, data = state(jacobian=before)
     other = {"dense": mj.mjtJacobian.mjJAC_SPARSE, "sparse": mj.mjtJacobian.mjJAC_DENSE}[before]
     model.opt.jacobian = other
@@ -402,7 +402,7 @@ def test_from_mujoco_with_a_jacobian_of_other_data_raises(factor, stepped, movin
 
 @pytest.mark.parametrize("integrator", ["EULER", "RK4", "IMPLICIT", "IMPLICITFAST"])
 @pytest.mark.parametrize("jacobian", ["dense", "sparse"])
-def test_data_of_a_step_and_of_a_forward_pass_agree_with_themselves(jacobian, integrator):
+def test_from_mujoco_after_a_step_or_a_forward_pass_is_consistent(jacobian, integrator):
     model, data = state(jacobian=jacobian)
     model.opt.integrator = getattr(mj.mjtIntegrator, f"mjINT_{integrator}")
     problem = lv.io.from_mujoco(model, data)
@@ -417,7 +417,7 @@ def test_data_of_a_step_and_of_a_forward_pass_agree_with_themselves(jacobian, in
         problem = lv.io.from_mujoco(model, data)
 
 
-def test_data_of_a_second_model_are_refused():
+def test_from_mujoco_with_data_of_another_model_raises():
     model, data = state()
     text = scene()
     # As many velocities, of six joints where one was.
@@ -431,7 +431,7 @@ def test_data_of_a_second_model_are_refused():
         lv.io.from_mujoco(other, data)
 
 
-def test_data_without_a_forward_pass_are_rejected_by_name():
+def test_from_mujoco_without_a_forward_pass_raises():
     model = mj.MjModel.from_xml_string(
         "<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
     )

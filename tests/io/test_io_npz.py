@@ -200,7 +200,7 @@ def box(tmp_path, **changes):
     return archive(tmp_path / "box.npz", {n: v for n, v in entries.items() if v is not None})
 
 
-def test_box_rows_and_cones_become_blocks_in_their_order(tmp_path):
+def test_load_of_box_npz_keeps_rows_and_contacts_in_order(tmp_path):
     lo = np.array([0.0, -np.inf, 5.0, 5.0, 5.0, -1.0, 7.0])
     hi = np.array([1.0, 0.5, 4.0, 4.0, 4.0, 0.0, 6.0])  # rows of cones do not read theirs
     cones = {"cone_start": [6, 2], "cone_dim": [1, 3], "cone_mu": [0.25, 0.5]}
@@ -219,7 +219,7 @@ def test_box_rows_and_cones_become_blocks_in_their_order(tmp_path):
     assert np.array_equal(stored.slack, np.zeros(7))
 
 
-def test_box_matrices_may_be_sparse_and_of_any_number(tmp_path):
+def test_load_of_box_npz_reads_sparse_matrices_and_any_number_type(tmp_path):
     rng = np.random.default_rng(1)
     a = sp.csr_array(np.where(rng.random((7, 7)) < 0.4, rng.random((7, 7)), 0.0))
     parts = {"A": None, "A_data": a.data, "A_indices": a.indices, "A_indptr": a.indptr, "A_shape": np.array(a.shape)}

@@ -91,7 +91,7 @@ def test_from_pinocchio_solution_keeps_every_constraint_for_a_step():
     assert abs(solution.impulse[-1]) <= 0.7 * dt * (1.0 + 1e-12)
 
 
-def test_joint_limits_are_measured_at_q():
+def test_from_pinocchio_measures_joint_limits_at_q():
     """q away from zero: gaps by hand, J by differences of them."""
     model, _, q, v = robot()
     model.lowerPositionLimit[:], model.upperPositionLimit[:] = -0.3, 0.4
@@ -121,7 +121,7 @@ def vectors(joint):
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_limits_and_friction_of_any_joint_hold_in_pinocchios_own_dynamics(seed):
+def test_from_pinocchio_limits_and_friction_hold_in_its_own_dynamics(seed):
     rng = np.random.default_rng(seed)
     model = pin.Model()
     for i, kind in enumerate(rng.choice(KINDS, rng.integers(1, 5))):

@@ -75,7 +75,7 @@ def test_recorder_with_a_world_of_nan_writes_one_line_for_it_and_continues(tmp_p
     assert len(recorder.files) == 2
 
 
-def test_single_problems_and_pairs(tmp_path):
+def test_recorder_accepts_single_problems_and_pairs(tmp_path):
     problem = lv.Problem.lcp(np.eye(2), np.ones(2))
     with lv.io.Recorder(tmp_path / "a", every=1) as recorder:
         recorder.add(problem, np.ones(2), state={"time": 0.5})

@@ -69,7 +69,7 @@ def test_record_ctrl_c_while_a_file_is_written_leaves_no_file_without_a_line(tmp
     assert len(list(tmp_path.glob("*.npz"))) == 2
 
 
-def test_steps_recorded_from_different_states_are_independent(tmp_path):
+def test_record_from_different_states_makes_independent_steps(tmp_path):
     model, data = state(steps=20)
     arrays = {"qpos": np.tile(data.qpos, (3, 1)), "qvel": np.tile(data.qvel, (3, 1))}
     found = lv.io.record(model, data, tmp_path / "six", 6, states=arrays)
@@ -132,7 +132,7 @@ def test_record_of_a_model_that_ends_mujoco_in_an_error_raises_its_words(tmp_pat
         lv.io.record(model, data, tmp_path / "steps", 4)
 
 
-def test_controls_are_played_drawn_or_called(tmp_path):
+def test_record_with_controls_plays_draws_or_calls_them(tmp_path):
     text = """<mujoco><worldbody><body><joint name="j" range="-1 1" limited="true"/><geom size=".1"/></body></worldbody>
       <actuator><motor joint="j" ctrlrange="-2 3" ctrllimited="true"/></actuator></mujoco>"""
     model = mj.MjModel.from_xml_string(text)

@@ -71,7 +71,7 @@ def test_rolling_reference_problems_are_solved_as_their_reference(problem_dir, n
 
 
 @pytest.mark.parametrize("solver", lv.available(external=False, law="lcp", exact=True))
-def test_exact_solvers_end_on_every_problem_without_friction(problem_dir, solver):
+def test_reference_problems_without_friction_are_solved_by_exact_solvers(problem_dir, solver):
     problems = {name: lavender.io.load(problem_dir / name) for name in FILES if name.endswith(".npz")}
     problems = {name: problem for name, problem in problems.items() if not any(problem.cones.kind)}
     assert len(problems) > 25

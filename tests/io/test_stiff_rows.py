@@ -84,7 +84,7 @@ def test_residual_of_changed_acceleration_is_the_change_of_the_row_velocities(co
             assert 0.3 < found.velocity / (arm * abs(change) * model.opt.timestep) < 1.01
 
 
-def test_worlds_with_stiff_rows_many_equal_single():
+def test_stiff_rows_of_many_worlds_equal_those_of_single_ones():
     kind = mj.mjtState.mjSTATE_INTEGRATION
     states, single = [], []
     for model, data in iterate_pressed_states(3):

@@ -51,7 +51,7 @@ def test_solvers_of_every_kind_agree_with_osqp():
             assert row.verdict == "agrees" or row.status not in ("CONVERGED", "ROUNDOFF_LIMIT"), str(table)
 
 
-def test_orders_within_a_colour_have_the_same_bits():
+def test_sweeps_with_any_order_within_a_color_have_the_same_bits():
     """The statements of the exercise on colours: one result in bits for every order within them, and more sweeps."""
     module = example("jacobi")
     found = module.numbers()
@@ -62,7 +62,7 @@ def test_orders_within_a_colour_have_the_same_bits():
     assert stages["Gauss-Seidel, coloured"] < 0.1 * stages["Gauss-Seidel"]
 
 
-def test_friction_bounds_are_met_and_the_right_bounds_give_coulomb():
+def test_example_friction_bounds_are_met_and_right_ones_give_coulomb():
     module = example("friction_bounds")
     found = module.numbers()
     none, *rounds = found["rounds"]
@@ -122,7 +122,7 @@ def test_every_motion_of_the_example_is_a_solution_and_solvers_find_two_of_them(
     assert set(module.motions(lv.suite.case("painleve(slide=0.5)").problem)) == {"open"}
 
 
-def test_drift_follows_the_motion_error_over_runs(monkeypatch):
+def test_example_drift_follows_the_motion_error(monkeypatch):
     module = example("motion_over_a_run")
     monkeypatch.setattr(module, "STEPS", 12)
     monkeypatch.setattr(module, "SWEEPS", (4, 64))

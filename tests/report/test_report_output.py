@@ -100,7 +100,7 @@ def test_texts_of_a_report_with_every_part_are_approved(written):
         check_text("report.txt", name, text.replace(str(out.parent), "FOLDER"))
 
 
-def test_files_have_every_table_figure_and_run(written):
+def test_report_write_has_files_of_every_table_figure_and_run(written):
     report, out, events = written
     assert {p.name for p in out.iterdir()} == {
         "records.csv", "index.html", "summary.md", "figures", "tables"

@@ -333,7 +333,7 @@ def test_restored_snapshot_has_the_same_bits_and_searches_pairs_again(name, solv
 
 
 @pytest.mark.parametrize("inspects", [False, True])
-def test_threads_that_share_a_simulation_wait_for_each_other(inspects):
+def test_scene_steps_in_two_threads_wait_for_each_other(inspects):
     # Without the lock, eight of eight runs crashed. restore(snapshot()) of one thread may undo a step of another
     # between the two calls, so the bits are compared if each thread only steps.
     scene = lv.Scene("pile", n=60, kind="mixed", substeps=2)
@@ -387,7 +387,7 @@ def caller(plug_in):
     return make
 
 
-def test_calls_from_inside_a_step_are_rejected(caller):
+def test_scene_call_from_inside_a_step_raises(caller):
     rejected = []
 
     def inside():
@@ -464,7 +464,7 @@ for n in (60, 65_537):
 
 
 @pytest.mark.slow
-def test_coincident_spheres_touch_or_are_rejected():
+def test_scene_of_coincident_spheres_steps_or_raises():
     # 65,537 spheres are 2^31 + 32,768 pairs, a negative number in 32 bits.
     pytest.importorskip("resource")
     python("-X", "faulthandler", "-c", COINCIDENT)
@@ -473,7 +473,7 @@ def test_coincident_spheres_touch_or_are_rejected():
 # -- numbers at the edge of float64 --------------------------------------------------------------------
 
 
-def test_buffers_beyond_memory_raise():
+def test_scene_with_buffers_beyond_memory_raises():
     sim = lv.Simulation(lv.Scene("stack", n=2))
     sim.state.head[HEAD["need_contacts"]] = 2**28
     with pytest.raises(lv.InputError, match="GiB"):

@@ -77,7 +77,7 @@ PACES = [
 
 
 @pytest.mark.parametrize(("name", "pace"), PACES)
-def test_more_time_is_never_worse(name, pace, clock, monkeypatch):
+def test_auto_with_more_time_is_not_worse(name, pace, clock, monkeypatch):
     problem, found = PROBLEMS[name](), []
     play(monkeypatch, clock, pace, problem)
     for limit in LIMITS:

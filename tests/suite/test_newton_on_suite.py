@@ -85,7 +85,7 @@ def test_ctrl_c_returns_the_best_iterate(name, case, interrupted_newton):
     assert solution.residual.relative < 1.0
 
 
-def test_faces_under_the_cone_law_where_the_first_interior_point_stops_short():
+def test_newton_under_the_cone_law_continues_where_the_first_interior_point_stops():
     problem = suite.pyramid(k=30, friction="coulomb").problem.relaxed("cone")
     solution = lv.solve(problem, "newton", tol=1e-9)
     assert good(solution, 1e-9), solution

@@ -51,7 +51,7 @@ def test_hard_set_threshold_is_between_stick_and_slip():
         assert np.hypot(w[1], w[2]) == pytest.approx(max(0.0, above) * 0.5 * build.FALL_SPEED, abs=1e-17)
 
 
-def test_painleve_meets_the_condition_of_the_paradox():
+def test_hard_set_painleve_meets_the_condition_of_the_paradox():
     a = painleve().problem.dense()
     assert a[0, 0] - 2.0 * a[0, 1] < 0.0  # tests/project/test_examples.py has its three solutions
 
@@ -59,7 +59,7 @@ def test_painleve_meets_the_condition_of_the_paradox():
 @pytest.mark.parametrize(
     "name", ["arch", "arch(n=25)", "card_house", "card_house(levels=5)", "big_box(mass_ratio=400)", "slab(n=5)"]
 )
-def test_hard_structures_at_rest_do_not_move_and_need_their_friction(name):
+def test_hard_set_structures_at_rest_do_not_move_only_with_friction(name):
     case = suite.case(name)
     v = case.problem.velocity(case.reference.impulse)
     # Loads of tens of kilograms on bodies of one: rounding of impulses is 1e-15 of a metre per second each.

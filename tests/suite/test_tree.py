@@ -120,7 +120,7 @@ def test_auto_solves_problems_that_only_late_stages_solve(make):
     assert solution.success, solution.stages
 
 
-def test_rows_of_a_follow_where_newton_over_velocities_ends_in_vain():
+def test_auto_continues_over_rows_of_a_if_newton_over_velocities_fails():
     rng = np.random.default_rng(8)
     half, jac, moved = (rng.standard_normal((150, 150)), rng.standard_normal((400, 150)), rng.standard_normal(150))
     target = jac @ moved - rng.exponential(0.5, 400) * (rng.random(400) < 0.7)
@@ -156,7 +156,7 @@ def test_newton_of_transport_plan_factors_sparse_rows_of_a():
     assert plan.newton < 2e7  # [ns] Over velocities it is estimated at 1.4 s.
 
 
-def test_squeezed_bodies_are_proved_to_have_no_solution_before_all_go_in_turn():
+def test_auto_proves_that_squeezed_bodies_have_no_solution_before_it_alternates():
     """Floor and ceiling close in on each body, under Coulomb's law, where no method of ours proves it."""
     down = np.vstack([np.eye(3), np.diag([-1.0, 1.0, 1.0])])  # each contact: normal and two tangents
     a = np.kron(np.eye(20), down @ down.T)

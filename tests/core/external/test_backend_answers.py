@@ -67,7 +67,7 @@ def test_points_keep_their_bits_through_scaling():
         assert here.tobytes() == there.tobytes()
 
 
-def test_form_by_name_or_by_the_problem_is_used():
+def test_backend_form_is_the_named_one_or_that_of_the_problem():
     program = draw_program(0)
     definite, singular = lv.Problem.from_qp(**program), lv.Problem.from_qp(**draw_program(1))
     assert choose_program_form(definite, "auto") == choose_program_form(singular, "auto") == "program"
@@ -96,7 +96,7 @@ def test_solve_qp_of_an_ill_conditioned_program_is_solved_by_named_backends(name
     assert here <= TOL and solution.success
 
 
-def test_matrix_p_of_all_forms_is_symmetric_in_every_bit():
+def test_backend_form_has_a_p_that_is_symmetric_in_every_bit():
     problem = lv.Problem.lcp(*spd(9, seed=1))
     for program in (build_form(problem, "impulse").program, get_program(lv.Problem.from_qp(**draw_program(6)).qp)):
         P = program.scaled.get_hessian(True)

@@ -36,7 +36,7 @@ def test_program_without_a_solution_is_no_success(name):
 
 
 @pytest.mark.parametrize("name", mark_slow(BACKENDS))
-def test_active_bounds_of_a_program_have_multipliers(name):
+def test_backend_multipliers_of_active_bounds_are_not_zero(name):
     """pyqpmad returns zeros for multipliers of bounds."""
     problem = lv.Problem.from_qp([[2.0, 0.5], [0.5, 1.0]], [0.0, 1.0], lb=[1.0, -2.0], ub=[1.0, 2.0])
     if registry.get(name).refuses(problem) is not None:

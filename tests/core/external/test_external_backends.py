@@ -71,7 +71,7 @@ def test_backend_prints_nothing_imports_nothing_and_runs_in_threads(name, capfd,
 
 
 @pytest.mark.parametrize("name", BACKENDS)
-def test_asymmetric_and_negative_diagonals_are_refused_with_the_reason(name):
+def test_backend_on_an_asymmetric_or_negative_matrix_raises_the_reason(name):
     a, b = spd(4)
     a[0, 1] += 1e-3
     with pytest.raises(lv.CapabilityError, match="needs a symmetric A"):
@@ -131,7 +131,7 @@ def test_backend_on_empty_or_fixed_problems_is_not_called(name):
 
 @pytest.mark.parametrize("name", BACKENDS)
 @pytest.mark.parametrize("form", ["impulse", "velocity"])
-def test_dual_holds_the_backends_own_multipliers(name, form):
+def test_backend_dual_fulfils_the_kkt_conditions(name, form):
     problem = random_contact_problem(34, tangents=0, spin=False)
     c = problem.cones
     above = np.isfinite(c.upper) & (np.arange(problem.m) < 3)  # which have an upper bound alone
@@ -343,7 +343,7 @@ def test_newton_step_removes_an_error_of_the_backend(register):
 
 
 @pytest.mark.parametrize("later", [lv.Status.INFEASIBLE, lv.Status.NUMERICAL_ERROR, lv.Status.TIME_LIMIT])
-def test_second_call_that_fails_does_not_replace_a_good_answer(later, register):
+def test_backend_second_call_that_fails_keeps_the_first_answer(later, register):
     def wrong_bound(program, limit):  # lambda_0 at its bound, although it is positive at the solution
         x = -(1.0 + 1e-9) * program.q
         lam = np.full(len(program.t), 1e3)
@@ -355,7 +355,7 @@ def test_second_call_that_fails_does_not_replace_a_good_answer(later, register):
     assert solution.claim_check == "confirmed" or later is lv.Status.INFEASIBLE
 
 
-def test_tol_zero_runs_at_the_tightest_tolerance():
+def test_backend_at_tol_zero_runs_at_its_tightest_tolerance():
     solution = lv.solve(lv.Problem.lcp(*spd(10)), "clarabel", tol=0.0)
     assert solution.status in (lv.Status.STALLED, lv.Status.ROUNDOFF_LIMIT)
     assert solution.residual.relative <= 1e-10

@@ -23,7 +23,7 @@ PROBLEMS = [pytest.param(*given, id="-".join(given)) for given in combinations()
 
 
 @pytest.mark.parametrize("kind, law, operator", PROBLEMS)
-def test_directions_agree_with_differences_of_solutions(kind, law, operator):
+def test_derivative_jvp_agrees_with_differences_of_solutions(kind, law, operator):
     for seed in range(3):
         p = drawn(seed, kind, law, operator)
         solution = solved(p)
@@ -48,7 +48,7 @@ def test_directions_agree_with_differences_of_solutions(kind, law, operator):
 
 
 @pytest.mark.parametrize("kind, law, operator", PROBLEMS)
-def test_gradients_are_the_adjoint_of_directions(kind, law, operator):
+def test_derivative_vjp_is_the_adjoint_of_jvp(kind, law, operator):
     # to rounding: both are the same linear map, read from its two ends
     p = drawn(0, kind, law, operator)
     d, rng = lv.derivative(p, solved(p)), np.random.default_rng(1)
@@ -73,7 +73,7 @@ def test_gradients_are_the_adjoint_of_directions(kind, law, operator):
 # -- states ------------------------------------------------------------------------------------------------------
 
 
-def test_states_of_rows_and_parts():
+def test_derivative_states_of_rows_and_components_are_documented_ones():
     p = lv.Problem.lcp(np.eye(4), [1.0, -1.0, 3.0, 0.0], [0.0, 0.0, 0.0, 0.0], [2.0, 2.0, 2.0, 2.0])
     solution = lv.solve(p, tol=1e-12)
     assert solution.states.names == ("free", "at a bound", "at a bound", "at a bound")
@@ -88,7 +88,7 @@ def test_states_of_rows_and_parts():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_states_fit_impulse_and_slack(kind):
+def test_derivative_states_fit_impulse_and_slack(kind):
     # the definition, in NumPy: what is open has no impulse, what sticks no slack, what slides is on its rim
     law = "cone" if kind == "round" else "coulomb"
     p = drawn(1, kind, law, "generalized")
@@ -168,7 +168,7 @@ def test_derivative_of_equal_bounds_moves_them_together():
 # -- many at once ------------------------------------------------------------------------------------------------
 
 
-def test_arrays_of_a_batch_are_those_of_its_gradients():
+def test_derivatives_of_a_batch_equal_single_gradients():
     # one after the other, of what the compiled call takes and of what goes alone: a matrix, a singular system
     rng = np.random.default_rng(0)
     problems = [drawn(seed, "disk", "cone", "generalized") for seed in range(3)]
@@ -221,7 +221,7 @@ def test_derivatives_of_a_stacked_batch_equal_single_ones_and_reject_other_solut
 
 @pytest.mark.parametrize("count", [3, 170])  # dense; sparse
 @pytest.mark.parametrize("law", ["lcp", "cone"])
-def test_contacts_given_twice_move_as_given_once(law, count):
+def test_derivative_of_contacts_given_twice_equals_that_of_given_once(law, count):
     rng = np.random.default_rng(count)
     each, size = (1, 0) if law == "lcp" else (3, 2)
     jac = np.zeros((each * count, 3 * count + 3))

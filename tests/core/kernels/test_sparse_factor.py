@@ -43,7 +43,7 @@ def definite(a):
 
 
 @pytest.mark.parametrize("n", [1, 47, 48, 49, 200])
-def test_full_factor_solves_and_counts_lost_pivots(n):
+def test_dense_factor_solves_and_counts_lost_pivots(n):
     """Of rank n / 2 the pivots after it are roundings: a right side in the range is solved all the same.
 
     Backward errors |a x - b| / (|a| |x|) are n roundings, at rank n / 2 as many times more as the last pivot is small.
@@ -85,7 +85,7 @@ def test_ordering_of_any_graph_is_a_permutation(n, pairs, heavy):
     assert np.array_equal(np.sort(panels.order), np.arange(len(of)))
 
 
-def test_trees_and_stars_fill_nothing():
+def test_sparse_factor_of_trees_and_stars_fills_nothing():
     rng = np.random.default_rng(0)
     for n in (2, 50, 3000):
         parent = np.array([rng.integers(0, i) if n < 3000 else 0 for i in range(1, n)])  # the last: a star
@@ -110,7 +110,7 @@ def factor_of(matrix, order):
 
 
 @pytest.mark.parametrize("piles", [1, 2])
-def test_dissection_halves_the_work_of_minimum_degree_on_a_cube(piles):
+def test_sparse_factor_by_dissection_halves_the_work_on_a_cube(piles):
     """Blocks of a grid of 14 x 14 x 14 with 26 neighbours, alone or beside others: each vertex has one place."""
     line = sp.diags_array([np.ones(13), np.ones(14), np.ones(13)], offsets=[-1, 0, 1])
     cube = sp.csr_array(sp.kron(sp.kron(line, line), line))
@@ -203,7 +203,7 @@ def test_sparse_factor_with_shifts_and_lost_pivots_solves():
 
 
 @pytest.mark.parametrize(("diagonal", "loses_pivots"), [(1e-9, False), (1e-12, False), (1e-20, True)])
-def test_superlu_replaces_a_factor_without_pivots_or_digits(diagonal, loses_pivots):
+def test_sparse_factor_without_pivots_or_digits_is_replaced_by_superlu(diagonal, loses_pivots):
     """Pivots of a chain of small diagonal are its neighbours', in other supernodes: 1e-9 is refined, 1e-20 is lost."""
     n = 200
     chain = [np.full(n - 1, 1.0), np.full(n, diagonal), np.full(n - 1, -1.0)]

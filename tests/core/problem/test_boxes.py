@@ -70,7 +70,7 @@ def test_findex_round_trip_in_any_order_is_equal(seed):
         assert again == problem
 
 
-def test_fixed_normals_make_constant_bounds():
+def test_boxed_problem_has_constant_friction_bounds():
     boxed = free(1, contacts=1, mu=[(0.25, 0.5)]).boxed(2.0)
     assert boxed.cones.upper.tolist() == [np.inf, 0.5, 1.0]
 
@@ -81,7 +81,7 @@ def test_fixed_normals_make_constant_bounds():
 @pytest.mark.parametrize("name", ["lemke", "direct"])
 @pytest.mark.parametrize("law", LAWS)
 @given(seed=seeds, iterations=st.sampled_from([1, 2, 1000]))
-def test_pivoting_ends_nowhere_worse_than_it_starts(law, name, seed, iterations):
+def test_pivoting_on_boxes_is_not_worse_than_its_start(law, name, seed, iterations):
     """Rows that depend on each other, which many impulses or none can meet; from near the best that `auto` finds."""
     problem = random_box_friction_contacts(seed, law, bodies=3, joints=4, contacts=8)
     problem = replace(problem, compliance=np.zeros(problem.m))
@@ -105,7 +105,7 @@ def test_plug_in_without_box_friction_refuses_boxes():
 # -- ellipses --------------------------------------------------------------------------------------------------------
 
 
-def test_coefficients_come_back_and_equal_ones_are_a_disk():
+def test_cones_of_two_coefficients_return_them_and_equal_ones_are_a_disk():
     mu = np.array([[0.5, 0.2], [0.02, 0.8], [0.3, 0.3], [0.0, 0.0]])
     cones = lv.Cones.contacts(mu)
     assert cones.has_ellipse
@@ -122,7 +122,7 @@ def test_coefficients_come_back_and_equal_ones_are_a_disk():
     np.testing.assert_allclose(t[1:, 1:], [[0, 0.1], [0.3, 0.0], [0, 0]], atol=1e-15)
 
 
-def test_thin_ellipse_with_tiny_compliance_is_rigid():
+def test_solve_of_a_thin_ellipse_with_tiny_compliance_equals_the_rigid_one():
     """1e-40 in rows that are 1e-12 as long, beside a d of 1e-24."""
     problem = lv.Problem.from_jacobian(
         np.eye(3), np.eye(3), [0.3, 0.2, -1.0], cones=lv.Cones.contacts([(0.5, 5e-13)]), compliance=[0.0, 0.0, 1e-40]
@@ -132,7 +132,7 @@ def test_thin_ellipse_with_tiny_compliance_is_rigid():
 
 
 @pytest.mark.parametrize("mass", ["in order", "in another order"])
-def test_disks_share_the_factor_of_the_mass_matrix(mass):
+def test_converted_ellipses_share_the_factor_of_the_mass_matrix(mass):
     """Bit for bit what J with longer rows and the same M come to, although M is neither checked nor factored again."""
     rng, n = np.random.default_rng(0), 12
     half = np.eye(n) + np.diag(rng.normal(size=n - 1), 1)
@@ -171,7 +171,7 @@ ELLIPSES = {
 
 
 @pytest.mark.parametrize("form", ELLIPSES)
-def test_ellipse_results_are_in_the_given_rows(form):
+def test_solution_of_ellipses_is_in_the_given_rows(form):
     problem = ELLIPSES[form](3, friction="cone")
     s, calls = problem.cones.stretch, []
     found = lv.solve(problem, "anderson", tol=1e-6, max_iter=5, callback=lambda n, x, r: calls.append((x, r)) and None)

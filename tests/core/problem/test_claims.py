@@ -142,7 +142,7 @@ def test_false_claim_in_every_form_and_law_is_contradicted(form, status, plug_in
 
 
 @pytest.mark.parametrize("form", GIVEN)
-def test_arrays_made_writable_by_a_solver_change_no_problem(form, plug_in):
+def test_plug_in_that_writes_to_arrays_of_a_problem_changes_no_problem(form, plug_in):
     problem, twin = given_by(form), given_by(form)
 
     def run(problem, impulse):
@@ -266,7 +266,7 @@ def test_unsolvable_problem_with_growing_impulses_is_not_accepted(name, problem)
 @pytest.mark.parametrize("error", [FloatingPointError("underflow"), MemoryError()])
 @pytest.mark.parametrize("where", ["prepare", "run"])
 @pytest.mark.parametrize("limit", [None, 10.0])
-def test_arithmetic_error_of_a_plug_in_is_a_numerical_error(error, where, limit, register):
+def test_plug_in_with_an_arithmetic_error_has_the_status_numerical_error(error, where, limit, register):
     class Breaks:
         def prepare(self, problem):
             if where == "prepare":

@@ -32,7 +32,7 @@ def test_fields_of_springs_motors_limits_and_gaps_have_their_documented_effect()
 
 
 @pytest.mark.parametrize("belt_is_a", [True, False])
-def test_belt_target_moves_the_body_on_it(belt_is_a):
+def test_target_of_a_belt_moves_the_body_on_it(belt_is_a):
     """The belt runs on the world, once as the first body of the contact and once as the second."""
     v = np.array([[0.0, 0.0, -0.1, 0.0, 0.0, 0.0]])
     side = 1.0 if belt_is_a else -1.0

@@ -35,7 +35,7 @@ def row_by_row(mass, x):
 
 
 @given(seeds)
-def test_rows_that_are_eliminated_together_have_the_bits_of_one_after_the_other(seed):
+def test_generalized_elimination_of_rows_together_has_the_bits_of_single_ones(seed):
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 48 if seed % 5 else 160))
     parent = np.arange(n) - 1 if seed % 3 == 0 else random_tree_parents(rng, n)
@@ -115,7 +115,7 @@ def test_newton_over_velocities_continues_centering_with_many_rows(nv, seed):
     assert solution.success, str(solution)
 
 
-def test_updated_is_the_same_structure_with_new_numbers():
+def test_problem_updated_has_the_same_structure_and_new_numbers():
     problem = random_generalized_problem(9, "cone")
     general = problem.generalized
     rng = np.random.default_rng(0)
@@ -129,7 +129,7 @@ def test_updated_is_the_same_structure_with_new_numbers():
 
 
 @pytest.mark.parametrize("jac", [[[1.0, 1.0], [1.0, -1.0]], [[1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 0.0, 1.0]]])
-def test_entries_of_a_that_vanish_are_left_out(jac):
+def test_generalized_matrix_leaves_out_vanishing_entries(jac):
     """Colours and islands are told by entries: of rows that all meet in the same columns, and of others."""
     n = len(jac)
     problem = lv.Problem.from_jacobian(jac, np.eye(n), np.zeros(n), cones=lv.Cones.free(n))
@@ -138,7 +138,7 @@ def test_entries_of_a_that_vanish_are_left_out(jac):
 
 @given(seed=seeds)
 @pytest.mark.parametrize("friction", ["coulomb", "cone", "lcp"])
-def test_branches_are_factored_in_their_own_pattern(friction, seed):
+def test_generalized_factor_of_a_tree_has_the_pattern_of_its_branches(friction, seed):
     """Large trees, some contacts between branches: few entries in a row of N, the solution of A."""
     contacts = 0 if friction == "lcp" else 6
     problem = random_generalized_problem(seed, "cone" if friction == "lcp" else friction, n=200, contacts=contacts)
@@ -197,7 +197,7 @@ def cloth(side, seed, friction="cone"):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_many_small_trees_are_put_in_an_order_that_fills_in_little(seed):
+def test_generalized_order_of_many_small_trees_fills_in_little(seed):
     problem = cloth(24, seed)
     assert problem.generalized.order is not None
     solution = lv.solve(problem, "newton", form="velocity", tol=1e-10)

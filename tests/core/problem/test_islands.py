@@ -141,7 +141,7 @@ LARGE = st.lists(st.integers(3, 60), min_size=1, max_size=3).map(lambda powers: 
 @pytest.mark.parametrize("friction", ["coulomb", "cone"])
 @pytest.mark.parametrize("form", ["matrix", "J and M"])
 @given(seed=seeds, sizes=LARGE, still=st.booleans())
-def test_inactive_rows_change_no_relative_residual(form, friction, seed, sizes, still):
+def test_residual_relative_does_not_depend_on_inactive_rows(form, friction, seed, sizes, still):
     rng = np.random.default_rng(seed)
     problem = random_generalized_problem(seed, friction)
     if still:  # the zero impulse is a solution
@@ -179,7 +179,7 @@ def test_solvers_with_inactive_rows_converge_as_without(friction, size, form):
     assert solved >= 15
 
 
-def test_row_of_zero_a_is_rounding_or_infeasible():
+def test_solve_of_a_row_of_zeros_is_rounding_or_infeasible():
     """Its row of A is zero: b of 1e-17 beside numbers of 1 is rounding, b of 1e-3 has no solution."""
     for b, status in ((1e-17, lv.Status.CONVERGED), (1e-3, lv.Status.INFEASIBLE)):
         assert lv.solve(lv.Problem.lcp(np.diag([1.0, 0.0]), [1.0, b])).status is status

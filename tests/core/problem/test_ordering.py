@@ -26,7 +26,7 @@ def test_named_orders_are_permutations_with_joints_first(order, seed):
 
 
 @given(seed=seeds)
-def test_colors_share_no_moving_body(seed):
+def test_block_colors_share_no_moving_body(seed):
     problem = random_contact_problem(seed, bodies=6, contacts=20)
     o, color = compute_block_order(problem, "colored"), compute_block_colors(problem)
     body = np.concatenate([problem.rows.joint_body, problem.rows.contact_body])
@@ -39,7 +39,7 @@ def test_colors_share_no_moving_body(seed):
 
 
 @given(seed=seeds)
-def test_colors_of_a_matrix_share_no_entry(seed):
+def test_block_colors_of_a_matrix_share_no_entry(seed):
     problem = as_matrix(random_contact_problem(seed, bodies=6, contacts=20))
     color, a, ptr = compute_block_colors(problem), problem.dense(), problem.cones.ptr
     for i in range(problem.n_blocks):
@@ -48,14 +48,14 @@ def test_colors_of_a_matrix_share_no_entry(seed):
                 assert not a[ptr[i] : ptr[i + 1], ptr[j] : ptr[j + 1]].any()
 
 
-def test_colors_of_a_dense_graph_exceed_63():
+def test_block_colors_of_a_dense_graph_exceed_63():
     """100 contacts of one body with 100 others: every one needs its own colour."""
     n = 100
     rows = touching(np.stack([np.zeros(n), np.arange(1, n + 1)], axis=1))
     assert sorted(compute_block_colors(lv.Problem.from_rows(rows)).tolist()) == list(range(n))
 
 
-def test_levels_count_from_the_ground():
+def test_block_levels_count_from_the_ground():
     n = 6
     body = np.stack([np.arange(-1, n - 1), np.arange(n)], axis=1)
     shuffled = np.random.default_rng(3).permutation(n)
@@ -80,14 +80,14 @@ def test_blocks_of_floating_bodies_are_above_the_blocks_of_bodies_on_the_ground(
     assert compute_block_order(problem, "top_down").blocks.tolist() in ([0, 3, 2, 1], [3, 0, 2, 1])
 
 
-def test_symmetric_is_forwards_then_backwards():
+def test_order_symmetric_is_forwards_then_backwards():
     problem = random_lcp(4)
     forwards = lv.solve(problem, "pgs", tol=0.0, max_iter=1)
     both = sweeps(problem, "pgs", 1, order="reverse", impulse=forwards.impulse)
     np.testing.assert_array_equal(sweeps(problem, "pgs", 2, order="symmetric"), both)
 
 
-def test_ranks_are_a_permutation_that_brings_neighbours_near():
+def test_ranks_of_blocks_are_a_permutation_that_brings_neighbours_near():
     # A chain of 20,000 bodies whose numbers are shuffled: neighbours are 6,700 apart in the mean.
     n = 20_000
     rng = np.random.default_rng(0)

@@ -19,7 +19,7 @@ I2 = np.eye(2)
 # -- classes and forms -----------------------------------------------------------------------------------
 
 
-def test_law_follows_from_the_kinds_of_blocks():
+def test_problem_law_follows_from_the_kinds_of_blocks():
     assert lv.Problem.linear(I2, [1, 1]).law == "linear"
     assert lv.Problem.lcp(I2, [1, 1]).law == "lcp"
     assert lv.Problem.lcp(I2, [1, 1], lower=-np.inf).law == "linear"
@@ -32,7 +32,7 @@ def test_law_follows_from_the_kinds_of_blocks():
 
 @pytest.mark.parametrize("given_by", ["rows", "J and M"])
 @given(seed=seeds)
-def test_velocity_form_is_the_same_problem(given_by, seed):
+def test_problem_of_v_free_has_the_b_of_its_target(given_by, seed):
     problem = FORMS[given_by](random_contact_problem(seed))
     form = problem.velocity_form()
     k, s = form.jacobian.toarray(), form.scale
@@ -43,7 +43,7 @@ def test_velocity_form_is_the_same_problem(given_by, seed):
     np.testing.assert_allclose(form.impulse(z), s)
 
 
-def test_relaxed_and_boxed_change_the_law_alone():
+def test_problem_relaxed_or_boxed_differs_in_its_law_alone():
     problem = random_contact_problem(4, tangents=2, spin=True)
     cone = problem.relaxed("cone")
     assert (cone.law, cone.relaxed("coulomb")) == ("cone", problem)
@@ -61,7 +61,7 @@ def test_relaxed_and_boxed_change_the_law_alone():
         problem.boxed(np.full(c, -1.0))
 
 
-def test_rows_have_names():
+def test_problem_rows_have_names():
     problem = random_contact_problem(6, tangents=2, spin=True)
     kj = problem.rows.n_joints
     first = int(problem.cones.ptr[kj])
@@ -88,7 +88,7 @@ def test_rows_have_names():
 # -- friction: defaults with a meaning ------------------------------------------------------------------------
 
 
-def test_mu_alone_means_two_tangents_and_a_mu_without_friction_rows_is_refused():
+def test_from_rows_with_mu_alone_has_two_tangents_and_without_friction_rows_raises():
     made = touching([[-1, 0], [0, 1]])
     problem = lv.Problem.from_rows(made, mu=0.5)
     assert (problem.m, problem.law) == (6, "coulomb")
@@ -203,7 +203,7 @@ def makers(sparse):
 
 @pytest.mark.parametrize("sparse", [None, sp.csr_array, sp.coo_array])
 @pytest.mark.parametrize("maker", makers(None))
-def test_arrays_that_are_copied_stay_writable_and_unshared(maker, sparse):
+def test_problem_with_copy_leaves_arrays_writable_and_unshared(maker, sparse):
     given, matrices = given_arrays(), []
     form = sparse and (lambda a: matrices.append(sparse(a)) or matrices[-1])
     problem = makers(form)[maker](given)
@@ -218,7 +218,7 @@ def test_arrays_that_are_copied_stay_writable_and_unshared(maker, sparse):
     assert pickle.dumps(problem) == before
 
 
-def test_arrays_that_are_adopted_are_shared_and_read_only():
+def test_problem_without_copy_shares_read_only_arrays():
     given = given_arrays()
     problem = lv.Problem(given["b"], random_lcp(3).cones, given["A"], guess=given["guess"], copy=False)
     for name, kept in (("b", problem.b), ("A", problem.matrix), ("guess", problem.guess)):

@@ -160,7 +160,7 @@ def test_a_weld_leaves_no_relative_velocity():
     np.testing.assert_allclose(carried, after[1, :3], rtol=0.0, atol=1e-9)
 
 
-def test_joints_remove_the_fraction_of_their_errors():
+def test_row_builder_joints_remove_the_fraction_of_their_errors():
     error = np.array([0.01, -0.02])
     builder = planar(baumgarte=0.5)
     builder.weld(-1, 0, BODY, np.array(BODY) + error, angle_error=0.1)
@@ -224,7 +224,7 @@ def test_row_builder_in_two_dimensions_equals_a_plane_in_three():
     np.testing.assert_allclose(velocity[:, 2:5], 0.0, rtol=0.0, atol=1e-7)
 
 
-def test_keys_carry_impulses_to_blocks_in_another_order():
+def test_row_builder_keys_carry_impulses_to_another_order():
     def build(order):
         builder = planar((0.3, -1.0, 0.0))
         keys = {i: builder.contact(-1, 0, (1.0 + i, -1.2), (0.0, 1.0), mu=0.5, feature=i) for i in order}
@@ -242,7 +242,7 @@ def test_keys_carry_impulses_to_blocks_in_another_order():
     assert not carried[second.rows_of(other_keys["ball"])].any()
 
 
-def test_blocks_have_names_and_order():
+def test_row_builder_blocks_have_names_and_order():
     builder = planar()
     contact = builder.contact(None, 0, BODY, (0.0, 1.0), mu=0.2)
     hinge = builder.hinge(None, 0, BODY)
@@ -290,7 +290,7 @@ def test_a_tangent_can_be_chosen():
     np.testing.assert_allclose(builder.problem().rows.tangent[0], expected, rtol=0.0, atol=1e-15)
 
 
-def test_rod_with_coinciding_anchors_pushes_b_along_z():
+def test_row_builder_rod_with_coinciding_anchors_pushes_b_along_z():
     builder = spatial(np.zeros((1, 6)), np.zeros((1, 3)))
     point = (0.0, 0.0, 0.0)
     builder.distance(-1, 0, point, point, 1.0)
@@ -332,7 +332,7 @@ def draw_arguments(rng, block_type, n, dimensions):
 
 @pytest.mark.parametrize("dimensions", [2, 3])
 @given(seed=seeds)
-def test_arrays_of_blocks_have_the_bits_of_single_calls(dimensions, seed):
+def test_row_builder_with_arrays_of_blocks_has_the_bits_of_single_calls(dimensions, seed):
     rng, n = np.random.default_rng(seed), 4
     inertia = np.full(3, 2.0) if dimensions == 2 else np.tile(2.0 * np.eye(3), (3, 1, 1))
     bodies = (np.ones(3), inertia, rng.normal(size=(3, 3 * dimensions - 3)), DT, rng.normal(size=(3, dimensions)))
@@ -356,7 +356,7 @@ def test_arrays_of_blocks_have_the_bits_of_single_calls(dimensions, seed):
 
 
 @pytest.mark.parametrize(("length", "cause"), [(None, "length is None"), (0.0, "length is 0")])
-def test_distance_of_length_zero_raises_and_recommends_ball(length, cause):
+def test_row_builder_distance_of_length_zero_raises_and_recommends_ball(length, cause):
     builder = spatial(np.zeros((1, 6)), np.zeros((1, 3)))
     point = (0.0, 0.0, 1.0)
     lengths = {} if length is None else {"length": [1.0, length]}

@@ -59,7 +59,7 @@ def outcome(given):
 
 @pytest.mark.parametrize("what", SPOILT)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_quick_checks_of_sweeps_equal_full_residuals(what, seed):
+def test_sweeps_quick_check_equals_the_full_residual(what, seed):
     given = spoilt(seed, SPOILT[what])
     quick = outcome(given)
     with pytest.MonkeyPatch.context() as patch:
@@ -113,7 +113,7 @@ def test_rows_in_float32_are_widened_exactly():
         lv.Rows(**single | {"normal": n * np.where(np.arange(20) == 4, 1.0001, 1.0)[:, None]}, **more)
 
 
-def test_impulses_are_carried_by_key_and_new_blocks_start_from_nothing():
+def test_problem_carry_keeps_impulses_by_key_and_starts_new_blocks_at_zero():
     def step(keys, size):
         return lv.Problem(np.ones(sum(size)), sum_of(size), np.eye(sum(size)), key=np.array(keys))
 
@@ -153,7 +153,7 @@ def test_impulses_are_carried_by_key_and_new_blocks_start_from_nothing():
 
 
 @given(seeds)
-def test_carry_random_keys_equals_an_assignment_by_a_dict(seed):
+def test_problem_carry_of_random_keys_equals_a_dict(seed):
     rng = np.random.default_rng(seed)
     # The highest bits of a key are the type of a block, so that many keys differ in a few high bits only.
     pool = rng.permutation(np.uint64(2) ** rng.integers(0, 64, 60, dtype=np.uint64) + np.arange(60, dtype=np.uint64))

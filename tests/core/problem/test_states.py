@@ -43,7 +43,7 @@ def test_states_margin_of_a_contact_is_the_allowed_change_of_its_impulse(impulse
     assert (state.name, state.margin) == (name, pytest.approx(margin))
 
 
-def test_margin_is_that_of_the_impulse_and_not_of_a_solution():
+def test_states_margin_is_that_of_the_given_impulse():
     problem = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0])
     solution = lv.solve(problem, tol=1e-12)
     assert solution.states.names == ("free", "at a bound")
@@ -59,7 +59,7 @@ def test_states_of_equal_bounds_have_no_margin():
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1e200])
-def test_wild_impulses_have_states(bad):
+def test_states_of_wild_impulses_are_defined(bad):
     problem = lv.Problem.lcp(np.diag(np.full(5, 2.0)) + 0.1, np.ones(5))
     assert len(compute_states(problem, np.full(5, bad)).names) == 5
 

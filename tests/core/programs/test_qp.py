@@ -135,7 +135,7 @@ def test_x_and_multipliers_equal_qpsolvers(backend, seed):
 
 
 @given(seed=seeds)
-def test_sparse_and_dense_matrices_are_the_same_problem(seed):
+def test_from_qp_of_sparse_and_dense_matrices_is_the_same_problem(seed):
     qp = drawn(seed)
     dense = lv.Problem.from_qp(**qp)
     for make in (sp.csc_matrix, sp.csr_array, sp.coo_array, sp.lil_matrix):
@@ -177,7 +177,7 @@ PLACEHOLDERS = [1e4, 1e7, 1e9, 1e12, 1e15, 1e17, 9e19]
 
 @pytest.mark.parametrize("name", lv.available(lv.Problem.from_qp(np.eye(2), np.zeros(2), lb=np.zeros(2))))
 @pytest.mark.parametrize("tol", [1e-6, 1e-9])
-def test_placeholder_bounds_hide_no_equation(name, tol):
+def test_solve_qp_with_placeholder_bounds_fulfils_its_equation(name, tol):
     """(x - 2)^2 + (y - 1)^2 with x + y = 1 is least at (1, 0); (2, 1) was found, or x off by 1.7."""
     for far in PLACEHOLDERS:
         problem = lv.Problem.from_qp(
@@ -191,7 +191,7 @@ def test_placeholder_bounds_hide_no_equation(name, tol):
             assert answer.found, str(answer)
 
 
-def test_multiplier_of_a_far_row_counts_as_zero_in_the_error():
+def test_solve_qp_error_ignores_the_multiplier_of_a_far_row():
     """The gap of 1e-4 of a multiplier of 1e-10 at a bound of 1e6 is a residual, and the point is a solution."""
     problem = lv.Problem.from_qp(2.0 * np.eye(2), [-4.0, -2.0], A=[[1.0, 1.0]], b=[1.0], ub=[1e6, 1e6])
     impulse = lv.solve_qp(problem, "newton", tol=1e-12).impulse.copy()
@@ -216,7 +216,7 @@ def test_solve_qp_violation_hidden_by_cancelling_terms_is_not_found():
     assert answer.found and not off.found and off.error == pytest.approx(0.5, rel=1e-3)
 
 
-def test_gaps_of_rows_with_opposite_signs_do_not_cancel():
+def test_solve_qp_error_adds_gaps_of_opposite_signs():
     problem = lv.Problem.from_qp(np.zeros((2, 2)), [1.0, 1.0], lb=[1.0, 1.0])
     exact = lv.solve_qp(problem, tol=1e-12).impulse
     off = problem.qp.solution(exact + np.array([1e-3, -1e-3, 0.0, 0.0]), 1e-6)
@@ -374,7 +374,7 @@ def test_program_is_singular_from_a_pivot_of_1e_13():
     assert not tiny.has_singular_program
 
 
-def test_singular_programs_are_batched_and_continued():
+def test_solve_many_and_updated_accept_singular_programs():
     many = lv.solve_many([SINGULAR, SINGULAR, lv.Problem.lcp(np.eye(2), [1.0, 1.0])], tol=1e-9)
     assert many.success.all()
     np.testing.assert_array_equal(many[0].impulse, lv.solve(SINGULAR, tol=1e-9).impulse)
@@ -413,7 +413,7 @@ def test_solve_qp_without_forces_is_found_only_if_rows_hold(seed):
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in (1, 2))])
-def test_rows_that_contradict_each_other_among_many_are_proven(seed):
+def test_solve_qp_of_contradicting_rows_among_many_returns_a_proof(seed):
     rng = np.random.default_rng(seed)
     n, conflict = 120, rng.choice(200, 3, replace=False)
     G, x, weight = rng.normal(size=(200, n)), rng.normal(size=n), rng.uniform(0.5, 1.5, 3)

@@ -29,7 +29,7 @@ def test_auto_solves_scaled_copies():
 
 
 @pytest.mark.parametrize("base", [base for base in BASES if base.kind == "x"], ids=lambda base: base.name)
-def test_error_is_the_same_in_all_units(base):
+def test_solve_qp_error_is_the_same_in_all_units(base):
     """All scales are powers of two, so that the numbers of the judge are equal in every bit."""
     wrong = base.x + 1e-3 * np.random.default_rng(0).normal(size=len(base.x))
     errors = set()
@@ -62,7 +62,7 @@ def test_judge_of_programs_accepts_no_wrong_point(arrays, x):
     assert lv.solve_qp(problem, tol=1e-6).found
 
 
-def test_new_vectors_give_the_same_answer_as_a_new_program():
+def test_solve_qp_with_new_vectors_has_the_answer_of_a_new_program():
     base = BY_NAME["rank 3"].arrays
     problem = lv.Problem.from_qp(**base)
     for name in ("auto", *installed("osqp", "daqp")):
@@ -84,7 +84,7 @@ def test_linear_program_without_p_is_solved():
     np.testing.assert_allclose(answer.x, [0.0, 1.0], atol=1e-9)
 
 
-def test_exact_answer_at_tol_zero_is_found_at_once():
+def test_solve_qp_of_an_exact_answer_at_tol_zero_is_found():
     answer = lv.solve_qp(lv.Problem.from_qp(2.0 * np.eye(2), [-2.0, -4.0], ub=[0.5, 9.0]), tol=0.0)
     assert answer.error == 0.0 and answer.found and answer.solution.status is lv.Status.CONVERGED
     assert "ill-conditioned" not in str(answer.solution)

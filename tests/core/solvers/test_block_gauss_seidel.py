@@ -43,7 +43,7 @@ def test_block_gauss_seidel_solves_separate_joints_in_one_sweep(rows, matrix):
     assert found.residual.relative <= 1e-12 + 10.0 * found.residual.roundoff_floor  # a few roundings
 
 
-def test_dependent_rows_of_a_joint_are_solved():
+def test_block_gauss_seidel_solves_dependent_rows_of_a_joint():
     # A redundant row twice in one block, and a block that contradicts itself: the best of it, finite.
     a = np.array([[2.0, 2.0, 0.3], [2.0, 2.0, 0.3], [0.3, 0.3, 1.0]])
     cones = lv.Cones(np.array([0, 3]), np.zeros(1, int), np.full(3, -np.inf), np.full(3, np.inf), [0.0], [0.0])
@@ -55,7 +55,7 @@ def test_dependent_rows_of_a_joint_are_solved():
     assert contradiction.work["fallbacks"] > 0
 
 
-def test_blocks_of_many_rows_are_swept_row_by_row_and_counted():
+def test_block_gauss_seidel_sweeps_blocks_of_many_rows_row_by_row():
     rng = np.random.default_rng(8)
     m = 12
     g = rng.standard_normal((m, 2 * m))

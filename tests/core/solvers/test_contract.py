@@ -104,7 +104,7 @@ def test_claims_about_small_matrices_are_true(name, seed, m):
 
 
 @pytest.mark.parametrize("name", [name for name in OURS if registry.get(name).impulse])
-def test_normal_without_inverse_mass_bears_friction_of_the_relaxed_law(name):
+def test_solver_under_the_cone_law_keeps_friction_of_a_normal_without_inverse_mass(name):
     """The solution has w_n = mu |w_t| > 0 and lambda_n > 0."""
     b, impulse = np.array([-0.5, 2.0, 0.0]), np.array([2.0, 1.0, 0.0])  # The slack is w = (0.5, -1, 0) m/s.
     one = lv.Cones.contacts([0.5])

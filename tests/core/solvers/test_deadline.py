@@ -181,7 +181,7 @@ def test_solve_whose_deadline_passes_at_any_reading_returns_a_judged_impulse(nam
 
 
 @pytest.mark.parametrize("name", ["newton", "pgs", "anderson", "auto"])
-def test_set_up_that_used_up_the_limit_is_not_followed_by_an_iteration(name, clock, monkeypatch):
+def test_solve_with_a_set_up_beyond_the_limit_makes_no_iteration(name, clock, monkeypatch):
     problem, solver = dense(100, "lcp"), registry.get(name).load()
     prepare = solver.prepare
 

@@ -17,7 +17,7 @@ def forms(problem):
 
 @pytest.mark.parametrize("friction", ["coulomb", "cone"])
 @given(seed=seeds, rolling=st.booleans())
-def test_contacts_are_solved_as_newton_solves_them(friction, seed, rolling):
+def test_driver_on_contacts_has_the_bits_of_newton(friction, seed, rolling):
     base = random_contact_problem(seed, friction, rolling=rolling, bodies=5, contacts=6, joints=2)
     for problem in forms(base):
         expected = lv.solve(problem, "newton", tol=1e-9)

@@ -8,7 +8,7 @@ from random_problems import good, random_lcp
 import lavender as lv
 
 
-def test_free_rows_that_depend_on_others_stay_zero():
+def test_lemke_leaves_dependent_free_rows_at_zero():
     g = np.array([[1.0], [1.0], [2.0]])
     problem = lv.Problem.lcp(g @ g.T, [1.0, 1.0, 2.0], [-np.inf, -np.inf, 0.0])
     solution = lv.solve(problem, "lemke", tol=1e-9)
@@ -27,21 +27,21 @@ def equality_program(seed):
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_free_rows_without_a_pivot_of_their_own_take_one_with_a_bounded_row(seed):
+def test_lemke_pivots_a_free_row_together_with_a_bounded_row(seed):
     """The path is then one of a monotone problem, which ends at a solution."""
     solution = lv.solve(equality_program(seed), "lemke", tol=1e-9)
     assert good(solution), solution
     assert solution.work["paths"] == 1
 
 
-def test_another_covering_vector_avoids_the_ray_of_the_first():
+def test_lemke_with_another_covering_vector_avoids_the_first_ray():
     problem = lv.Problem.lcp([[1.0, 1.0], [1.0, -1.0]], [1.0, 1.0])
     solution = lv.solve(problem, "lemke", tol=1e-9)
     assert good(solution), solution
     assert solution.work["paths"] > 1
 
 
-def test_exchanges_from_the_end_of_a_ray_reach_a_solution():
+def test_lemke_exchanges_from_the_end_of_a_ray_reach_a_solution():
     m = [[0.0, 0.0, 10.0, 20.0], [0.0, 0.0, 30.0, 15.0], [10.0, 20.0, 0.0, 0.0], [30.0, 15.0, 0.0, 0.0]]
     solution = lv.solve(lv.Problem.lcp(m, np.ones(4)), "lemke", tol=1e-9)
     assert good(solution), solution

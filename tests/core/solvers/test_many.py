@@ -41,7 +41,7 @@ def assert_same(many, i, single):
 
 
 @pytest.mark.parametrize("again", [copy.copy, copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
-def test_results_of_many_are_copied_and_pickled(again):
+def test_solve_many_results_are_copied_and_pickled(again):
     """Solutions, verdicts and derivatives, of a batch and of a list in which each goes another way."""
     batch = lv.Batch(*worlds(3), cones=DISKS)
     mixed = [batch[0], lv.Problem.contact(np.eye(3), np.ones(3), mu=[(0.5, 0.2)]), batch[1]]
@@ -304,7 +304,7 @@ def test_invalid_world_of_a_batch_is_named_and_others_are_solved(threads):
 
 
 @pytest.mark.parametrize("listed", [False, True])
-def test_start_that_is_not_finite_is_a_fault_of_its_world_only(listed):
+def test_solve_many_with_a_start_that_is_not_finite_fails_in_its_world_only(listed):
     batch = lv.Batch(*worlds(6), cones=DISKS)
     clean = lv.solve_many(batch, tol=1e-8)
     start = clean.impulse.copy()
@@ -328,7 +328,7 @@ def test_start_that_is_not_finite_is_a_fault_of_its_world_only(listed):
     assert again[inside].tobytes() == impulse[inside].tobytes()
 
 
-def test_worlds_are_chosen_as_entries_of_an_array_are():
+def test_solve_many_index_selects_worlds_as_entries_of_an_array():
     batch = lv.Batch(*worlds(5), cones=DISKS)
     many = lv.solve_many(batch)
     found = lv.residual_many(batch, many.impulse)
@@ -348,7 +348,7 @@ def test_worlds_are_chosen_as_entries_of_an_array_are():
 
 
 @pytest.mark.parametrize("listed", [False, True])
-def test_arrays_of_results_cannot_be_written_to(listed):
+def test_solve_many_results_are_read_only(listed):
     """A world is read when it is asked for: what was written over by then would be handed out as its answer."""
     batch = lv.Batch(*worlds(3), cones=DISKS)
     given = list(batch) if listed else batch

@@ -19,7 +19,7 @@ from lavender_ext.newton.solve import Layout, Solve
 
 @pytest.mark.parametrize("friction", [False, True])
 @pytest.mark.parametrize("seed", range(5))
-def test_rows_that_outnumber_velocities_take_an_interior_point_no_longer(seed, friction):
+def test_newton_interior_point_with_more_rows_than_velocities_takes_no_more_steps(seed, friction):
     """Its first point leaves out what H cannot reach: that was a million times the rest, and shifted every cone."""
     rng = np.random.default_rng(seed)
     nv, m = 20, 180
@@ -172,7 +172,7 @@ def sparse_rows(seed, m=500, even=True, near=3):
 
 @pytest.mark.parametrize("even", [True, False])
 @given(seed=seeds)
-def test_free_rows_of_few_entries_are_solved_with_all_the_others(even, seed):
+def test_newton_solves_sparse_free_rows_together_with_all_rows(even, seed):
     problem = sparse_rows(seed, 200, even)
     system = system_in(problem, "sparse")
     h, rng, eps = dense_h(problem), np.random.default_rng(seed), 1e-6

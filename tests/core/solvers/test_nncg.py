@@ -76,7 +76,7 @@ def test_nncg_starts_from_the_answer_of_the_cone_law(name):
 
 
 @pytest.mark.parametrize("memory", [1, 2, 5])
-def test_first_iterations_are_least_squares_over_the_last_sweeps(memory):
+def test_anderson_first_iterations_are_least_squares_over_the_last_sweeps(memory):
     # x <- y - sum gamma_i (y_{i+1} - y_i), gamma from least squares of f = D^1/2 (y - x), written with lstsq.
     rng = np.random.default_rng(3)
     a = rng.standard_normal((8, 12))

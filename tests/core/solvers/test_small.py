@@ -140,7 +140,7 @@ def test_islands_under_friction_are_one_call(friction, form, equal, tol, corners
 
 @pytest.mark.parametrize("law", ["coulomb", "cone"])
 @pytest.mark.parametrize("seed", range(4))
-def test_islands_of_bodies_with_joints(law, seed):
+def test_islands_of_bodies_with_joints_are_one_call(law, seed):
     """Pairs of bodies, each with a joint or none, in no order; with a wrong number in a cut no call would end."""
     rng = np.random.default_rng(seed)
     drawn = random_contact_problem(seed, law, bodies=20, joints=8, contacts=70, tangents=2, spin=False)

@@ -21,7 +21,7 @@ TINY = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0])
 
 
 @pytest.mark.parametrize("name", ["pgs", "auto"])
-def test_another_problem_replaces_the_prepared_one_unless_an_error_is_raised(name):
+def test_prepared_solve_of_another_problem_keeps_it_unless_it_raises(name):
     """Too late for an answer, too: the next solve is of the problem that was given last."""
     other = dataclasses.replace(TINY, b=-2.0 * TINY.b)
     right = [lv.solve(p, name, tol=1e-9).impulse for p in (TINY, other)]

@@ -80,7 +80,7 @@ def test_gauss_seidel_sor_and_jacobi_are_their_formulas(seed):
 
 
 @pytest.mark.parametrize("k", [2, 3, 5])
-def test_coincident_contacts_defeat_undamped_jacobi(k):
+def test_jacobi_without_damping_diverges_on_coincident_contacts(k):
     """k contacts at one place: A is all ones. Unprojected factor k - 1; projected from 0, period 2."""
     a, b = np.ones((k, k)), np.ones(k)
     free = lv.Problem.linear(a, b)
@@ -94,7 +94,7 @@ def test_coincident_contacts_defeat_undamped_jacobi(k):
 
 
 @given(seed=seeds)
-def test_safe_damping_is_below_the_limit_of_convergence(seed):
+def test_jacobi_safe_damping_is_below_the_limit_of_convergence(seed):
     # omega < 2 / L, L the largest eigenvalue of D^-1 A, for symmetric positive semidefinite A.
     problem = random_lcp(seed, m=12)
     scaled = problem.dense() / np.sqrt(np.outer(problem.d, problem.d))

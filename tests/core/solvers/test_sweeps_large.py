@@ -32,7 +32,7 @@ def test_records_of_bodies_written_out_change_no_bit(order, pile, monkeypatch):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_writing_out_keeps_joints_spin_and_warm_starts(seed, monkeypatch):
+def test_written_out_sweeps_keep_joints_spin_and_warm_starts(seed, monkeypatch):
     problem = random_contact_problem(seed, bodies=12, joints=5, contacts=30)
     monkeypatch.setattr("lavender.problem.ordering.MAX_MEAN_BODY_DISTANCE", 0)
     start = sweeps(problem, NAME, 3)
@@ -64,7 +64,7 @@ def test_written_out_sweeps_that_are_unfinished_return_impulses_in_the_given_ord
 
 @pytest.mark.parametrize("name", lv.available(order=True))
 @pytest.mark.parametrize("large", [1, 10**9])
-def test_orders_within_a_colour_have_the_same_bits(name, large, pile, monkeypatch):
+def test_sweeps_with_any_order_within_a_color_have_the_same_bits(name, large, pile, monkeypatch):
     """Blocks of one colour do not read what others of it write: contacts, joints and rows, packed and copied or not."""
     monkeypatch.setattr(layout, "MIN_CONTACTS_FOR_COPY", large)
     rng = np.random.default_rng(5)
@@ -90,7 +90,7 @@ def test_local_takes_a_matrix_too(pile):
 
 
 @pytest.mark.parametrize("order", ("given", *ORDERS, "symmetric", "random"))
-def test_update_of_numbers_keeps_the_structure(order, pile, monkeypatch):
+def test_written_out_sweeps_with_new_numbers_keep_the_structure(order, pile, monkeypatch):
     monkeypatch.setattr("lavender.problem.ordering.MAX_MEAN_BODY_DISTANCE", 0)
     monkeypatch.setattr(layout, "MIN_CONTACTS_FOR_COPY", 1)
     other = replace(pile, b=pile.b * 1.25)

@@ -45,7 +45,7 @@ def simulate(name, rate, seconds, solver="sequential_impulses", **parameters):
 
 @pytest.mark.parametrize("rate", [60, pytest.param(120, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("name", SCENES)
-def test_a_scene_of_the_gallery_keeps_its_energy_and_its_place(name, rate):
+def test_scene_of_the_gallery_at_rest_keeps_its_energy_and_place(name, rate):
     result = simulate(name, rate, 5.0, **SMALLER.get(name, {}))
     assert (result.lost, result.failed) == ("", 0)
     # What the projection lifts: a slop for each body's weight, and a thousandth of what moves in impacts.
@@ -74,7 +74,7 @@ def test_newton_locks_a_redundant_loop_unless_no_projection_moves_its_rows_apart
     assert result.drift > 0.1  # m
 
 
-def test_energy_is_that_of_the_textbook():
+def test_scene_energy_is_that_of_the_textbook():
     # a box of 1 x 2 x 3 m and 12 kg at 5 m, turning by 2 rad/s about its first axis, which looks along y
     scene = lv.Scene(gravity=10.0)
     half = np.sqrt(0.5)

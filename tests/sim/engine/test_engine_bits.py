@@ -112,7 +112,7 @@ def test_simulation_continued_in_any_way_has_the_bits_of_the_run(name, tmp_path)
         assert trajectory(twin, 20) == expected, way
 
 
-def test_substeps_are_steps_of_a_fraction():
+def test_scene_substeps_have_the_bits_of_shorter_steps():
     one = lv.Simulation(lv.Scene("stack", n=3, dt=0.01, substeps=2))
     two = lv.Simulation(lv.Scene("stack", n=3, dt=0.005, substeps=1))
     for _ in range(30):

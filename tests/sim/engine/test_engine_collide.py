@@ -52,7 +52,7 @@ box_numbers = st.tuples(*[st.floats(-1, 1)] * 10, *[st.floats(0.2, 1.5)] * 6)
 
 
 @given(numbers=box_numbers)
-def test_box_box_agrees_with_the_slow_twin(numbers):
+def test_collide_of_two_boxes_agrees_with_the_slow_twin(numbers):
     x = np.array(numbers)
     q = [np.array([1.0, *x[:3]]), np.array([1.0, *x[3:6]])]
     q = [y / np.linalg.norm(y) for y in q]
@@ -193,7 +193,7 @@ def test_broad_phase_pairs_equal_those_of_testing_all(seed, n, spread, decades):
     assert listed == sorted(listed)
 
 
-def test_far_away_bodies_do_not_break_the_grid():
+def test_broad_phase_with_far_away_bodies_finds_all_pairs():
     scene = lv.Scene(gravity=0.0)
     for i in range(40):
         scene.add_sphere(0.5, position=(1e12 * (i % 2), 0.9 * (i // 2), 0))
@@ -222,7 +222,7 @@ def test_jointed_bodies_touch_only_if_enabled():
 # -- cache ------------------------------------------------------------------------------------------
 
 
-def test_shuffled_and_false_keys_do_no_harm():
+def test_warm_start_with_shuffled_or_false_keys_steps_as_without():
     start = after(60, "stack", n=4)
     cold = start.snapshot()
     rng = np.random.default_rng(0)
@@ -270,7 +270,7 @@ def test_warm_start_of_a_contact_whose_key_changes_keeps_its_impulse():
     assert observation["positions"][box, 0] > 0.5
 
 
-def test_impulses_turn_with_the_contact_frame():
+def test_warm_start_impulses_turn_with_the_contact_frame():
     # A box at rest on a slope: the cached friction acts along the slope whatever the tangents are.
     sim = lv.Simulation(lv.Scene("ramp", solver_iterations=64, substeps=1, order="given"))
     for _ in range(60):
@@ -288,7 +288,7 @@ def test_impulses_turn_with_the_contact_frame():
 
 
 @pytest.mark.parametrize(("speed", "expected"), [(5.0, 4), (15.0, 4), (100.0, 0)])
-def test_contact_that_moves_by_at_most_five_margins_in_a_step_keeps_its_warm_start(speed, expected):
+def test_warm_start_of_a_contact_that_moves_by_five_margins_is_kept(speed, expected):
     """Bars that lie crosswise: where their edges cross, contacts move on both by a fraction of `speed` / 240 m."""
     scene = lv.Scene(substeps=1)
     scene.add_box((2.0, 0.4, 0.2), position=(0.0, 0.0, 0.1), static=True)

@@ -81,7 +81,7 @@ def test_sweeps_outside_four_to_sixty_four_raise():
 
 
 @pytest.mark.parametrize("shape", ["sphere", "box"])
-def test_body_slower_than_the_documented_bound_does_not_pass_a_wall(shape):
+def test_scene_body_slower_than_the_documented_bound_does_not_pass_a_wall(shape):
     """The bound on the motion of a substep is half of the body's thickness plus the margin, at any initial distance."""
     h, margin = 1 / 240, 0.01
     passed = {0.3: 0, 0.98: 0, 1.9: 0}  # Fractions of the bound; above 1 nothing is promised, and some pass.

@@ -76,7 +76,7 @@ def problem_in(scene, step, **parameters):
         ("card_house", 1, ONE), ("card_house", 3, ONE), ("table", 3, {"friction": 1.0, **ONE}),
     ],
 )  # fmt: skip
-def test_redundant_contacts_at_rest(scene, step, parameters):
+def test_scene_step_by_newton_of_redundant_contacts_at_rest_is_exact(scene, step, parameters):
     problem = problem_in(scene, step, **parameters)
     assert problem.law == "coulomb"
     solution = lv.solve(problem, "newton", tol=1e-8)
@@ -86,7 +86,7 @@ def test_redundant_contacts_at_rest(scene, step, parameters):
 
 @pytest.mark.parametrize("law", ["coulomb", "cone"])
 @pytest.mark.parametrize(("step", "friction"), [(45, 0.5), (60, 0.1), (99, 0.5)])
-def test_bridge_whose_hinges_nearly_depend_on_each_other(step, friction, law):
+def test_scene_bridge_of_nearly_dependent_hinges_is_solved_by_newton(step, friction, law):
     problem = problem_in("bridge", step, friction=friction, **ONE)
     rows = np.flatnonzero(np.isinf(problem.cones.upper) & np.isinf(problem.cones.lower))
     scale = 1.0 / np.sqrt(problem.d)
@@ -105,7 +105,7 @@ def test_scene_step_by_newton_keeps_the_best_point():
 
 
 @pytest.mark.parametrize(("scene", "parameters"), [("spinner", {}), ("stack", {"n": 1}), ("stack", {"n": 2})])
-def test_few_bodies_whose_factor_is_full_reach_the_tolerance(scene, parameters):
+def test_scene_step_by_newton_with_a_full_factor_reaches_the_tolerance(scene, parameters):
     """The scratch of a substep is allocated before the analysis: it must hold the pattern of a full factor."""
     run = NewtonSteps(scene, warm_start=False, **parameters)
     for _ in range(40):
@@ -114,7 +114,7 @@ def test_few_bodies_whose_factor_is_full_reach_the_tolerance(scene, parameters):
     assert all(run.ended)
 
 
-def test_more_bodies_than_the_first_scratch_serves():
+def test_scene_step_by_newton_with_more_bodies_than_its_first_workspace_runs():
     """1,596 boxes: the pattern of the factor needs more integers than the order, and the plan says how many."""
     steps = NewtonSteps("pyramid", base=56)
     steps.substeps = 1

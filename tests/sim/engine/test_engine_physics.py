@@ -29,7 +29,7 @@ def test_a_projectile_follows_the_integrator_exactly_and_physics_to_first_order(
     assert errors[0] / errors[1] == pytest.approx(2.0, rel=1e-9)
 
 
-def test_two_spheres_bounce_elastically():
+def test_scene_of_two_spheres_bounces_elastically():
     scene = lv.Scene(gravity=0.0, restitution=1.0, friction=0.0)
     scene.add_sphere(0.5, 1.0, position=(-1, 0.1, 0), velocity=(2, 0, 0))
     scene.add_sphere(0.4, 3.0, position=(1, -0.2, 0.3), velocity=(-1, 0.2, 0))
@@ -45,7 +45,7 @@ def test_two_spheres_bounce_elastically():
     np.testing.assert_allclose(sums(observation["velocities"][:, :3]), before, rtol=0, atol=1e-14)
 
 
-def test_restitution_gives_the_wanted_speed_and_slow_contacts_do_not_bounce():
+def test_scene_restitution_gives_its_speed_and_slow_contacts_do_not_bounce():
     for e, threshold, expected in ((0.5, 0.1, 0.5), (0.5, 10.0, 0.0), (1.0, 0.1, 1.0)):
         scene = lv.Scene(restitution=e, gravity=0.0, restitution_threshold=threshold)
         scene.add_plane()
@@ -96,7 +96,7 @@ def test_a_closed_system_keeps_its_momentum(kind):
 
 
 @pytest.mark.parametrize("name", ["chain", "bridge", "four_bar", "newtons_cradle"])
-def test_joints_of_a_scene_stay_closed(name):
+def test_scene_joints_stay_closed(name):
     sim = lv.Simulation(lv.Scene(name, solver_iterations=64))
     worst = 0.0
     for _ in range(600):

@@ -58,7 +58,7 @@ def test_step_has_the_bits_and_residuals_of_solve(name, more):
     assert rows > 0
 
 
-def test_names_keys_and_guess_travel_with_the_problem():
+def test_scene_constraint_problem_has_names_keys_and_guess():
     sim = after(60, "bridge", n=4)
     problem = sim.constraint_problem()
     assert problem.row_name(3) == "hinge 0, axis 3"
@@ -72,7 +72,7 @@ def test_names_keys_and_guess_travel_with_the_problem():
     assert lv.Simulation(lv.Scene("ramp", friction=0)).constraint_problem().cones.n_rows == 4
 
 
-def test_budget_and_mode_take_effect_at_the_next_step():
+def test_scene_iterations_and_warm_start_set_now_act_in_the_next_step():
     sim = lv.Simulation("stack")
     sim.step()
     assert sim.step()[0]["solver"][[0, 1, 3]].tolist() == [16, 1, 24]
@@ -86,7 +86,7 @@ def test_budget_and_mode_take_effect_at_the_next_step():
 # -- snapshots -----------------------------------------------------------------------------------
 
 
-def test_foreign_and_damaged_snapshots_are_refused(tmp_path):
+def test_restore_of_a_foreign_or_damaged_snapshot_raises(tmp_path):
     sim = lv.Simulation(lv.Scene("stack", n=3))
     path = tmp_path / "state"
     sim.save(path)
@@ -136,7 +136,7 @@ def test_foreign_and_damaged_snapshots_are_refused(tmp_path):
 
 @pytest.mark.parametrize("rolling", [0.0, 0.01])
 @pytest.mark.parametrize("name", ["pgs", "block_gauss_seidel", "newton", "nncg", "anderson", "admm"])
-def test_any_registered_solver_steps_the_scene(name, rolling):
+def test_scene_step_by_any_registered_solver_runs(name, rolling):
     sim = lv.Simulation(lv.Scene("stack", n=3, solver=name, solver_iterations=2000, rolling_radius=rolling))
     for _ in range(30):
         observation, *_, info = sim.step()

@@ -295,7 +295,7 @@ def test_limits_of_overhang_and_arch_equal_those_of_a_linear_program(make, limit
     ],
     ids=["overhang 10", "too far 10", "overhang 5, sweeps", "arch", "too thin", "heavy newton", "heavy sweeps"],
 )  # fmt: skip
-def test_structure_stands_exactly_if_statics_allows(scene, stands):
+def test_scene_structure_stands_exactly_if_statics_allows(scene, stands):
     _, x, _, _ = record(scene(), 8.0)
     drop = (x[0] - x[-1])[:, 2].max()
     assert drop < 0.01 if stands else drop > 0.1

@@ -32,7 +32,7 @@ def test_scene_of_one_box_gives_the_documented_observation():
         ("bridge", {"n": 4, "load": 0.0}, 4, 0, 25), ("four_bar", {}, 3, 0, 20), ("four_bar", {"motor": 1.0}, 3, 0, 21),
     ],
 )  # fmt: skip
-def test_sizes_are_those_of_the_docstrings(name, more, bodies, contacts, rows):
+def test_scene_observation_has_the_sizes_of_its_docstrings(name, more, bodies, contacts, rows):
     scene = lv.Scene(name, **more)
     problem = lv.Simulation(scene).constraint_problem()
     assert (scene.n_bodies, problem.rows.n_contacts, problem.m) == (bodies, contacts, rows)
@@ -60,7 +60,7 @@ def test_scene_without_friction_or_spin_allocates_no_rows():
     assert lv.Simulation(scene).state.size[rows] == 1
 
 
-def test_contacts_of_one_scene_may_have_different_rows():
+def test_scene_contacts_have_only_the_rows_of_their_friction():
     scene = lv.Scene(friction=0.0, patch_radius=0.2, substeps=1)
     scene.add_plane(friction=0.5)
     scene.add_sphere(position=(0, 0, 0.5), friction=0.5, velocity=(1, 0, 0), angular_velocity=(0, 0, 3))
@@ -140,7 +140,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("call", "words"), REFUSED)
-def test_bad_parts_and_parameters_are_refused_and_nothing_is_added(call, words):
+def test_scene_with_a_wrong_part_or_parameter_raises_and_adds_nothing(call, words):
     scene = lv.Scene()
     scene.add_sphere(name="ball")
     scene.add_plane()
@@ -178,7 +178,7 @@ def test_step_with_a_lost_state_names_its_body_and_ends_the_simulation(solver, v
 # -- parts --------------------------------------------------------------------------------------------
 
 
-def test_inertia_of_the_shapes():
+def test_scene_shapes_have_their_textbook_inertia():
     scene = lv.Scene()
     scene.add_box((1, 2, 3), 12.0)
     scene.add_sphere(2.0, 5.0)
@@ -186,7 +186,7 @@ def test_inertia_of_the_shapes():
     np.testing.assert_allclose(scene.bodies[1].inertia, np.eye(3) * 8.0, rtol=1e-15)
 
 
-def test_anchors_lie_where_they_were_given():
+def test_scene_joint_anchors_are_at_their_given_places():
     scene = lv.Scene()
     a = scene.add_box(position=(1, 0, 0), quaternion=(1, 1, 0, 0))
     b = scene.add_box(position=(0, 2, 0), quaternion=(0, 1, 2, 3))

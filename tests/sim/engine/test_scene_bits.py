@@ -92,7 +92,7 @@ def test_inverse_and_rotations_are_those_of_linear_algebra():
     )
 
 
-def test_half_turns_have_quaternions():
+def test_quaternion_of_a_half_turn_is_that_of_its_matrix():
     for axis in np.eye(3):
         r = 2.0 * np.outer(axis, axis) - np.eye(3)
         np.testing.assert_array_equal(arithmetic.convert_frame_to_quaternion(r), [0.0, *axis])

@@ -58,7 +58,7 @@ def test_stacks_stand_on_few_sweeps_in_every_order_and_friction(name, seconds, p
     assert drift(name, seconds, **parameters) < MOST
 
 
-def test_stack_in_whole_steps_and_given_order_leaves_its_place():
+def test_scene_stack_in_whole_steps_and_given_order_drifts():
     # Whole steps swept in one direction: the measure above does see a stack that leaves its place.
     assert drift("stack", n=10, solver_iterations=8, substeps=1, order="given") > 10 * MOST
 
@@ -69,7 +69,7 @@ def test_stack_in_whole_steps_and_given_order_leaves_its_place():
         (1 / 60, 4), (1 / 120, 2), (1 / 240, 1), (1 / 50, 5), (1 / 100, 3), (1 / 1000, 1), (1 / 30, 8), (0.1, 24),
     ],
 )  # fmt: skip
-def test_substeps_are_no_longer_than_the_longest(dt, substeps):
+def test_scene_substeps_are_no_longer_than_the_maximum(dt, substeps):
     assert lv.Scene("stack", dt=dt).parameters.substeps == substeps
     assert lv.Scene("stack", dt=dt, max_substep=dt / 3).parameters.substeps == 3
     assert lv.Scene("stack", dt=dt, substeps=7).parameters.substeps == 7
@@ -87,7 +87,7 @@ def test_scene_defaults_follow_other_parameters():
     assert scene.with_parameters(solver="sequential_impulses").parameters.substeps == 8
 
 
-def test_contacts_of_an_alternating_scene_turn_round_every_substep():
+def test_scene_with_alternating_order_reverses_contacts_in_each_substep():
     sim = lv.Simulation(lv.Scene("pyramid", base=3, substeps=1))
     seen = []
     for _ in range(6):
