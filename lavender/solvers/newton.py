@@ -15,6 +15,7 @@
    the solution of the convex law, proximal points of this form follow from there (`lavender_ext/newton/flow.pxd`).
    Otherwise, or if they stall too, a path of smoothed problems (Chen, Mangasarian 1996) is followed, each step by the
    coordinate that changes fastest (Rheinboldt 1986), through folds at which contacts change from stick to slip.
+   Proximal points from the best point follow if that fails, too.
 
 Problems in generalised coordinates are first solved over their velocities (`newton_systems/general.py`), without
 forming A. Unless rows far outnumber velocities, this kernel runs method 4 over a dense A under Coulomb's law, and

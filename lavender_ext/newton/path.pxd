@@ -22,8 +22,7 @@ and its progress is the change of (2) and of the direction of y_t. On the curve 
 (Allgower, Georg 2003): at a large tau, where tau falls, det F_z > 0. So the direction is known at every point, even at
 one that a step has reached by chance.
 
-The ratio c that leads to a solution soon is not known in advance: several are tried in turn, each from the start. The
-compliance eps prevents that redundant contacts share their load as tau^2 / z determines, which no factor can resolve.
+The compliance eps prevents that redundant contacts share their load as tau^2 / z determines, which no factor can resolve.
 
     stage        step                                            event                  next stage
     STARTING     Newton's method at the first tau                on the curve           STEPPING
@@ -105,7 +104,6 @@ cdef enum:                      # outcomes of a correction
     ON_CURVE = 2
 
 cdef enum:
-    N_PATHS = 3                 # ratios c that are tried
     MAX_PATH_FACTORISATIONS = 600   # Budget of one path; most end within 300.
     MAX_START_STEPS = 15        # Newton steps at one first tau.
     MAX_TAU_RAISES = 3          # The first tau is raised up to this often: contacts of towers carry up to some hundred times g.
@@ -121,9 +119,9 @@ cdef enum:                      # coordinates: 4 i + FIRST_COORDINATE is the nor
     COORDINATES_PER_ELEMENT = 4
 
 
-cdef inline double friction_ratio_of(int32_t k) noexcept nogil:
-    """Return c of the k-th path."""
-    return 3.0 if k < 1 else 1.0 if k < 2 else 10.0     # Compilers would turn comparisons by == into a table.
+cdef inline double friction_ratio() noexcept nogil:
+    """Return c, tau of friction over tau of normals."""
+    return 3.0
 
 
 cdef inline double curve_tolerance() noexcept nogil:
@@ -239,7 +237,7 @@ cdef inline void evaluate_smoothed_map(newton_t* n, const double* z, double tau,
         if is_row(e, i):
             evaluate_smoothed_row_map(e, j, z[j], n.slack[j], tau, &own)
         else:
-            evaluate_smoothed_contact_map(e, i, z + j, n.slack + j, tau, n.path.friction_ratio * tau, &own)
+            evaluate_smoothed_contact_map(e, i, z + j, n.slack + j, tau, friction_ratio() * tau, &own)
         for k in range(nr):
             n.f[j + k] = own.f[k]
         if not derived:
@@ -281,7 +279,7 @@ cdef inline double compute_coordinate_rate(const newton_t* n, int32_t which, con
         normal, root = smooth_max(y, tau), sqrt(y * y + 4.0 * tau * tau)
         part += e.part[i] - 1
         size, first, a = e.size[part], e.first[part], e.reach[part]
-        wide = n.path.friction_ratio * tau
+        wide = friction_ratio() * tau
         r, q = a * normal, 0.0
         along = square = 0.0
         for k in range(first, first + size):
@@ -345,8 +343,6 @@ cdef inline void begin_path(newton_t* n) noexcept nogil:
     x.trial_residual = 1e-2
     x.h = first_step_length()
     x.last = n.s.factorisations + MAX_PATH_FACTORISATIONS
-    x.friction_ratio = friction_ratio_of(x.paths)
-    x.paths += 1
     x.stage = x.factors = x.raises = x.n_saved = x.steps_since_return = x.halvings = 0
     if 0.0 < x.size < 1.0 / 0.0:
         push_phase(n, PATH)

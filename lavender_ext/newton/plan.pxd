@@ -21,9 +21,9 @@
                     CONVEX_FLOW               Euler steps from it, if few contacts slide          FIRST_PATH
                     FIRST_PATH                path of smoothed problems, unless joints are rigid  SECOND_DE_SAXCE
                     SECOND_DE_SAXCE           De Saxce's interior point with 0.7 of it            AUGMENTED_DE_SAXCE
-                    AUGMENTED_DE_SAXCE        De Saxce's on the augmented system, if joints are   MORE_PATHS
+                    AUGMENTED_DE_SAXCE        De Saxce's on the augmented system, if joints are   LAST_FLOW
                                               rigid
-                    MORE_PATHS                paths with other ratios of smoothing                COULOMB_DAMPED_NEWTON
+                    LAST_FLOW                 Euler steps from the best point                     COULOMB_DAMPED_NEWTON
                     COULOMB_DAMPED_NEWTON     proximal damped Newton from the best point          COULOMB_END
 
 Problems that need a state; those of weights are tests of tests/suite/test_newton_on_suite.py, the bridge is one of
@@ -33,6 +33,7 @@ tests/sim/engine/test_engine_newton.py:
     THIRD_CONE_WEIGHT    pyramid(k=6, mass_ratio=1e6, friction="coulomb", sliding=0.5) under the cone law, to 1e-8
     AUGMENTED_INTERIOR_POINT, AUGMENTED_DE_SAXCE    Scene("bridge", friction=0.5), step 99, to 1e-8
     FIRST_FLOW           pyramidF(k=14), to 1e-6 within 360 factorisations
+    LAST_FLOW            pyramidF(k=12, mass_ratio=1e6, sliding=2), to 1e-8
 
 A host that has a better point begins Euler steps from it with `continue_from_better_point`.
 
@@ -53,7 +54,7 @@ from lavender_ext.core.start cimport is_zero_impulse
 from lavender_ext.judge.score cimport relative_residual
 from lavender_ext.newton.cones cimport has_lower_bound, has_upper_bound
 from lavender_ext.newton.flow cimport begin_flow, step_flow
-from lavender_ext.newton.path cimport N_PATHS, begin_path, step_path
+from lavender_ext.newton.path cimport begin_path, step_path
 from lavender_ext.newton.active_set cimport begin_active_set, step_active_set
 from lavender_ext.newton.damped_newton cimport (begin_damped_newton, begin_damped_newton_stretches,
                                                 continue_damped_newton_stretches, push_damped_newton, step_damped_newton)
@@ -92,7 +93,7 @@ cdef enum:                      # states of PLAN_COULOMB
     FIRST_PATH = 6
     SECOND_DE_SAXCE = 7
     AUGMENTED_DE_SAXCE = 8
-    MORE_PATHS = 9
+    LAST_FLOW = 9
     COULOMB_DAMPED_NEWTON = 10
     COULOMB_END = 11
 
@@ -110,6 +111,8 @@ cdef enum:
     CONVEX_FLOW_FACTORISATIONS = 300  # Its budget before the paths; piles that it solves take up to 240.
     MIN_FLOW_ROWS = 900         # With fewer rows the paths take few factorisations.
     FLOW_PATIENCE = 60          # Euler steps from a near point end if so many factorisations do not halve the residual.
+    LAST_FLOW_FACTORISATIONS = 1000     # Budget of the last Euler steps; sliding pyramids that they solve take up to 900.
+    LAST_FLOW_PATIENCE = 300    # The last Euler steps end if so many factorisations do not halve the residual.
     FIRST_FLOW_FACTORISATIONS = 200     # Budget of Euler steps; walls and pyramids that they solve take up to 200.
     START_FACTORISATIONS = 8    # First stretch of damped Newton; a start near a solution gains within it.
     FIRST_END_INNER_STEPS = 10
@@ -394,10 +397,8 @@ cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
     elif state == AUGMENTED_DE_SAXCE:
         if n.has_augmented and has_rigid_joints(n):
             begin_augmented_de_saxce(n)
-    elif state == MORE_PATHS:
-        if n.path.paths < N_PATHS:
-            n.stage = MORE_PATHS
-            begin_path(n)
+    elif state == LAST_FLOW:
+        begin_flow(n, n.best_z, LAST_FLOW_FACTORISATIONS, LAST_FLOW_PATIENCE)
     elif state == COULOMB_DAMPED_NEWTON:
         begin_damped_newton(n, n.best_z, COULOMB, start_alpha(), MAX_INNER_STEPS)
         push_damped_newton(n, UNLIMITED)
@@ -446,7 +447,7 @@ cdef inline void start_newton_solve(newton_t* n, const double* lam) noexcept nog
     """Start from lam (rows); problem, system, tol and budget are set."""
     cdef int32_t i
     cdef bint has_cones = n.s.e.n < n.s.e.m
-    n.stop = n.needs_check = n.proven = n.depth = n.path.paths = 0
+    n.stop = n.needs_check = n.proven = n.depth = 0
     n.has_convex_start = n.mostly_slides = 0
     n.flow.has_run = 0
     n.s.augmented = n.s.factorisations = 0

@@ -151,7 +151,6 @@ cdef struct path_t:             # a path of smoothed problems
     double saved_l[2]
     double saved_tl[2]
     double saved_h[2]
-    double friction_ratio       # c: tau of friction over tau of normals
     double size                 # root mean square of g
     double eps                  # compliance
     double start                # first log tau
@@ -170,7 +169,6 @@ cdef struct path_t:             # a path of smoothed problems
     int32_t factors             # factorisations for the present point
     int32_t raises              # number of times that the first tau was raised
     int32_t n_saved
-    int32_t paths               # number of paths begun so far
     int32_t last                # factorisations at which the path ends
 
 

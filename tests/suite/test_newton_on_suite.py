@@ -157,6 +157,13 @@ def test_euler_steps_asymmetric_matrix_is_left_to_other_phases():
         assert ("Euler step" in claim.message) == runs, claim
 
 
+def test_newton_sliding_pyramid_of_unequal_masses_needs_the_last_euler_steps():
+    """Paths with other ratios of smoothing end at 2e-5 after 2,500 factorisations."""
+    problem = lv.suite.case("pyramidF(k=12, sliding=2, mass_ratio=1e6)").problem
+    solution = lv.solve(problem, "newton", tol=1e-8)
+    assert good(solution, 1e-8), solution
+
+
 def test_newton_pyramid_with_slip_needs_euler_steps():
     """Without Euler steps, 360 factorisations end at 9e-6."""
     problem = lv.suite.case("pyramidF(k=14)").problem
