@@ -132,44 +132,6 @@ def clock():
     play_clock(None)
 
 
-@pytest.fixture
-def interrupted_newton(monkeypatch) -> list[float]:
-    """Ctrl-C after newton's fifth turn of one factorisation; the list fills with the best residual after each."""
-    from lavender.solvers import newton
-    from lavender.solvers.newton_systems import general
-
-    looks: list[float] = []
-
-    class Interrupted:
-        """A compiled method whose sixth step is preceded by Ctrl-C."""
-
-        def __init__(self, method):
-            self.method = method
-
-        def __getattr__(self, name):
-            return getattr(self.method, name)
-
-        def step(self, work, impulse):
-            if len(looks) == 5 and not self.is_stopped:
-                self.is_stopped = True
-                raise KeyboardInterrupt
-            end = self.method.step(work, impulse)
-            if not self.is_stopped:
-                looks.append(self.method.relative)
-            return end
-
-        is_stopped = False
-
-    run = general.run_newton_method
-
-    def interrupt(problem, method, *more):
-        return run(problem, Interrupted(method), *more)
-
-    monkeypatch.setattr(newton, "INTERRUPT_CHECK_INTERVAL", 0.0)
-    monkeypatch.setattr(general, "run_newton_method", interrupt)
-    return looks
-
-
 def shipped(name):
     """A module of WebAssembly of these sources, as bytes; built once for each state of the sources."""
     from lavender.base.errors import LavenderError

@@ -104,17 +104,6 @@ def test_a_recorded_scene_is_reported_as_a_sequence(lavender, tmp_path):
     assert lavender("report", "--sequence", folder, "--compare", "nowhere")[0] == 2
 
 
-WORKER = """
-import os, signal, sys
-class Finder:
-    def find_spec(self, name, path=None, target=None):
-        if name == "joblib.hashing":
-            os.killpg(0, signal.SIGINT)
-if "popen_loky" in " ".join(sys.orig_argv):
-    sys.meta_path.insert(0, Finder())
-"""
-
-
 ARM = """<mujoco><option timestep="0.01"/><worldbody><geom type="plane" size="1 1 1"/>
 <body pos="0 0 {height}"><freejoint/><geom type="{kind}" size=".1 .1 .1"/></body></worldbody></mujoco>"""
 

@@ -385,16 +385,6 @@ def test_every_command_writes_files_under_temporary_names_first(tmp_path):
     )
 
 
-# -- names and numbers that commands are given ------------------------------------------------------------------------
-
-WORDS = (
-    ("report", "two_particles", "--workers", "{}"),
-    ("solve", "random_spd(n={})"), ("solve", "two_particles", "--tol", "{}"),
-    ("solve", "two_particles", "--max-iter", "{}"), ("solve", "two_particles", "--time-limit", "{}"),
-    ("check", "two_particles", "--tol", "{}", "--solvers", "pgs"), ("view", "{}"), ("record", "{}", "--out", "{}"),
-)  # fmt: skip
-
-
 def check_command(code, text, statuses=(0, 1, 2, 3)):
     """Require a documented status, with a message if it is 2, no traceback and no code of the terminal."""
     assert code in statuses, text

@@ -199,15 +199,6 @@ def test_a_worker_ends_when_its_parent_is_killed(hostile):
     assert wait_until(lambda: not any(map(runs, pids)))
 
 
-def children(pid):
-    try:
-        with open(f"/proc/{pid}/task/{pid}/children") as f:
-            found = list(map(int, f.read().split()))
-    except FileNotFoundError:
-        return []
-    return [c for child in found for c in (child, *children(child))]
-
-
 def test_report_run_with_harmful_backends_records_each_crash(hostile, watchdog, monkeypatch):
     monkeypatch.setattr("lavender.report.workers.GRACE_TIME", 0.5)
     plan = report.Plan(tolerances=(1e-3,), budgets=(), repeats=1, time_limit=1.0)  # a hundred times what they take

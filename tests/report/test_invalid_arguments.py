@@ -1,4 +1,4 @@
-"""Extreme problems are measured by numbers, and claims about slow ones are confirmed."""
+"""Extreme problems are measured by numbers."""
 
 import hypothesis.strategies as st
 import numpy as np
@@ -7,8 +7,6 @@ from extreme_problems import build_problem, problem_data
 from hypothesis import given, reject
 
 import lavender as lv
-
-# -- extreme numbers ------------------------------------------------------------------------------------------------
 
 MEASURES = ("kinetic", "energy", "speed", "spin", "rows")
 
@@ -33,11 +31,3 @@ def test_motion_errors_and_ranks_of_extreme_problems_are_numbers(data, exponent)
     if problem.m and problem.is_symmetric:
         result = lv.redundancy(problem)
         assert 0 <= result.rank == problem.m - len(result.rows)
-
-
-#: Scenes and their parameters, of which one value each is drawn.
-SCENES = {
-    "stack": {"n": (3, 6, 10)}, "pyramid": {"base": (3, 4)}, "card_house": {"levels": (2, 3)}, "chain": {"n": (5, 20)},
-    "bridge": {"n": (6, 12)}, "heavy_on_light": {"ratio": (1.0, 10.0, 1e3)}, "table": {"legs": (3, 4, 9)},
-    "four_bar": {}, "ramp": {"angle": (0.1, 0.35, 0.6)}, "pile": {"n": (8, 16)},
-}  # fmt: skip

@@ -41,15 +41,6 @@ def test_history_of_a_start_that_is_a_solution_has_one_record():
     assert (history.iterations.tolist(), history.solvers) == ([0], ("start",))
 
 
-def test_prepared_auto_records_a_history_only_if_requested():
-    problem = lv.suite.case("granularF(n=3, sliding=0.5)").problem
-    prepared = lv.prepare(problem)
-    first, second, third = (prepared.solve(history=True), prepared.solve(max_iter=500), prepared.solve(history=True))
-    assert second.history is None
-    assert first.history.iterations.tolist() == third.history.iterations.tolist()
-    assert first.impulse.tobytes() == third.impulse.tobytes()
-
-
 def test_plot_of_auto_history_names_the_solver_of_each_stage():
     history = lv.solve(lv.suite.case("box_stackF(n=10)").problem, history=True).history
     labels = [text.get_text() for text in history.plot().axes[0].get_legend().get_texts()]

@@ -11,9 +11,6 @@ from lavender.solvers.sweeping import SweepSolver
 from lavender.solving.auto import DecisionTree, Newton, Step, estimate_cost
 from lavender.solving.loop import Loop
 
-OWN = [name for name, spec in registry.specs().items() if spec.builtin and not spec.external and name != "auto"]
-
-
 LIMITS = [1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3]  # s
 
 

@@ -74,17 +74,6 @@ def test_redundant_boxes_cold_at_every_mass_ratio(name, form, ratio):
         assert solution.work["factorisations"] <= 30 and solution.solver.form == form
 
 
-@pytest.mark.parametrize(("name", "case"), [("newton", "pyramidF(k=4)"), ("auto", "pyramidF(k=4, mass_ratio=1e3)")])
-def test_ctrl_c_returns_the_best_iterate(name, case, interrupted_newton):
-    """Interrupted after the fifth turn: what was found until then is kept, and `auto` begins nothing more."""
-    looks = interrupted_newton
-    solution = lv.solve(lv.suite.case(case).problem, name, tol=1e-12)
-    assert solution.status is lv.Status.INTERRUPTED
-    assert len(looks) == 5
-    assert min(looks) < 1.0 and solution.residual.energy < solution.residual.energy_at_zero
-    assert solution.residual.relative < 1.0
-
-
 def test_newton_under_the_cone_law_continues_where_the_first_interior_point_stops():
     problem = suite.pyramid(k=30, friction="coulomb").problem.relaxed("cone")
     solution = lv.solve(problem, "newton", tol=1e-9)

@@ -1,6 +1,5 @@
 """Solvers on problems of structures drawn by lot (`random_families`)."""
 
-import numpy as np
 import pytest
 from calls import check
 from random_problems import as_matrix, good
@@ -22,17 +21,6 @@ def test_admm_under_a_short_limit_forms_no_matrix():
     assert prepared.solve(time_limit=1e-4).status is lv.Status.TIME_LIMIT
     after, whole = prepared.solve(max_iter=5), lv.solve(problem, "admm", max_iter=5)
     assert after.work == whole.work and after.impulse.tobytes() == whole.impulse.tobytes()
-
-
-def test_solve_with_an_infeasible_island_has_a_certificate_of_the_whole():
-    a = np.zeros((4, 4))
-    a[:2, :2] = [[1.0, -1.0], [-1.0, 1.0]]  # y = (1, 1): A^T y = 0, b.y = 2
-    a[2:, 2:] = [[2.0, 0.5], [0.1, 2.0]]
-    small = lv.Problem.lcp(a, [1.0, 1.0, -1.0, 3.0], 0.0, [np.inf, np.inf, 1.0, 1.0])
-    large = wild(seed=141, rows=600).problem  # 360 asymmetric rows in many islands
-    for problem in (small, large):
-        solution = lv.solve(problem, tol=1e-6)
-        assert solution.status is lv.Status.INFEASIBLE and solution.claim_check == "confirmed"
 
 
 # Few rows on which exchanges or Newton's method alone do not end: asymmetric, with joints, symmetric, nearly singular,

@@ -112,26 +112,6 @@ def test_process_forked_during_a_solve_solves_the_same_problem():
     python("-W", "ignore::DeprecationWarning", "-c", script)
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="forks are of POSIX")
-def test_forked_process_has_threads_of_its_own():
-    """Two calls of `work` that wait for each other: a child's is not left to a thread that it has not."""
-    script = """if True:
-        import os, threading
-        from lavender.base.threads import run_on_threads
-
-        def both():
-            each = threading.Barrier(2, timeout=20.0)
-            return len(run_on_threads(lambda stop: each.wait(), 2))
-
-        assert both() == 2
-        child = os.fork()
-        if not child:
-            os._exit(both() != 2)
-        status = os.waitpid(child, 0)[1]
-        assert status == 0, status"""
-    python("-W", "ignore::DeprecationWarning", "-c", script)
-
-
 def test_an_error_of_one_thread_stops_the_others():
     """This one waits for the error of the other, and is told to begin nothing more."""
     both, told = threading.Barrier(2, timeout=10.0), []

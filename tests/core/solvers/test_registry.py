@@ -2,10 +2,8 @@
 
 import copy
 import dataclasses
-import importlib.metadata
 import pickle
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -142,18 +140,3 @@ def test_register_of_a_name_twice_raises_without_replace(register):
     assert lv.get("mine").summary == "another"
     with pytest.raises(lv.InputError, match="SolverSpec"):
         lv.register("mine")
-
-
-class Entry:
-    """An entry point as importlib.metadata gives them."""
-
-    value = "package:SPEC"
-    dist = SimpleNamespace(name="package")
-    pattern = importlib.metadata.EntryPoint.pattern
-
-    def __init__(self, name, load):
-        self.name, self.load = name, load
-
-
-def raises():
-    raise RuntimeError("needs a licence")

@@ -7,17 +7,10 @@ import pytest
 from calls import SHORT, check, facts
 from hypothesis import given
 from hypothesis import strategies as st
-from random_problems import (
-    as_matrix,
-    random_contact_problem,
-    random_generalized_problem,
-    random_lcp,
-    seeds,
-    side_by_side,
-)
+from random_problems import as_matrix, random_contact_problem, random_generalized_problem, random_lcp, seeds
 
 import lavender as lv
-from benchmarks.core_problems import forms, fresh, stacks
+from benchmarks.core_problems import forms, stacks
 from lavender import registry
 
 
@@ -188,35 +181,3 @@ def test_compiled_call_on_an_island_at_rest_returns_zero():
     found = check(problem.updated(b=b), "auto", impulse=start)
     assert found.success and found.residual.relative <= found.tol
     assert not found.impulse[:12].any()
-
-
-def wide_factor():
-    """The factor has 239 entries in a row, ten times the initial workspace."""
-    rng = np.random.default_rng(0)
-    jac, velocity = rng.normal(size=(300, 240)), rng.normal(size=240)
-    return lv.Problem.from_jacobian(jac, np.eye(240), velocity, cones=lv.Cones.free(300), compliance=300.0)
-
-
-ATTEMPTED = {
-    "few rows": lambda: draw("matrix coulomb", 3),
-    "few rows that the call does not solve": lambda: lv.Problem.lcp([[0.0, 1.0], [-1.0, 0.0]], [1.0, 1.0]),
-    "J and M, more rows": lambda: random_generalized_problem(1, "cone", n=40, compliance=True, contacts=40),
-    "J and M, rigid": lambda: random_generalized_problem(1, "coulomb", n=60, compliance=False, contacts=50),
-    "islands": lambda: forms(stacks(40, 2, 0.4, False, 1))["bodies"],
-    "islands that the call does not solve": lambda: side_by_side(
-        [
-            forms(stacks(40, 2, 0.4, False, corners=1))["matrix"].relaxed("cone"),
-            lv.Problem(np.array([1.0, -1.0]), lv.Cones.free(2), np.ones((2, 2)), friction="cone"),
-        ]
-    ),
-    "a matrix": lambda: random_lcp(0, m=80),
-    "velocities that all meet": wide_factor,
-}
-
-
-@pytest.mark.parametrize("name", ATTEMPTED)
-def test_compiled_call_within_a_limit_that_does_not_bind_has_the_same_bits(name):
-    problem = ATTEMPTED[name]()
-    without, within = lv.solve(fresh(problem)), lv.solve(fresh(problem), time_limit=60.0)
-    assert without.success or without.certificate is not None
-    assert without.impulse.tobytes() == within.impulse.tobytes() and without.work == within.work

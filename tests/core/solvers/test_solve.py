@@ -127,15 +127,3 @@ def test_problems_that_differ_in_b_share_memory_of_the_operator_and_free_each_ot
         seen.append(weakref.ref(prepared.problem))
     gc.collect()
     assert [ref() is not None for ref in seen] == [False] * 4 + [True]
-
-
-@pytest.mark.parametrize("tol", [1e-6, np.float64(1e-6)])
-def test_solve_of_default_arguments_has_the_bits_of_other_calls(tol):
-    for problem in (
-        lv.Problem.from_jacobian(np.eye(3), np.eye(3), -np.ones(3), mu=0.5, friction="cone", compliance=0.01),
-        lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, 0.5]),
-        lv.Problem.lcp([[0.0, 1.0], [-1.0, 0.0]], [1.0, 1.0]),  # The compiled call does not solve it.
-    ):
-        own, other = lv.solve(problem), lv.solve(problem, tol=tol, time_limit=60.0)
-        assert own.impulse.tobytes() == other.impulse.tobytes()
-        assert (own.status, own.work, own.message) == (other.status, other.work, other.message)

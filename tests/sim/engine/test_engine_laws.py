@@ -53,9 +53,6 @@ def test_thrown_bodies_gain_no_energy_and_do_not_pass_through_the_ground(seed):
     assert seen["positions"][1:, 2].min() > 0.05
 
 
-SMALL = {"pyramid": {"base": 4}, "pile": {"n": 20}, "chain": {"n": 8}, "bridge": {"n": 6}}
-
-
 @pytest.mark.parametrize("name", ["card_house", "bridge", "chain"])
 def test_motion_has_the_same_bits_for_every_unit_of_mass(name):
     """Units of mass are powers of four, whose square roots are exact."""
