@@ -320,3 +320,47 @@ def test_newton_of_cones_takes_as_many_steps_for_large_friction_as_for_small(for
             problem = FORMS[form](replace(bodies, cones=replace(bodies.cones, mu=mu)))
             solution = lv.solve(problem, "newton", tol=1e-9)
             assert solution.success and solution.iterations <= 30, f"{seed}, {power}: {solution}"
+
+
+@pytest.mark.parametrize("form", ["rows", "matrix"])
+@pytest.mark.parametrize("kind", ["disks", "spin", "rolling", "rolling and spin", "ellipses"])
+def test_newton_of_cones_takes_as_many_steps_for_every_kind_of_contact(kind, form):
+    """Up to 27 steps; contacts with several components have several cones."""
+    for seed in range(6):
+        problem = FORMS[form](add_compliance(CONTACTS[kind](seed, "cone"), 0.001))
+        solution = lv.solve(problem, "newton", tol=1e-9)
+        assert solution.success and solution.iterations <= 30, f"{seed}: {solution}"
+
+
+@pytest.mark.parametrize("form", ["rows", "matrix"])
+def test_newton_of_cones_takes_as_many_steps_for_upper_limits_as_for_lower_ones(form):
+    for seed in range(8, 16):
+        bodies = add_compliance(CONTACTS["disks"](seed, "cone", joints=8), 0.001)
+        cones, is_joint = bodies.cones, ~bodies.cones.contact_rows
+        steps = []
+        for sign in (1.0, -1.0):
+            low, high = (-np.inf, 0.01 * (1 + seed)) if sign > 0.0 else (-0.01 * (1 + seed), np.inf)
+            limits = {
+                "lower": np.where(is_joint, low, cones.lower), "upper": np.where(is_joint, high, cones.upper)
+            }  # fmt: skip
+            turned = {"rows": replace(bodies.rows, jac=sign * bodies.rows.jac), "cones": replace(cones, **limits)}
+            problem = replace(bodies, b=np.where(is_joint, sign, 1.0) * bodies.b, **turned)
+            steps.append(lv.solve(FORMS[form](problem), "newton", tol=1e-9).iterations)
+        assert abs(steps[0] - steps[1]) <= 3, f"{seed}: {steps}"
+
+
+@pytest.mark.parametrize("compliance", [0.0, 1e-3, 0.3])
+def test_newton_solves_a_chain_of_joints_directly_from_a_warm_start(compliance):
+    n = 8
+    builder = lv.RowBuilder(
+        np.ones(n), [0.4 * np.eye(3)] * n, np.tile([0.0, 0.0, -0.1, 0.02, 0.01, 0.0], (n, 1)), 0.01,
+        position=[(i + 0.5, 0.0, 0.0) for i in range(n)],
+    )  # fmt: skip
+    for i in range(n):
+        builder.ball(i - 1, i, (float(i), 0.0, 0.0))
+    problem = builder.problem()
+    problem = replace(problem, compliance=np.full(problem.m, compliance))
+    exact = np.linalg.solve(problem.dense(), problem.b)
+    solution = lv.solve(replace(problem, guess=0.9 * exact + 1e-3), "newton", tol=1e-9)
+    assert (solution.message, solution.work) == ("joints solved directly", {"factorisations": 1})
+    np.testing.assert_allclose(solution.impulse, exact, rtol=1e-9)
