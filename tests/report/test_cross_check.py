@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from calls import says
-from random_problems import random_contact_problem, spd
+from random_problems import random_contact_problem, random_lcp, spd
 
 import lavender as lv
 from lavender import registry, suite
@@ -291,3 +291,17 @@ def test_known_lists_every_solver_and_available_those_without_a_reason():
     assert set(known) == set(registry.specs())
     assert [name for name, reason in known.items() if reason is None] == lv.available(TINY)
     assert all(reason for reason in known.values() if reason is not None)
+
+
+def test_cross_check_of_answers_at_their_floor_reports_no_breach():
+    for seed in range(8):
+        for problem in (lv.Problem.lcp(*spd(8, seed=seed)), random_lcp(seed), random_lcp(seed, rank=6)):
+            check = lv.cross_check(problem, ["newton", "direct", "pgs"], reference="newton", tol=1e-15)
+            assert check.contradicted == (), str(check)
+
+
+def test_cross_check_reference_may_take_more_than_its_usual_iterations():
+    n = 100
+    problem = lv.Problem.lcp(2.005 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1), np.ones(n))
+    check = lv.cross_check(problem, ["newton"], reference="pgs")
+    assert check.reference == "pgs" and not lv.solve(problem, "pgs", tol=1e-9).success

@@ -230,3 +230,11 @@ def test_tables_of_200_cases_of_which_few_are_solved_are_complete():
     assert len(report.sections["runs"].frames[0]) == 400
     assert report.sections["runs"].frames[0]["to 1e-3 [s]"].notna().sum() == 6
     assert len(report.sections["failures"].frames[0]) == 394
+
+
+def test_tabulate_in_time_counts_a_case_that_a_solver_did_not_end_in_time_as_unsolved():
+    made = [record("a", "half", 1e-3, 1e-9), record("b", "half", 1.0, 1e-9)]
+    made += [record(case, "both", 1e-3, 1e-2, tol=1e-3) for case in "ab"]
+    report = Report(lines_of(*made), times=(1e-2, 10.0))
+    [row] = tables.tabulate_in_time(report).to_dict("records")
+    assert [x for name, x in row.items() if name.startswith("in ")] == ["both", "half"]

@@ -76,5 +76,5 @@ def test_states_are_copied_and_pickled():
 def test_state_of_a_block_that_does_not_exist_raises_and_states_the_number_of_blocks(block):
     states = lv.solve(lv.Problem.lcp(np.eye(3), [1.0, -1.0, 2.0])).states
     assert states.names == ("free", "at a bound", "free") and states[-1].name == "free"
-    with pytest.raises((IndexError, lv.InputError), match="there are 3 blocks|block is -1"):
+    with pytest.raises((IndexError, lv.InputError), match=r"there are 3 blocks|block is -1"):
         states[block]
