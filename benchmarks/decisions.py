@@ -49,8 +49,8 @@ def count_work(name: str, factor: float) -> dict[str, float]:
     from lavender.base.deadline import Deadline
     from lavender.judge.residuals import get_zero_impulse_reference
     from lavender.problem import Problem
-    from lavender.solving.auto import DecisionTree
     from lavender.solving.compiled_call import choose_call_deadline
+    from lavender.solving.stages import DecisionTree
 
     def pile(n: int) -> Problem:
         return lv.suite.granular(n=n, friction="coulomb").problem

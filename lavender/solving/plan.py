@@ -15,8 +15,8 @@ from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.problem import Problem
 from lavender.solvers.registry import get
 from lavender.solvers.small import describe_small_call
-from lavender.solving.auto import DecisionTree, Stage
 from lavender.solving.singular_programs import program_backends
+from lavender.solving.stages import DecisionTree, Stage
 
 MAX_EXPLAINED_STAGES = 6  # Largest number of stages that are listed before the alternation with doubled work.
 

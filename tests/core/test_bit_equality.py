@@ -27,8 +27,9 @@ from lavender import registry
 from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.solvers.newton_systems import general
 from lavender.solvers.pivoting import PivotState
-from lavender.solving.auto import DecisionTree, create_solver_step
+from lavender.solving.auto import create_solver_step
 from lavender.solving.log import SolveLog
+from lavender.solving.stages import DecisionTree
 from lavender_ext.core.method import OUTCOMES
 from lavender_ext.pivot.lemke import Lemke
 

@@ -8,8 +8,9 @@ import lavender as lv
 from benchmarks.core_problems import fresh
 from lavender import registry, suite
 from lavender.solvers.sweeping import SweepSolver
-from lavender.solving.auto import DecisionTree, Newton, Step, estimate_cost
 from lavender.solving.loop import Loop
+from lavender.solving.stages import DecisionTree
+from lavender.solving.steps import Newton, Step, estimate_cost
 
 LIMITS = [1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3]  # s
 

@@ -14,7 +14,8 @@ import lavender as lv
 from benchmarks.random_families import drawn, wild
 from lavender import registry, suite
 from lavender.solvers import costs, decisions
-from lavender.solving.auto import METHODS, DecisionTree, Stage, starts_relaxed
+from lavender.solving.stages import DecisionTree, Stage
+from lavender.solving.steps import METHODS, starts_relaxed
 
 
 @pytest.fixture(autouse=True)
@@ -65,7 +66,7 @@ def test_explain_reaches_each_branch_of_auto(name):
     stages = lv.explain(problem).stages
     assert [stage.solver for stage in stages[: len(expected)]] == expected
     assert all(stage.why and stage.iterations > 0.0 and stage.cost > 0.0 for stage in stages)
-    methods = {METHODS[stage.solver][0] for stage in stages if stage.solver != "certificate"}
+    methods = {METHODS[stage.solver] for stage in stages if stage.solver != "certificate"}
     assert [name for name in methods if registry.get(name).refuses(problem)] == []
     found = lv.prepare(make(), "auto").solve(tol=1e-6)
     assert found.success

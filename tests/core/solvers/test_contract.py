@@ -18,7 +18,7 @@ from lavender import contract, registry
 from lavender.base.errors import TooLarge
 from lavender.problem import operators
 from lavender.solvers import decisions
-from lavender.solving import auto
+from lavender.solving import steps
 
 OURS = lv.available(external=False)
 #: Backends that must solve every problem that they accept; others may fail if the result reports it.
@@ -191,7 +191,7 @@ def test_auto_continues_with_other_solvers_after_an_exception(limit, error, monk
 
     problem = random_contact_problem(3, contacts=60, bodies=20, friction="coulomb")
     assert problem.m > decisions.SMALL_ROWS
-    kinds = {auto.Newton, auto.Step, auto.Iterations, auto.Sweeps}
+    kinds = {steps.Newton, steps.Step, steps.Iterations, steps.Sweeps}
     for broken in [{kind} for kind in kinds] + [kinds]:
         for kind in broken:
             monkeypatch.setattr(kind, "advance", breaks)

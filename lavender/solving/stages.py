@@ -1,0 +1,318 @@
+"""Stages of `auto` for a problem, from estimated costs; `auto.py` has the rule, `decisions.py` its numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import count, islice
+from math import inf, nan
+from typing import Any
+
+import numpy as np
+
+from lavender.base.deadline import NEVER, Deadline, format_seconds
+from lavender.base.errors import BREAKDOWN
+from lavender.problem import Problem
+from lavender.problem.derived import cached_property
+from lavender.solvers.costs import RATES, estimate_first_factor_cost, estimate_formation_cost, get_loose_limit
+from lavender.solvers.decisions import DECISIONS
+from lavender.solvers.newton import NewtonState
+from lavender.solvers.registry import get
+from lavender.solving.log import get_relaxation
+from lavender.solving.steps import Newton, RelaxedNewton, Step, estimate_cost, starts_relaxed
+
+RELAXED_BUDGET_RATIO = 2.0  # The relaxation may take this multiple of the expected number of factorisations.
+# On large problems with friction, `admm` may cost this fraction of Newton's method before that runs, up to the largest
+# number of iterations, if it pays for the smallest. Without a factor, an iteration costs about as much as three sweeps.
+ADMM_FRACTION, SWEEPS_PER_ADMM_ITERATION = 0.4, 3.0
+MIN_ADMM_ITERATIONS, MAX_ADMM_ITERATIONS = 150.0, 600.0
+MAX_TRIALS = 2  # `admm` continues from the relaxation while this number of turns is predicted to suffice.
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage of the tree."""
+
+    solver: str  # Name in `METHODS`, or "certificate".
+    iterations: float  # Largest number of iterations.
+    cost: float  # [ns] Estimated cost of these iterations.
+    why: str  # Reason, for `lavender.explain`.
+    least: float = inf  # Sweeps stop if they predict that more than this number of sweeps is still needed.
+    # Position among the stages after which only islands that are not solved continue; 0 for other stages.
+    position: int = 0
+
+
+class DecisionTree:
+    """The stages of `auto` for a problem, as an iterable, and the costs that it compares [ns].
+
+    `log.best` is the smallest relative residual so far; without a log, no stage runs. Stages before `first_stage` have
+    run on a problem with more islands.
+    """
+
+    compiled_call_failed = False  # Whether the compiled call over velocities of J and M has failed.
+    started_from_zero = False  # Whether that call started from the zero impulse.
+    remaining_cost = 0.0  # [ns] Cost that the alternation may still use.
+    sweeps_failed = False  # Whether sweeps did not improve the residual in the alternation.
+
+    def __init__(
+        self, problem: Problem, deadline: Deadline = NEVER, log: Any = None, first_stage: int = 1
+    ) -> None:
+        self.problem, self.law, self.deadline, self.log = problem, problem.law, deadline, log
+        self.first_stage = first_stage
+        self.sweep = estimate_cost("anderson", problem).iteration  # [ns] Cost of one sweep.
+        self.first = DECISIONS.first_sweeps * self.sweep  # [ns] Cost of the first sweeps.
+        # [ns] Lower bound of the cost of Newton's method, without its analysis.
+        self.min_newton_cost = estimate_cost("newton", problem).total
+
+    @property
+    def best(self) -> float:
+        """Smallest relative residual so far; NaN if no stage runs."""
+        return nan if self.log is None else float(self.log.best)
+
+    def skip(self, stage: Stage) -> None:
+        """Return the cost of a stage that does not run to the alternation."""
+        self.remaining_cost += stage.cost
+
+    @cached_property
+    def relaxed_sweep(self) -> float:
+        """Cost of one sweep over the convex relaxation [ns]."""
+        return estimate_cost("anderson", get_relaxation(self.problem)).iteration
+
+    @cached_property
+    def newton_state(self) -> NewtonState | None:
+        """Newton's method after its analysis; None if it refuses the problem, fails or would end after the deadline."""
+        if get("newton").refuses(self.problem) is not None or self.is_late:
+            return None
+        try:
+            state: NewtonState = get("newton").load()().prepare(self.problem)
+        except BREAKDOWN:
+            return None
+        return state
+
+    @property
+    def solver_costs(self) -> dict[str, float]:
+        """Estimated costs [ns] of the factorising solvers, the cheapest first; a failed `newton` comes last."""
+        found = {} if self.newton_state is None else {"newton": self.newton_state.cost}
+        if self.can_pivot:
+            found["direct"] = self.direct
+        failed = "newton" if self.compiled_call_failed else ""
+        return dict(sorted(found.items(), key=lambda item: (item[0] == failed, item[1])))
+
+    @cached_property
+    def can_pivot(self) -> bool:
+        """Whether `direct` is considered: for bounded rows, or linear ones of bodies, if A is given or cheap."""
+        if self.law == "linear" and self.problem.rows is not None:
+            max_cost = self.min_newton_cost
+        elif self.law == "lcp":
+            max_cost = self.first
+        else:
+            return False
+        return self.formation <= max_cost and self.deadline.fits(self.formation / DECISIONS.time_share)
+
+    @cached_property
+    def formation(self) -> float:
+        """Cost to form A from bodies or from J and M [ns], whether or not A is cached."""
+        return estimate_formation_cost(self.problem, self.problem.matrix is not None)
+
+    @cached_property
+    def direct(self) -> float:
+        """Cost of `direct` on bounded rows [ns], including the cost to form A."""
+        return self.formation + estimate_cost("direct", self.problem).total
+
+    @property
+    def newton(self) -> float:
+        """Cost of the cheapest factorising solver [ns]; inf if none is possible."""
+        return min(self.solver_costs.values(), default=inf)
+
+    @property
+    def unit(self) -> float:
+        """Cost [ns] of the cheapest factorising solver, or of the first sweeps if there is none."""
+        return self.newton if self.newton < inf else self.first
+
+    @property
+    def is_late(self) -> bool:
+        """Whether no factorising solver can return a result before the deadline."""
+        return not self.has_time_for_newton()
+
+    def has_time_for_newton(self, before: float = 0.0) -> bool:
+        """Return whether the least cost of Newton's method fits after `before` [ns]."""
+        needed = before + 2.0 * get_loose_limit(self.problem)
+        if self.problem.generalized is None and self.deadline.fits(needed):
+            return True  # The least cost of bodies and matrices is below the loose limit.
+        return self.has_time("newton", self.min_newton_cost, before)
+
+    def has_time(self, name: str, cost: float, before: float = 0.0) -> bool:
+        """Return whether a factorising solver of this cost [ns] ends in time if it starts after `before` [ns]."""
+        if not self.deadline.is_set:
+            return True
+        needed = before + cost
+        if name == "newton" and "newton_state" in vars(self):
+            return self.deadline.fits(needed)
+        return self.deadline.fits(get_loose_limit(self.problem) + needed) or self.deadline.fits(
+            estimate_cost(name, self.problem).setup + needed
+        )
+
+    def has_time_to_factorise_after(self, steps: dict[str, Step], cost: float) -> bool:
+        """Return whether work of this cost [ns] leaves time for a factorising solver, or all of them have ended."""
+        if "newton_state" not in vars(self):
+            return self.has_time_for_newton(cost)
+        step = steps.get("newton")
+        if self.newton_state is None or step is None or not step.over:
+            return self.newton_state is not None and self.has_time("newton", self.newton, cost)
+        return not step.late
+
+    def leaves_time(self, stage: Stage, step: Step) -> bool:
+        """Return whether a stage of any solver but sweeps can end before the deadline."""
+        if isinstance(step, RelaxedNewton):
+            return self.has_time("newton", stage.cost)
+        if isinstance(step, Newton):
+            return self.newton_state is not None and self.has_time("newton", self.newton_state.cost)
+        if step.name == "direct":
+            return self.has_time("direct", self.direct if self.can_pivot else stage.cost)
+        if step.state is not None:
+            return True
+        return self.deadline.fits(estimate_cost(stage.solver, self.problem).setup / DECISIONS.time_share)
+
+    @cached_property
+    def factorises_first(self) -> bool:
+        """Whether a factorising solver costs less than the first sweeps, or sweeps do not accept the problem.
+
+        The cost to factor a sparse A depends on its fill-in, which only an analysis computes. Before the first sweeps,
+        therefore, only the costs of `direct` and of Newton's method over bodies or velocities are compared.
+        """
+        p = self.problem
+        if self.law == "linear" or p.cones.has_round or (self.can_pivot and self.direct < self.first):
+            return True
+        # Started at the same point as a failed compiled call, Newton's method would stall again.
+        if self.compiled_call_failed or p.matrix is not None:
+            return False
+        return self.min_newton_cost < self.first and self.newton < self.first
+
+    def __iter__(self) -> Iterator[Stage]:
+        """Yield the stages in order. The caller runs a stage only if the stages before it did not solve the problem."""
+        p, ratio, first = self.problem, DECISIONS.budget_ratio, self.first
+        if p.matrix is not None and self.law == "linear":
+            yield Stage("direct", inf, self.min_newton_cost, "linear, a matrix")
+        relaxed = starts_relaxed(p)
+        if relaxed:
+            yield from self.iterate_relaxed_stages()
+        max_cost = self.min_newton_cost if self.law == "linear" else first
+        pivots_first = self.factorises_first and self.can_pivot and self.direct < max_cost
+        if pivots_first:
+            n = ratio * DECISIONS.pivot_factorisations
+            yield Stage("direct", n, ratio * self.direct, "a narrow band: before any analysis")
+        elif not (relaxed or self.factorises_first):
+            yield self.sweeps(first, "the first sweeps, before any analysis")
+        if not relaxed and not self.factorises_first and first < self.newton < inf:
+            why = f"up to {format_seconds(1e-9 * self.newton)}, as much as {next(iter(self.solver_costs))} costs"
+            yield self.sweeps(self.newton - first, why, self.newton)
+        if p.generalized is not None and not np.all(p.compliance):
+            yield from islice(self.iterate_factorising_stages(0.25 * ratio), 1)
+            # The certificate's smallest violation is computed over velocities.
+            cost = self.newton if self.newton_state is None else self.newton_state.cost
+            yield Stage("certificate", 1.0, cost, "whether the least violation proves that there is none")
+        if relaxed:
+            yield from self.iterate_alternating_stages()
+            return
+        for stage in self.iterate_factorising_stages(ratio):
+            if not (pivots_first and stage.solver == "direct"):  # It has had this budget.
+                yield stage
+        if self.law == "coulomb" and p.generalized is None and ratio * self.unit >= RATES["linear program"]:
+            yield Stage("certificate", 1.0, RATES["linear program"], "whether a linear program proves it")
+        yield from self.iterate_alternating_stages()
+
+    def iterate_relaxed_stages(self) -> Iterator[Stage]:
+        """Yield the first stages of a large problem with friction, unless they have run on a larger problem."""
+        if self.first_stage <= 1:
+            cost = self.min_newton_cost
+            least = cost / self.relaxed_sweep
+            yield Stage("anderson", inf, cost, "before any analysis", least=least, position=1)
+        state = self.newton_state
+        if state is None:
+            return
+        cost = ADMM_FRACTION * state.cost
+        iterations = min(cost / (SWEEPS_PER_ADMM_ITERATION * self.relaxed_sweep), MAX_ADMM_ITERATIONS)
+        runs_admm = iterations >= MIN_ADMM_ITERATIONS
+        if self.first_stage <= 2:
+            why = f"up to {format_seconds(1e-9 * state.cost)}, as much as newton costs"
+            least = state.cost / self.relaxed_sweep
+            if runs_admm:
+                least = min(least, SWEEPS_PER_ADMM_ITERATION * iterations)
+            yield Stage("anderson", inf, state.cost, why, least=least, position=2)
+        if self.first_stage <= 3 and runs_admm:
+            why = f"up to {ADMM_FRACTION:g} times newton's cost"
+            yield Stage("admm from zero", iterations, cost, why, position=3)
+        if self.first_stage <= 4:
+            n, why = RELAXED_BUDGET_RATIO * state.steps, "exact if no contact slips"
+            yield Stage("newton on the relaxation", n, state.cost, why, position=4)
+        if self.log is None or self.log.relaxed is not None:
+            n, why = DECISIONS.trial_iterations, "from the relaxation, while it is predicted to end soon"
+            yield from self.repeat_while_converging(Stage("admm", n, n * self.relaxed_sweep, why), MAX_TRIALS)
+
+    def iterate_factorising_stages(self, times: float) -> Iterator[Stage]:
+        """Yield stages of the factorising solvers; each may cost `times` the estimated cost of the cheapest of them."""
+        budget = times * self.newton
+        for name, cost in self.solver_costs.items():
+            if cost <= budget:
+                why = f"{times:.3g} times its estimated cost of {format_seconds(1e-9 * cost)}"
+                yield self.factorisation(name, times * cost, why)
+
+    def iterate_alternating_stages(self) -> Iterator[Stage]:
+        """Yield all solvers in rounds with doubled work, until no solver improves the residual in two rounds."""
+        self.remaining_cost = DECISIONS.total_ratio * self.unit
+        times = DECISIONS.budget_ratio
+        if starts_relaxed(self.problem):
+            times = DECISIONS.turn_factorisations / DECISIONS.factorisations
+        for k in count():
+            before = self.best
+            for stage in self.iterate_one_round(times * 2.0**k):
+                if self.remaining_cost < 1.0:  # Less than 1 ns remains.
+                    return
+                fraction = min(1.0, self.remaining_cost / stage.cost)
+                self.remaining_cost -= fraction * stage.cost
+                yield replace(stage, iterations=fraction * stage.iterations, cost=fraction * stage.cost)
+            if k > 0 and self.best >= before:
+                return
+
+    def iterate_one_round(self, times: float) -> Iterator[Stage]:
+        """Yield one round, in which each solver may cost `times` the cheapest factorising solver."""
+        p, cost, setup = self.problem, times * self.unit, 0.0
+        why = f"in turn, {times:.3g} times the cheapest factorising solver's cost"
+        if starts_relaxed(p):
+            yield from (self.factorisation(name, cost, why) for name in self.solver_costs)
+            # An iteration costs as much as a sweep under the cone law.
+            n = ADMM_FRACTION * cost / self.relaxed_sweep
+            yield from self.repeat_while_converging(Stage("admm", n, ADMM_FRACTION * cost, why))
+            return
+        n = 0.5 * cost / self.sweep  # An iteration of `admm` costs as much as two sweeps.
+        if p.generalized is not None:
+            # `admm` forms and factors A of J and M. Its set-up cost does not depend on cached data.
+            setup = estimate_formation_cost(p, False)
+            setup += estimate_first_factor_cost(p.m, float(p.metric.entries_of_matrix))
+        yield from (self.factorisation(name, cost, why) for name in self.solver_costs)
+        if setup <= cost:
+            yield from self.repeat_while_converging(Stage("admm", n, cost, why))
+        if not self.sweeps_failed and not p.cones.has_round:
+            before = self.best
+            yield self.sweeps(cost, why)
+            self.sweeps_failed = self.best >= before
+
+    def repeat_while_converging(self, stage: Stage, max_more: int = 1) -> Iterator[Stage]:
+        """Yield a stage, on large problems with friction repeatedly: while `max_more` of the same gain reach tol."""
+        is_converging = True
+        while is_converging:
+            before = self.best
+            yield stage
+            gains = starts_relaxed(self.problem) and self.best < before
+            is_converging = gains and self.best * (self.best / before) ** max_more <= self.log.tol
+
+    def factorisation(self, name: str, cost: float, why: str) -> Stage:
+        """Return the stage of a factorising solver with the budget `cost` [ns]."""
+        steps = DECISIONS.pivot_factorisations
+        if name == "newton" and self.newton_state is not None:
+            steps = self.newton_state.steps
+        return Stage(name, cost / self.solver_costs[name] * steps, cost, why)
+
+    def sweeps(self, cost: float, why: str, max_remaining: float = inf) -> Stage:
+        """Return a stage of sweeps that may cost `cost` [ns]; it ends if more than `max_remaining` is predicted."""
+        return Stage("anderson", cost / self.sweep, cost, why, max_remaining / self.sweep)

@@ -1,0 +1,353 @@
+"""Steps of `auto`: solvers that run in turns, each of which continues from its last turn."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from math import inf
+from typing import Any
+
+import numpy as np
+
+from lavender.base.arrays import FloatArray
+from lavender.base.deadline import Deadline
+from lavender.base.errors import BREAKDOWN, format_error
+from lavender.judge.solution import Claim, Status, sum_work_counts
+from lavender.problem import Problem
+from lavender.solvers._accelerated import build_state_in_given_form
+from lavender.solvers.costs import Cost, estimate_formation_cost, get_loose_limit
+from lavender.solvers.decisions import DECISIONS
+from lavender.solvers.direct import SufficientDirect
+from lavender.solvers.newton import WARM_START_MAX_RESIDUAL
+from lavender.solvers.newton_systems.systems import find_bodies
+from lavender.solvers.registry import get
+from lavender.solving.log import SolveLog, get_relaxation
+from lavender.solving.loop import Loop
+from lavender_ext.judge.measure import all_finite, residuals_by_island
+
+MAX_CALL_ITERATIONS = 2**30  # Largest number of iterations in one call.
+SOLVED_RELAXATION_RATIO = (
+    1e-5  # The relaxation is solved if its residual is below this multiple of Coulomb's.
+)
+MIN_PREDICTED_RESIDUAL = (
+    1e-16  # Predictions of remaining sweeps replace a smaller tol by this relative residual.
+)
+FIRST_SWEEPS_OF_LARGE_PROBLEM = (
+    8  # Sweeps of `is_large` problems before the first prediction of how many remain.
+)
+FIRST_RELAXED_FACTORISATIONS = (
+    6  # Interior points on the relaxation need at least this number of factorisations.
+)
+RELAXED_TOLERANCE = (
+    0.01  # The relaxation is solved to this multiple of tol, because Coulomb's residual is larger.
+)
+FORMATION_COST_RATIO = 4.0  # Sweeps use a formed A only if this multiple of the cost to form it remains.
+#: Solver of each step, by its name. On large piles, `admm` needs fewer iterations from zero than from sweeps.
+METHODS = {
+    "anderson": "anderson", "newton": "newton", "direct": "direct", "admm": "admm", "admm from zero": "admm",
+    "newton on the relaxation": "newton",
+}  # fmt: skip
+
+
+def make_solver(name: str, problem: Problem) -> Any:
+    """Create the solver of a step."""
+    if name == "direct" and problem.law == "linear":
+        return SufficientDirect()  # `auto` needs no refinement of a solution that meets tol.
+    # Solve blocks exactly under the cone law, and for a matrix: rows of a contact may differ in unit.
+    exact = problem.law == "cone" or (problem.law == "coulomb" and problem.matrix is not None)
+    spec = get(METHODS[name])
+    return spec.load()(**({"sweep": "blocks"} if exact and "sweep" in spec.options else {}))
+
+
+def estimate_cost(name: str, problem: Problem) -> Cost:
+    """Estimate the costs of the solver of a step."""
+    cost: Cost = make_solver(name, problem).cost(problem)
+    return cost
+
+
+def starts_relaxed(problem: Problem) -> bool:
+    """Return whether `auto` solves the convex relaxation first: under Coulomb's law, if the problem is large.
+
+    Of J and M, this requires that the velocities belong to free bodies. Over the rows of a sparse A, Newton's method on
+    Coulomb's law takes fewer steps than on the relaxation.
+    """
+    large = problem.law == "coulomb" and problem.m >= DECISIONS.relaxed_rows
+    if not large or problem.cones.has_round or not problem.is_symmetric:
+        return False
+    return problem.generalized is None or find_bodies(problem) is not None
+
+
+class Step:
+    """A solver that runs on the problem of a log in turns, each of which continues where the last one stopped.
+
+    `over` is true if the step cannot continue, `late` if it has no time to continue. The step stops if it predicts that
+    more than `least` iterations are still needed.
+    """
+
+    over = late = False
+    least = inf
+    state: Any = None
+    impulse: FloatArray  # Present iterate (m,) [N s].
+
+    def __init__(self, name: str, log: SolveLog) -> None:
+        self.name, self.log = name, log
+        self.solver = make_solver(name, log.problem)
+
+    def run(self, n: float) -> None:
+        """Run at most n iterations and record the stage in the log."""
+        log, before = self.log, self.log.best
+        try:
+            claim = self.advance(int(min(max(n, 1.0), log.remaining_iterations, MAX_CALL_ITERATIONS)))
+            self.record_history(claim)
+        except BREAKDOWN as error:
+            log.failure, self.over = format_error(error), True
+            claim = Claim(Status.NUMERICAL_ERROR, 0)
+        self.over = self.over or claim.status is not Status.MAX_ITERATIONS
+        self.late = claim.status is Status.TIME_LIMIT
+        log.timed_out = log.timed_out or self.late
+        log.record_stage(self.name, claim, before)
+
+    def advance(self, n: int) -> Claim:
+        """Run at most n iterations and offer the result to the log."""
+        log = self.log
+        if self.state is None:
+            self.state, self.impulse = self.solver.prepare(log.problem), log.impulse.copy()
+        claim: Claim = self.solver.run(self.state, self.impulse, n, log.tol, log.time_left)
+        self.store_iterate_in_log(claim.judged)
+        return claim
+
+    def record_history(self, claim: Claim) -> None:
+        """Record the iterate at the end of a stage, if a history is requested."""
+        log = self.log
+        if log.recorder is not None:
+            log.recorder.record_impulse(self.name, log.iterations + claim.iterations, self.impulse)
+
+    def store_iterate_in_log(self, judged: Any = None) -> None:
+        """Offer the iterate, and the judge's pass over it if there is one, to the log if it is finite."""
+        if all_finite(self.impulse):
+            self.log.judge_and_store_best(self.impulse, judged=judged)
+
+
+class Newton(Step):
+    """Newton's method with the state that the tree has analysed.
+
+    It starts from the best impulse. If it stalls after a start that is not the zero impulse, it starts once more from
+    zero, unless the compiled call has started from zero. If it stalls over velocities again, it continues from the best
+    impulse over bodies or over the rows of A.
+    """
+
+    started_from_zero = is_second_start = has_stalled = False
+    best = inf  # Smallest residual of all stages when this step ended.
+
+    def run(self, n: float) -> None:
+        """Run at most n iterations, with a second start from zero and over rows of A if the method stalls."""
+        log, end = self.log, self.log.iterations + n
+        super().run(n)
+        if self.has_stalled and not self.started_from_zero and not log.done():
+            self.started_from_zero = self.is_second_start = True
+            self.over = self.state.begun = False
+            super().run(end - log.iterations)
+        if self.has_stalled and self.state.general is not None and not log.done():
+            continuation = self.solver.prepare_continuation(self.state)
+            if continuation is not None:
+                # As in Newton's method by name, a bad start is replaced by the zero impulse.
+                self.state, self.is_second_start = continuation, not log.best <= WARM_START_MAX_RESIDUAL
+                self.over = False
+                super().run(end - log.iterations)
+
+    def advance(self, n: int) -> Claim:
+        """Run about n iterations; choose the start at the first call."""
+        log = self.log
+        if not self.state.begun:
+            self.impulse = log.problem.start() if self.is_second_start else log.impulse.copy()
+            self.started_from_zero = self.started_from_zero or not (self.impulse - log.problem.start()).any()
+        elif log.best < self.best and starts_relaxed(log.problem) and self.state.system is not None:
+            self.state.system.solve.continue_from_better_point(log.impulse, n)
+        claim = self.solver.advance(
+            self.state, self.impulse, n, log.tol, log.time_left, log.remaining_iterations
+        )
+        self.has_stalled = claim.status is Status.STALLED
+        self.store_iterate_in_log(claim.judged)
+        self.best = log.best
+        return claim
+
+
+class RelaxedNewton(Step):
+    """Interior points on the convex relaxation, judged under Coulomb's law. They stop if contacts slip."""
+
+    like: Any = None  # `NewtonState` of the problem; its elimination order is reused.
+
+    def advance(self, n: int) -> Claim:
+        """Run at most n factorisations, and compare both laws after each from the first possible end on."""
+        log = self.log
+        if self.state is None:
+            self.state = self.solver.update(self.like, get_relaxation(log.problem))
+            self.impulse = log.problem.start()
+        system, trial = self.state.system, self.impulse.copy()
+        claim, done = Claim(Status.MAX_ITERATIONS, 0), 0
+        work: dict[str, int] = {}
+        count, slips = min(n, FIRST_RELAXED_FACTORISATIONS) if system is not None else n, False
+        while done < n and claim.status is Status.MAX_ITERATIONS:
+            claim = self.solver.advance(
+                self.state, self.impulse, count, RELAXED_TOLERANCE * log.tol, log.time_left, n - done
+            )
+            done, work, count = done + claim.iterations, sum_work_counts((work, claim.work)), 1
+            self.store_iterate_in_log()
+            if claim.status is not Status.MAX_ITERATIONS or system is None:
+                break
+            system.solve.write_interior_impulse(trial)
+            log.judge_and_store_best(trial)
+            ratio, residual = log.compare_with_relaxation(trial)
+            slips = slips or ratio < DECISIONS.slip_ratio
+            if log.best <= log.tol or (slips and residual > DECISIONS.trial_residual):
+                break
+            if ratio < SOLVED_RELAXATION_RATIO:
+                log.relaxed = trial
+                break
+        return replace(claim, iterations=done, work=work)
+
+
+class Iterations(Step):
+    """A resumable solver, which runs in chunks between checks of the clock and Ctrl-C."""
+
+    time_fraction = 1.0  # Fraction of the remaining time that a stage may use.
+    restarts = False  # Whether a stage starts from the best impulse if another solver has found a better one.
+
+    def __init__(self, name: str, log: SolveLog) -> None:
+        super().__init__(name, log)
+        self.restarts = name == "admm" and starts_relaxed(log.problem)
+
+    def advance(self, n: int) -> Claim:
+        """Run at most n iterations and offer the last and the best iterate to the log."""
+        log, left = self.log, self.log.deadline.get_remaining_seconds()
+        if self.state is None or (self.restarts and log.best < self.state.best[0]):
+            self.prepare_and_set_start()
+        deadline = None
+        if left is not None:
+            deadline = log.deadline if self.time_fraction == 1.0 else Deadline(self.time_fraction * left)
+        loop = Loop(
+            problem=log.problem, solver=self.solver, state=self.state, impulse=self.impulse, tol=log.tol,
+            deadline=deadline, records=None if log.recorder is None else [],
+        )  # fmt: skip
+        begun = 0.0 if log.recorder is None else log.recorder.time
+        claim = self.run_loop(loop, n)
+        if log.recorder is not None:
+            log.recorder.append_loop_records(self.name, log.iterations, begun, loop)
+        self.store_iterate_in_log()
+        if log.best > log.tol:
+            best, impulse = self.state.best  # pyright: ignore[reportOptionalMemberAccess]
+            if impulse is not None and best < log.best:
+                log.judge_and_store_best(impulse)
+        return claim
+
+    def record_history(self, claim: Claim) -> None:
+        """Do nothing: the loop has made the records."""
+
+    def prepare_and_set_start(self) -> None:
+        """Prepare the solver and start from the best impulse of the log, zero, or the relaxation's solution."""
+        log, start = self.log, self.log.impulse
+        if self.name == "admm from zero":
+            start = log.problem._start
+        elif self.name == "admm" and self.state is None and log.relaxed is not None:
+            start = log.relaxed
+        self.state, self.impulse = self.solver.prepare(self.log.problem), start.copy()
+
+    def run_loop(self, loop: Loop, n: int) -> Claim:
+        """Run at most n iterations."""
+        return loop.run_chunks(n)
+
+
+class Sweeps(Iterations):
+    """Sweeps that stop if more than `least` remaining sweeps are predicted.
+
+    With a time limit, they use a part of the remaining time, or all of it in `sweep_until_deadline`.
+    """
+
+    time_fraction = DECISIONS.time_share
+    predicted = 0.0  # Predicted number of sweeps that are still needed, from the last checks.
+    n_islands = 0  # Number of islands; 0 if it is not known.
+
+    def __init__(self, name: str, log: SolveLog) -> None:
+        super().__init__(name, log)
+        self.is_large = starts_relaxed(log.problem)
+
+    def advance(self, n: int) -> Claim:
+        """Run at most n sweeps, offer the result to the log, and predict how many remain."""
+        before = self.log.best
+        claim = super().advance(n)
+        self.predict(claim.iterations, before, self.log.best)
+        return claim
+
+    def predict(self, sweeps: int, before: float, now: float) -> None:
+        """Predict the number of remaining sweeps from the last ones and the residuals before and after them."""
+        tol = max(self.log.tol, MIN_PREDICTED_RESIDUAL)
+        if now > tol:
+            gain = math.log(before / now) if now < before else 0.0
+            self.predicted = sweeps * math.log(now / tol) / gain if gain > 0.0 else inf
+
+    def prepare_and_set_start(self) -> None:
+        """Prepare the sweeps; start from the best impulse."""
+        p, deadline = self.log.problem, self.log.deadline
+        too_late = not deadline.fits(get_loose_limit(p)) and not deadline.fits(
+            FORMATION_COST_RATIO * estimate_formation_cost(p)
+        )
+        self.state = build_state_in_given_form(self.solver, p) if too_late else self.solver.prepare(p)
+        self.impulse = self.log.impulse.copy()
+
+    def run_loop(self, loop: Loop, n: int) -> Claim:
+        """Run at most n sweeps; predict how many remain at intervals."""
+        first = FIRST_SWEEPS_OF_LARGE_PROBLEM if self.is_large else int(DECISIONS.first_sweeps)
+        growth = 1.0 if self.is_large else 0.5
+        done, due, tol = self.state.watch.total, 0, max(self.log.tol, MIN_PREDICTED_RESIDUAL)
+        if self.time_fraction == 1.0:  # Checks would cost as much as the first sweeps: run these without.
+            loop.tol = 0.0
+            claim = loop.run_chunks(min(n, first))
+            if claim.status is not Status.MAX_ITERATIONS:
+                return claim
+            loop.tol = self.log.tol
+        now = self.log.best
+        while True:
+            step = n - due
+            if self.least < inf:
+                step = min(step, max(int(growth * (done + due)), 1 if done else first))
+            due += step
+            claim = loop.run_chunks(due)
+            if claim.status is Status.TIME_LIMIT and self.time_fraction < 1.0:
+                return replace(claim, status=Status.MAX_ITERATIONS)
+            if claim.status is not Status.MAX_ITERATIONS or due == n:
+                return claim
+            before, now = now, self.measure_progress()
+            if self.has_solved_half():
+                return claim
+            self.predicted = inf
+            self.predict(step, before, now)
+            if now <= tol or self.is_hopeless(self.least):
+                return claim
+
+    def is_hopeless(self, max_remaining: float) -> bool:
+        """Return whether more than `max_remaining` sweeps are predicted; large problems first make some of these."""
+        done = 0.0 if self.state is None else self.state.watch.total
+        is_early = self.is_large and done < DECISIONS.sweep_fraction * max_remaining
+        return self.predicted > max_remaining and not is_early
+
+    def measure_progress(self) -> float:
+        """Return the smallest relative residual so far."""
+        if self.is_large:
+            return float(self.state.best[0])  # Sweeps of large problems take as long as a pass of the judge.
+        self.store_iterate_in_log()
+        return self.log.best
+
+    def has_solved_half(self) -> bool:
+        """Return whether at least half of the blocks of a large problem belong to solved islands."""
+        if not self.is_large or self.n_islands == 1:
+            return False
+        island_of_block, table = residuals_by_island(self.log.problem.metric, self.impulse)
+        self.n_islands = len(table)
+        return float(np.mean(table[island_of_block, 0] <= self.log.tol)) >= 0.5
+
+
+#: Class of the step of each solver; the other solvers have `Iterations`.
+STEP_CLASSES = {
+    "anderson": Sweeps, "direct": Step, "newton": Newton,
+    "newton on the relaxation": RelaxedNewton,
+}  # fmt: skip
