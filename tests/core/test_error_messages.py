@@ -5,6 +5,7 @@ import json
 import pickle
 from dataclasses import fields
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ ROWS, ONE = random_bodies_and_contacts(np.random.default_rng(0)), sp.coo_array(n
 GENERAL = random_generalized_problem(9, "cone")
 PLANE, SPACE, TENSORS = np.zeros((2, 3)), np.zeros((2, 6)), np.tile(I3, (2, 1, 1))
 contacts, bounded = lv.Cones.contacts, lv.Cones.bounded
+QP = ("P", "q", "G", "h", "A", "b", "lb", "ub")
 SWAPPED = "so the two seem to be swapped: the order is inv_mass, inv_inertia, velocity, dt, position"
 
 
@@ -88,6 +90,13 @@ ERRORS = {
         (lambda: contacts(np.array([-0.1])), r"mu must not be negative; entry \[0\]"),
         (lambda: contacts(np.array([0.5]), patch_radius=np.array([-1.0])), "patch_radius must not be negative"),
         (lambda: contacts(np.array([0.5]), tangents=6), "tangents"),
+        (lambda: contacts(0.5, patch_radius=0.1).shaped("box"), "a box cannot bound spin or rolling"),
+        (lambda: contacts(0.5, shape="box", patch_radius=0.1), "a box has up to two tangents"),
+        (lambda: contacts(0.5, tangents=3, patch_radius=0.1), "which includes spin: leave patch_radius out"),
+        (lambda: contacts(0.5, tangents=1, rolling=0.1), "rolling needs tangents=2"),
+        (lambda: contacts(np.ones((2, 3))), r"\(k, 2\), one for each tangent"),
+        (lambda: contacts([[0.5, 0.0]]), "give shape='box' for a tangent without friction"),
+        (lambda: lv.Cones([0, 3], [lv.CONTACT_ELLIPSE], [0.0] * 3, [1.0] * 3, [0.5], [1e-20]), "1e-18 to 1e18"),
         # findex
         (lambda: findex([0, -1, -1], [INF, 1, 1], [-1, 1, 0]), "its own row"),
         (lambda: findex([0, -1, -1], [INF, 1, 1], [-1, 0, 1]), "its own findex is 0"),
@@ -123,6 +132,18 @@ ERRORS = {
         (lambda: GENERAL.updated(b=GENERAL.b, target=0.0), "give one of the two"),
         (lambda: as_matrix(GENERAL).updated(v_free=GENERAL.generalized.v_free, target=0.0), "generalised coordinates"),
         (lambda: GENERAL.updated(J=GENERAL.generalized.jac[:, 1:], target=0.0), "J has shape"),
+        *((partial(lv.Problem, np.ones(2), lv.Cones.free(2), **given), words) for given, words in (
+            ({"generalized": 3}, "a Generalized is needed"), ({"rows": 3}, "a Rows is needed"),
+            ({"generalized": GENERAL.generalized}, "J has .* rows; 2 are needed, as the cones have"),
+            ({"rows": ROWS}, "a block of bounded rows for each joint is needed"))),
+        # Batches
+        (lambda: lv.Batch(np.ones((1, 4, 4)), np.eye(4)[None], np.ones((1, 4)), cones=contacts(0.5, 3)), "round cone"),
+        (lambda: lv.Batch(np.ones((4, 2)), np.array([I2, I2]), np.ones((2, 2)), row_ptr=[0, 2, 4],
+                          cones=lv.Cones.free(1) + contacts(0.5)), "do not begin and end with the 2 rows of world 0"),
+        *((partial(lv.Batch, np.ones((2, 2, 2)), mass, np.ones((2, 2)), cones=contacts(0.5, 1)), words)
+          for mass, words in (((np.ones((2, 2)), [0, 1]), "three are needed"),
+                              ((np.ones((2, 2)), [1, 0], [0, 1, 2]), "do not describe a lower triangle"),
+                              ((np.ones((2, 3)), [0, 1], [0, 1, 2]), r"values of M have shape \(2, 3\)"))),
         # Problems and rows
         (lambda: lv.Problem.lcp(sp.csr_array([[1.0, 0.0], [2.0, INF]]), [1, 1]), r"entry \[1, 1\] is inf"),
         (lambda: lv.Problem.lcp(shortened(), [1, 1]), "A is not a valid compressed matrix"),
@@ -163,6 +184,15 @@ ERRORS = {
             ({"mu": [0.7] * 3}, "J has 6 rows and mu 3 values.*tangents=1"),
             ({"mu": [0.7] * 4}, "J has 6 rows, which is not a multiple of the 4 values of mu"), ({"mu": -0.7}, "mu"))),
         (lambda: BUILDER.velocity_after(BUILT, FOUND), r"give its \.impulse"),
+        (lambda: BUILDER.velocity_after(LCP, B), r"the result of RowBuilder\.problem\(\) is needed"),
+        (lambda: BUILDER.rows_of(3), "a key that a method of this builder returned"),
+        *((partial(two().contact, a, b, (0.0, 0.0), (0.0, 1.0)), words) for a, b, words in (
+            (0, 0, "a and b are both body 0"), (-1, None, "a and b are both the static world"))),
+        (lambda: two().contact(0, 1, (0.0, 0.0), (0.0, 1.0), name=3), "name is 3; a text is needed"),
+        (lambda: [builder.contact(0, 1, (0.0, 0.0), (0.0, 1.0), feature=2) for builder in [two()] * 2],
+         "feature is 2, which another contact of body 0 and body 1 already has"),
+        (lambda: two().contacts([(0, 1)] * 2, PLANE[:, :2], np.tile([0.0, 1.0], (2, 1)), feature=[2, 2]),
+         "contact 1: an earlier one of the same bodies has its feature|which another contact"),
         (lambda: BUILDER.problem("pyramid"), "a separate bound for each tangent is a shape"),
         (lambda: lv.solve(BUILDER), r"is a RowBuilder; .* give the result of its \.problem\(\)"),
         *((partial(lv.RowBuilder, [1.0, 1.0], inertia, velocity, 0.01, position), rf"^position \[m\] has shape {words}")
@@ -202,7 +232,16 @@ ERRORS = {
             (lambda: two_rows(jac=(1.0, 1e61)), "J"), (lambda: two_rows(v_free=(0.0, -1e61)), "v_free"),
             (lambda: lv.solve(two_rows(jac=(1.0, 1e40), target=[1.0, 1.0])), "A_ii"),
             (lambda: late_batch(1e40)[1].d, "A_ii"), (lambda: LCP.updated(b=[1.0, 1e61]), "b"))),
+        (lambda: compute_block_order(BUILT, "bottom_up", ground=[0]), "ground= is given for a problem with rows"),
+        (lambda: lv.Problem.from_qp(SimpleNamespace(**dict.fromkeys(QP, None)), [1.0, 1.0]), "give it alone"),
+        (lambda: lv.Problem.from_qp(I2, [1, 1], G=I2, h=[1.0, -INF]), r"h is -inf at \[1\], which no x satisfies"),
+        (lambda: lv.solve_qp(None), "P and q are missing; q is needed"),
         # Derivatives
+        (lambda: derivative().vjp(), "no cotangent of the solution is given"),
+        (lambda: derivative().jvp(), "no change of the data is given"),
+        (lambda: derivative().jvp(speed=B), "'speed' is not among the data of this problem"),
+        (lambda: derivative(P).jvp(M=np.triu(np.ones(P.generalized.mass.shape))), "the change of M must be symmetric"),
+        (lambda: derivative().vjp(impulse=np.ones(3)).full("b"), "'b' is not a matrix with a pattern"),
         (lambda: lv.derivative(CONTACT, 0.99 * lv.solve(CONTACT, tol=1e-12).impulse),
          r"relative residual is 1\.\d\de-02.*needs at most 1e-08, or the round-off floor.*solve with tol"),
         (lambda: lv.derivative(CONTACT.updated(b=[9.0, 6.0, 0.0]), lv.solve(CONTACT, tol=1e-12)),
@@ -227,6 +266,7 @@ ERRORS = {
         (lambda: derivative().vjp(impulse=np.ones(3)).J, "J exists only for problems given as rows or generalized"),
     ],
     AttributeError: [
+        (lambda: delattr(GENERAL.generalized, "v_free"), "immutable"),
         (lambda: setattr(GENERAL.generalized, "v_free", np.ones(2)), "immutable"),
         (lambda: derivative().vjp(impulse=np.ones(3)).weight, "a gradient has no 'weight'"),
         (lambda: lv.derivatives([P], [ANSWER]).vjp(impulse=[np.ones(P.m)]).M,

@@ -250,7 +250,8 @@ META = {"operator": "dense", "friction": "coulomb", "name": "", "names": None}
         ({"lavender_format": np.int64(2)}, "this lavender reads 1"),
         ({"lavender_format": np.array([1, 1])}, "one value"),
         ({"A": None, "cones_mu": None}, "entries cones_mu, A are missing"), ({"extra": np.zeros(1)}, "do not belong"),
-        *(({"meta": np.frombuffer(text, np.uint8)}, "JSON") for text in (b"{", b"\xff\xfe", b"[" * 100_000)),
+        *(({"meta": np.frombuffer(text, np.uint8)}, "JSON") for text in (b"{", b"[]", b"\xff\xfe", b"[" * 100_000)),
+        ({"meta": {k: x for k, x in META.items() if k != "names"}}, "entry 'meta' has no 'names'"),
         *(({"meta": META | change}, words) for change, words in (
             ({"operator": "magic"}, "operator is 'magic'"), ({"names": "abc"}, "names is 'abc'"),
             ({"names": [1]}, "a list of names, or null"), ({"more": 1}, "unknown names more"),
