@@ -24,18 +24,6 @@ def mark_slow(names):
 
 
 @pytest.mark.parametrize("name", mark_slow(BACKENDS))
-def test_program_without_a_solution_is_no_success(name):
-    P, rows = np.diag([1.0, 0.0]), np.ones((2, 2))
-    programs = (
-        lv.Problem.from_qp(np.eye(2), np.zeros(2), A=rows, b=[1.0, 2.0]),
-        lv.Problem.from_qp(P, [0.0, -1.0], lb=[0.0, 0.0], ub=[np.inf, np.inf]),
-    )
-    for problem in programs:
-        if registry.get(name).refuses(problem) is None:
-            assert not lv.solve(problem, name).success
-
-
-@pytest.mark.parametrize("name", mark_slow(BACKENDS))
 def test_backend_multipliers_of_active_bounds_are_not_zero(name):
     """pyqpmad returns zeros for multipliers of bounds."""
     problem = lv.Problem.from_qp([[2.0, 0.5], [0.5, 1.0]], [0.0, 1.0], lb=[1.0, -2.0], ub=[1.0, 2.0])

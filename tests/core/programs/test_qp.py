@@ -239,37 +239,6 @@ def test_solve_qp_within_the_tolerance_of_the_program_has_converged(plug_in):
 # -- what has no solution --------------------------------------------------------------------------
 
 
-def contradicting(seed, kind):
-    """A program whose rows contradict each other: of A, of G, of both, or of G and the box."""
-    rng, n = np.random.default_rng(seed), 4
-    root, A, G = rng.normal(size=(n, n)), rng.normal(size=(3, n)), rng.normal(size=(5, n))
-    b, h, q = rng.normal(size=3), rng.normal(size=5), rng.normal(size=n)
-    rows = {
-        "A": {"A": np.vstack([A, A[0] + A[1]]), "b": [*b, b[0] + b[1] + 1.0]},
-        "G": {"G": np.vstack([G, -G[0]]), "h": [*h, -h[0] - 1.0]},
-        "G and A": {"A": A[:2], "b": b[:2], "G": [-A[0] - A[1]], "h": [-b[0] - b[1] - 1.0]},
-        "box": {"G": -np.ones((1, n)), "h": [-100.0], "lb": np.zeros(n), "ub": np.ones(n)},
-    }[kind]
-    return lv.Problem.from_qp(root.T @ root + np.eye(n), q, **rows)
-
-
-# Sweeps, ADMM, quadprog and CVXOPT give no proof. HiGHS gives none either, and `auto` finds it for its claim.
-PROVES = [
-    name
-    for name in lv.available(lv.Problem.from_qp(np.eye(2), np.zeros(2), lb=np.zeros(2)))
-    if name in {"auto", "newton", "direct", "lemke", "osqp", "piqp", "qpalm", "daqp", "scs", "clarabel", "highs"}
-]
-
-
-@pytest.mark.parametrize("name", PROVES)
-@pytest.mark.parametrize("kind", ["A", "G", "G and A", "box"])
-def test_contradicting_rows_are_infeasible_with_a_certificate_by_every_solver_that_proves_it(name, kind):
-    for seed in range(5):
-        solution = lv.solve_qp(contradicting(seed, kind), name).solution
-        assert solution.status is lv.Status.INFEASIBLE, str(solution)
-        assert solution.claim_check == "confirmed" and solution.certificate is not None
-
-
 def test_solve_qp_of_an_infeasible_program_has_the_residual_of_its_impulse():
     """Of more than 64 rows an interior point proves it; impulses are within their bounds and judged as they are."""
     rng, n = np.random.default_rng(0), 40
