@@ -2,12 +2,13 @@
 
     find lam_i:   w_i = A_ii lam_i + q_i complementary to lam_i,   q_i = sum_{j != i} A_ij lam_j - b_i
 
-A contact with two tangents in a disk is open, sticks, or slips in the direction that a scalar equation determines
-(`lavender_ext/local/coulomb.pxd`, `cone.pxd`). Contacts with other friction components and the bounded rows of a joint
-are solved by Newton's method (`lavender_ext/local/block_newton.pxd`). Unlike in `pgs`, normal and friction of one
-contact are solved together; different contacts are coupled only by sweeps. The sweeps use body velocities if the
-problem has rows, J and M if that costs less than forming A, and otherwise the rows of A. `work["fallbacks"]` counts
-blocks without an exact solution, which are updated by projected steps instead.
+A contact with two tangents in a disk is open, sticks, or slips under Coulomb's law in the direction that a scalar
+equation determines (`lavender_ext/local/coulomb.pxd`). Sliding disks under the cone law, contacts with other
+friction components and the bounded rows of a joint are solved by Newton's method
+(`lavender_ext/local/block_newton.pxd`). Unlike in `pgs`, normal and friction of one contact are solved together;
+different contacts are coupled only by sweeps. The sweeps use body velocities if the problem has rows, J and M if
+that costs less than forming A, and otherwise the rows of A. `work["fallbacks"]` counts blocks without an exact
+solution, which are updated by projected steps instead.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Python interface to batches: problems by J and M, by A or by bodies, converted, solved and judged by `task.pxd`.
 
 A world is one problem of a batch. `Worlds` holds the worlds and their results. Each `Worker` belongs to one thread and takes
-the next world, without the interpreter. A worker leaves some worlds to the caller, who solves them with the general solvers:
+the next world, without the interpreter. A worker leaves some worlds to the caller, for the general solvers:
 these are called deferred.
 """
 from cpython.exc cimport PyErr_CheckSignals
@@ -72,7 +72,7 @@ cdef enum:
 
 
 cdef int set_task_from_problem(task_t* j, problem) except -1:
-    """Set up a task from a `Problem` that is given by A or by bodies and whose derived numbers are not computed."""
+    """Set up a task from a `Problem` that is given by A or by bodies, without derived numbers."""
     cdef Blocks blocks = problem.cones._blocks
     cdef Py_ssize_t m = blocks.at.n_rows
     rows, matrix = problem.rows, problem.matrix

@@ -21,7 +21,7 @@ from libc.stdint cimport int32_t
 from lavender_ext.core.block cimport euclidean_norm
 from lavender_ext.core.block_projection cimport classify_active_bound, evaluate_natural_map
 from lavender_ext.core.block_types cimport CONE, friction_components_t
-from lavender_ext.local.small cimport FAILED, MAX_ROWS, OPEN, STICK, solve_by_elimination
+from lavender_ext.local.small cimport FAILED, MAX_ROWS, OPEN, STICK, solve_by_elimination, solve_three
 
 
 cdef enum:
@@ -107,33 +107,34 @@ cdef inline bint run_damped_newton_iterations(scaled_block_t* x, const int32_t n
     cdef double A[MAX_ROWS * MAX_ROWS]
     cdef double f[MAX_ROWS]
     cdef double z[MAX_ROWS]
-    cdef double now = evaluate_natural_residual(x, n, t), next_, a, fraction
+    cdef double projected[MAX_ROWS]
+    cdef double now = evaluate_natural_residual(x, n, t), next_, a, fraction, size
     cdef int32_t i, j, k, _step, _halving, slow = 0
     for _step in range(MAX_NEWTON_STEPS):
-        if not now > 1e-15 * x.size:
+        size = x.size
+        if not now > 1e-15 * size:
             break
         for i in range(n):
-            z[i] = x.z[i]
-            f[i] = -x.F[i]
+            z[i], projected[i], f[i] = x.z[i], x.projected[i], -x.F[i]
             for j in range(n):
                 a = 0.0
                 for k in range(n):
                     a += x.P[n * i + k] * x.H[n * k + j]
                 A[n * i + j] = (1.0 if i == j else 0.0) - x.P[n * i + j] + t * a
-        solve_by_elimination(n, A, f)
+        if n != 3 or not solve_three(A, f):
+            solve_by_elimination(n, A, f)
         fraction = 1.0
         for _halving in range(MAX_STEP_HALVINGS):
             for i in range(n):
                 x.z[i] = z[i] + fraction * f[i]
             next_ = evaluate_natural_residual(x, n, t)
-            if next_ < now:
+            if next_ < now or now <= 1e-13 * size:      # Shorter steps do not reduce rounding.
                 break
             fraction *= 0.5
-        if not next_ < now and now <= 1e-13 * x.size:
+        if not next_ < now and now <= 1e-13 * size:
             for i in range(n):
-                x.z[i] = z[i]
-            now = evaluate_natural_residual(x, n, t)
-            break
+                x.z[i], x.projected[i] = z[i], projected[i]
+            return True
         slow += not next_ < 0.9 * now
         now = next_
         if slow > MAX_SLOW_STEPS:

@@ -184,24 +184,30 @@ cdef inline int32_t solve_coulomb_disk(const double* g, const double* q, double 
     return SLIP
 
 
+cdef inline bint update_sticking_disk(const double* g, const double* w, double mu, double* lam) noexcept nogil:
+    """Set lam (3) to lam - W^-1 w, at which w = 0, if it is within the cone; return whether it is."""
+    cdef double n, x, y
+    if not g[14] > 0.0 or not g[9] > 0.0:
+        return False
+    n = lam[0] - (g[16] * w[0] + g[17] * w[1] + g[18] * w[2])
+    x = lam[1] - (g[19] * w[0] + g[20] * w[1] + g[21] * w[2])
+    y = lam[2] - (g[22] * w[0] + g[23] * w[1] + g[24] * w[2])
+    if not (n >= 0.0 and x * x + y * y <= mu * mu * n * n and mu > 0.0):
+        return False
+    lam[0], lam[1], lam[2] = n, x, y
+    return True
+
+
 cdef inline int32_t update_coulomb_disk(const double* g, const double* w, double mu, double* lam) noexcept nogil:
     """Solve for lam (3) from the slack w (3) of the present lam; open and sticking contacts need only products."""
     cdef double q[3]
-    cdef double n, x, y, s, f
+    cdef double s, f
     q[0] = w[0] - (g[0] * lam[0] + g[1] * lam[1] + g[2] * lam[2])
     if q[0] >= 0.0:
         lam[0] = lam[1] = lam[2] = 0.0
         return OPEN
-    if g[14] > 0.0 and g[9] > 0.0:
-        # w = 0 at lam - W^-1 w
-        n = lam[0] - (g[16] * w[0] + g[17] * w[1] + g[18] * w[2])
-        x = lam[1] - (g[19] * w[0] + g[20] * w[1] + g[21] * w[2])
-        y = lam[2] - (g[22] * w[0] + g[23] * w[1] + g[24] * w[2])
-        if n >= 0.0 and x * x + y * y <= mu * mu * n * n and mu > 0.0:
-            lam[0] = n
-            lam[1] = x
-            lam[2] = y
-            return STICK
+    if update_sticking_disk(g, w, mu, lam):
+        return STICK
     q[1] = w[1] - (g[3] * lam[0] + g[4] * lam[1] + g[5] * lam[2])
     q[2] = w[2] - (g[6] * lam[0] + g[7] * lam[1] + g[8] * lam[2])
     # guess: beta = |w_t| / |lam_t| of the present sliding

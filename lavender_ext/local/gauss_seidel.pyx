@@ -8,8 +8,8 @@ The prepared numbers of block i begin at g[start[i]]:
     normal, two tangents, disk   `prepare_coulomb_disk` of local/coulomb.pxd, with 1 at ONE_PATTERN if its rows share one pattern
     other contacts               1 if there are three rows and they share one pattern, then `prepare_block_newton`
 
-A sweep solves each block exactly with the others fixed: disks by local/coulomb.pxd and local/cone.pxd, all others, and disks
-that these reject, by local/block_newton.pxd:
+A sweep solves each block exactly with the others fixed: disks that stick, and sliding disks under Coulomb's law, by
+local/coulomb.pxd, all others, and disks that it rejects, by local/block_newton.pxd:
 
     over A in compressed rows    w = A lam - b on the rows of the block                                  (1)
     over the factored form       w = J v + c lam - b, then v += M^-1 J^T (change)                   (2)
@@ -22,14 +22,12 @@ from lavender_ext.core.dot cimport dot
 from lavender_ext.core.block_types cimport (CONE, blocks_t, is_disk_friction_contact, has_independent_rows, count_tangent_rows,
                                             count_angular_rows, friction_components_t, get_friction_components)
 from lavender_ext.core.joint cimport relax_joint_block
-from lavender_ext.core.numbers cimport apply_contact_impulse_changes_to_body
 from lavender_ext.core.row_forms cimport find_panel, row_form_t, compute_row_slack, set_row_impulse
-from lavender_ext.core.rows cimport (apply_impulse_to_bodies, apply_joint_impulse, get_block_jacobian, compute_contact_velocity,
-                                     cross, dot12, dot3, joint_row_velocity, multiply_inverse_mass, compute_relative_velocity)
+from lavender_ext.core.rows cimport (apply_joint_impulse, get_block_jacobian, compute_contact_velocity, cross, dot12,
+                                     joint_row_velocity, multiply_inverse_mass)
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.local.block_newton cimport prepare_block_newton, scaled_block_t, solve_block_newton
-from lavender_ext.local.cone cimport solve_cone_disk
-from lavender_ext.local.coulomb cimport ONE_PATTERN, PREPARED, update_coulomb_disk, prepare_coulomb_disk
+from lavender_ext.local.coulomb cimport ONE_PATTERN, PREPARED, update_coulomb_disk, update_sticking_disk, prepare_coulomb_disk
 from lavender_ext.local.small cimport FAILED, MAX_ROWS, solve_by_elimination
 
 
@@ -91,8 +89,8 @@ cdef int32_t solve_block_without_closed_form(const blocks_t* p, int32_t i, const
     return solve_block_newton(&x, g, w, p.lower + j, p.upper + j, lam) == FAILED
 
 
-cdef int32_t solve_rejected_disk(const blocks_t* p, int32_t i, const double* g, const double* w, double* lam) noexcept nogil:
-    """Solve disk i, for which the closed form failed, by Newton's method; return 1 if projected steps were used, otherwise 0.
+cdef int32_t solve_disk_by_newton(const blocks_t* p, int32_t i, const double* g, const double* w, double* lam) noexcept nogil:
+    """Solve disk i, which slides or has no closed form, by Newton's method; return 1 if projected steps were used, otherwise 0.
 
     g has the numbers of `prepare_coulomb_disk`.
     """
@@ -129,18 +127,9 @@ cdef inline int32_t solve_block_exactly(const blocks_t* p, int32_t i, const doub
     if not is_disk_friction_contact(p, i):
         return solve_block_without_closed_form(p, i, g + 1, w, lam)
     # a disk
-    if p.law != CONE:
-        if update_coulomb_disk(g, w, p.mu[i], lam) != FAILED:
-            return 0
-    else:
-        for k in range(3):                              # q = w - W lam
-            s = w[k]
-            for t in range(3):
-                s -= g[3 * k + t] * lam[t]
-            x[k] = s
-        if (g[9] > 0.0 or x[0] >= 0.0) and solve_cone_disk(g, x, p.mu[i], lam) != FAILED:
-            return 0
-    return solve_rejected_disk(p, i, g, w, lam)
+    if (update_sticking_disk(g, w, p.mu[i], lam) if p.law == CONE else update_coulomb_disk(g, w, p.mu[i], lam) != FAILED):
+        return 0
+    return solve_disk_by_newton(p, i, g, w, lam)
 
 
 cdef inline void multiply_three_csr_rows(const csr_t* a, int32_t i, const double* x, double* out) noexcept nogil:
@@ -208,98 +197,69 @@ cdef inline int32_t solve_rows_block(const blocks_t* p, const row_form_t* form, 
     return fallback
 
 
-cdef inline int32_t update_disk_contact(const blocks_t* p, const rows_t* r, int32_t i, const double* g, double* lam,
-                                        double* v) noexcept nogil:
-    """Update a disk under Coulomb's law by (2); lam points at its normal."""
-    cdef int32_t j = p.ptr[i], c = i - r.n_joints, a = r.contact_body[2 * c], b = r.contact_body[2 * c + 1], k, axis
-    cdef double w[3]
-    cdef double change[4]
-    cdef double u[3]
-    cdef double omega[3]
+cdef inline void apply_contact_changes(double* v, double inv_mass, const double* inv_inertia_arm, const double* impulse,
+                                       const double* change, int32_t n, double sign) noexcept nogil:
+    """Apply the changes (n) of a contact's rows, with the linear `impulse`, to the velocity v (6) of one body; sign -1 for a."""
+    cdef int32_t axis, k
+    cdef double angular
+    for axis in range(3):
+        angular = change[0] * inv_inertia_arm[axis]
+        for k in range(1, n):
+            angular += change[k] * inv_inertia_arm[6 * k + axis]
+        v[axis] += sign * (inv_mass * impulse[axis])
+        v[3 + axis] += sign * angular
+
+
+cdef inline int32_t solve_contact_block(const blocks_t* p, const rows_t* r, int32_t i, const double* g, double* lam, double* v,
+                                        int32_t nt, int32_t n_angular) noexcept nogil:
+    """Update contact i, with nt tangents, over bodies by (2); lam (n) are its impulses."""
+    cdef int32_t j = p.ptr[i], c = i - r.n_joints, a = r.contact_body[2 * c], b = r.contact_body[2 * c + 1]
+    cdef int32_t n = 1 + nt + (n_angular & 1) + (n_angular & 2), k, fallbacks
+    cdef double w[6]
+    cdef double change[6]
     cdef double t2[3]
     cdef double impulse[3]
-    cdef double n = lam[0], x = lam[1], y = lam[2]
     cdef const double* normal = r.normal + 3 * c
     cdef const double* t1 = r.tangent + 3 * c
     cdef const double* inv_inertia_arm = r.inv_inertia_arm + 6 * (j - p.ptr[r.n_joints])
-    compute_relative_velocity(v, a, b, r.arm_a + 3 * c, r.arm_b + 3 * c, u, omega)
-    cross(normal, t1, t2)
-    w[0] = dot3(normal, u) + (r.compliance[j] * n - p.b[j])
-    w[1] = dot3(t1, u) + (r.compliance[j + 1] * x - p.b[j + 1])
-    w[2] = dot3(t2, u) + (r.compliance[j + 2] * y - p.b[j + 2])
-    k = 0
-    if update_coulomb_disk(g, w, p.mu[i], lam) == FAILED:
-        k = solve_block_exactly(p, i, g, w, lam)
-    change[0] = lam[0] - n
-    change[1] = lam[1] - x
-    change[2] = lam[2] - y
-    for axis in range(3):
-        impulse[axis] = change[0] * normal[axis] + change[1] * t1[axis] + change[2] * t2[axis]
+    compute_contact_velocity(r, c, nt, n_angular, v, w)
+    for k in range(n):
+        w[k] += r.compliance[j + k] * lam[k] - p.b[j + k]
+        change[k] = lam[k]
+    fallbacks = solve_block_exactly(p, i, g, w, lam)
+    for k in range(n):
+        change[k] = lam[k] - change[k]
+    if nt > 1:
+        cross(normal, t1, t2)
+    for k in range(3):
+        impulse[k] = change[0] * normal[k] + (change[1] * t1[k] if nt > 0 else 0.0) + (change[2] * t2[k] if nt > 1 else 0.0)
     if a >= 0:
-        apply_contact_impulse_changes_to_body(v + 6 * a, r.inv_mass + a, inv_inertia_arm, impulse, change, 2, False, -1)
+        apply_contact_changes(v + 6 * a, r.inv_mass[a], inv_inertia_arm, impulse, change, n, -1.0)
     if b >= 0:
-        apply_contact_impulse_changes_to_body(v + 6 * b, r.inv_mass + b, inv_inertia_arm + 3, impulse, change, 2, False, 1)
-    return k
+        apply_contact_changes(v + 6 * b, r.inv_mass[b], inv_inertia_arm + 3, impulse, change, n, 1.0)
+    return fallbacks
 
 
 cdef inline int32_t solve_bodies_block(const blocks_t* p, const rows_t* r, int32_t i, const double* g, double* lam,
                                        double* v) noexcept nogil:
     """Update block i over bodies by (2); return 1 if projected steps were used, otherwise 0."""
-    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, c = i - r.n_joints, k, a, b, nt, n_angular, roll, fallbacks
+    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k, a, b, fallbacks
     cdef double w[MAX_ROWS]
     cdef double previous[MAX_ROWS]
-    cdef double t2[3]
-    cdef double impulse[3]
-    cdef double twist[3]
-    cdef const double* normal
-    cdef const double* t1
-    t2[0] = t2[1] = t2[2] = 0.0
-    if c >= 0 and is_disk_friction_contact(p, i) and p.law != CONE:
-        return update_disk_contact(p, r, i, g, lam + j, v)
-    if c < 0:
-        if n > MAX_ROWS:
-            relax_joint_block(p, r, i, lam, v)
-            return 1
-        a = r.joint_body[2 * i]
-        b = r.joint_body[2 * i + 1]
-        for k in range(n):
-            w[k] = joint_row_velocity(r.jac + 12 * (j + k), v, a, b) + r.compliance[j + k] * lam[j + k] - p.b[j + k]
-            previous[k] = lam[j + k]
-        fallbacks = solve_block_exactly(p, i, g, w, lam + j)
-        for k in range(n):
-            apply_joint_impulse(r.minv_jac + 12 * (j + k), lam[j + k] - previous[k], v, a, b)
-        return fallbacks
-    a = r.contact_body[2 * c]
-    b = r.contact_body[2 * c + 1]
-    n_angular = count_angular_rows(p, i)
-    nt = count_tangent_rows(p, i)
-    roll = 1 + nt + (n_angular & 1)
-    normal = r.normal + 3 * c
-    t1 = r.tangent + 3 * c
-    compute_contact_velocity(r, c, nt, n_angular, v, w)
+    if i >= r.n_joints:
+        if is_disk_friction_contact(p, i):
+            return solve_contact_block(p, r, i, g, lam + j, v, 2, 0)        # compiled with constant sizes
+        return solve_contact_block(p, r, i, g, lam + j, v, count_tangent_rows(p, i), count_angular_rows(p, i))
+    if n > MAX_ROWS:
+        relax_joint_block(p, r, i, lam, v)
+        return 1
+    a, b = r.joint_body[2 * i], r.joint_body[2 * i + 1]
     for k in range(n):
-        w[k] += r.compliance[j + k] * lam[j + k] - p.b[j + k]
+        w[k] = joint_row_velocity(r.jac + 12 * (j + k), v, a, b) + r.compliance[j + k] * lam[j + k] - p.b[j + k]
         previous[k] = lam[j + k]
     fallbacks = solve_block_exactly(p, i, g, w, lam + j)
     for k in range(n):
-        w[k] = lam[j + k] - previous[k]
-    for k in range(3):
-        impulse[k] = w[0] * normal[k]
-        twist[k] = 0.0
-    if nt > 0:
-        for k in range(3):
-            impulse[k] += w[1] * t1[k]
-    if nt > 1:
-        cross(normal, t1, t2)
-        for k in range(3):
-            impulse[k] += w[2] * t2[k]
-    if n_angular & 1:
-        for k in range(3):
-            twist[k] = w[1 + nt] * normal[k]
-    if n_angular & 2:
-        for k in range(3):
-            twist[k] += w[roll] * t1[k] + w[roll + 1] * t2[k]
-    apply_impulse_to_bodies(v, a, b, r.inv_mass, r.inv_inertia, r.arm_a + 3 * c, r.arm_b + 3 * c, impulse, twist)
+        apply_joint_impulse(r.minv_jac + 12 * (j + k), lam[j + k] - previous[k], v, a, b)
     return fallbacks
 
 

@@ -27,6 +27,20 @@ cdef inline double safeguard_newton_step(double x, double step, double lo, doubl
     return 0.5 * (lo + hi) if hi >= 0.0 else 4.0 * x
 
 
+cdef inline bint solve_three(const double* a, double* x) noexcept nogil:
+    """Overwrite x (3) with a^-1 x by cofactors; return False, without a change, if a is nearly singular."""
+    cdef double c0 = a[4] * a[8] - a[5] * a[7], c1 = a[5] * a[6] - a[3] * a[8], c2 = a[3] * a[7] - a[4] * a[6]
+    cdef double x0 = x[0], x1 = x[1], x2 = x[2], det = a[0] * c0 + a[1] * c1 + a[2] * c2
+    if not fabs(det) > 1e-6 * ((fabs(a[0]) + fabs(a[1]) + fabs(a[2])) * (fabs(a[3]) + fabs(a[4]) + fabs(a[5]))
+                               * (fabs(a[6]) + fabs(a[7]) + fabs(a[8]))):
+        return False
+    det = 1.0 / det
+    x[0] = (c0 * x0 + (a[2] * a[7] - a[1] * a[8]) * x1 + (a[1] * a[5] - a[2] * a[4]) * x2) * det
+    x[1] = (c1 * x0 + (a[0] * a[8] - a[2] * a[6]) * x1 + (a[2] * a[3] - a[0] * a[5]) * x2) * det
+    x[2] = (c2 * x0 + (a[1] * a[6] - a[0] * a[7]) * x1 + (a[0] * a[4] - a[1] * a[3]) * x2) * det
+    return True
+
+
 cdef inline int32_t solve_by_elimination(int32_t n, double* a, double* x) noexcept nogil:
     """Overwrite x (n) with a^-1 x by elimination with row exchanges; return the rank of a (n, n), which is overwritten.
 
@@ -81,18 +95,3 @@ cdef inline int32_t solve_by_elimination(int32_t n, double* a, double* x) noexce
             x[k] = 0.0
         k -= 1
     return rank
-
-
-cdef inline int32_t is_slack_zero(int32_t m, const double* W, const double* q, const double* lam) noexcept nogil:
-    """Return whether w = W lam + q is 0 within rounding."""
-    cdef int32_t i, j
-    cdef double w, size
-    for i in range(m):
-        w = q[i]
-        size = fabs(q[i])
-        for j in range(m):
-            w += W[m * i + j] * lam[j]
-            size += fabs(W[m * i + j] * lam[j])
-        if fabs(w) > 1e-11 * size:
-            return 0
-    return 1

@@ -1,4 +1,4 @@
-"""Growing workspace whose arrays are taken from an arena: first to count them, then with memory."""
+"""Growing workspace with arrays taken from an arena: first to count them, then with memory."""
 from lavender_ext.core.arena cimport arena_t, make_arena
 from lavender_ext.core.method cimport workspace_t
 from lavender_ext.driver.host cimport grow_workspace_to

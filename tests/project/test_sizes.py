@@ -40,7 +40,7 @@ LINES = {
     "lavender_ext/derivative": 778,
     "lavender_ext/factor": 3251,
     "lavender_ext/judge": 3070,
-    "lavender_ext/local": 1100,
+    "lavender_ext/local": 950,
     "lavender_ext/newton lavender_ext/velocity_newton": 7805,
     "lavender_ext/pivot": 1719,
 }
