@@ -4,6 +4,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
 from random_problems import FORMS, as_matrix, general, random_contact_problem, touching
 from scipy.optimize import linprog
 
@@ -215,3 +216,21 @@ def test_proof_names_the_rows_and_the_contacts_that_contradict():
     proof = prove_infeasibility(problem, -np.eye(8)[0] + np.eye(8)[2])
     assert (proof.impulse_bound, proof.message) == (np.inf, "no solution, proved: row 0 against contact 0")
     assert list_conflicting_blocks(problem, proof.y) == ((0,), (2,))
+
+
+@pytest.mark.parametrize("law", ["coulomb", "cone"])
+@pytest.mark.parametrize("mu", [0.0, 0.5])
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_auto_proves_that_opposed_contacts_contradict_in_any_island(law, mu, place):
+    """Two contacts push one velocity in opposite directions, and both require it to grow."""
+    jac = np.zeros((6, 3))
+    jac[[0, 1, 2, 3, 4, 5], [0, 1, 2, 0, 1, 2]] = [1.0, 1.0, 1.0, -1.0, 1.0, -1.0]
+    b = np.tile([0.5, 0.1, 0.2, -0.6, 0.1, 0.0], 3)
+    b[6 * place : 6 * place + 6] = [1.0, 0.1, 0.2, 0.5, 0.1, 0.0]
+    whole = lv.Problem.from_jacobian(
+        sp.block_diag([jac] * 3), np.eye(9), np.zeros(9), target=b, cones=lv.Cones.contacts(mu, count=6), friction=law
+    )
+    for problem in (whole, as_matrix(whole)):
+        solution = lv.solve(problem)
+        assert solution.status is lv.Status.INFEASIBLE and solution.claim_check == "confirmed", str(solution)
+        assert set(np.flatnonzero(solution.certificate)) <= set(range(6 * place, 6 * place + 6))

@@ -140,3 +140,13 @@ def test_register_of_a_name_twice_raises_without_replace(register):
     assert lv.get("mine").summary == "another"
     with pytest.raises(lv.InputError, match="SolverSpec"):
         lv.register("mine")
+
+
+def test_impulse_of_an_infeasible_problem_is_inside_its_bounds_whatever_the_solver_returned(plug_in):
+    def pull(problem, impulse):
+        impulse[:] = -5.0
+        return lv.Claim(lv.Status.INFEASIBLE, 1, certificate=np.ones(2))
+
+    solution = lv.solve(lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0]], [1.0, 1.0]), plug_in(pull))
+    assert solution.status is lv.Status.INFEASIBLE and solution.claim_check == "confirmed"
+    assert (solution.impulse >= 0.0).all()
