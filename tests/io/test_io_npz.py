@@ -303,3 +303,13 @@ def test_load_of_npz_entries_with_false_headers_raises(tmp_path, entry, sign):
 def test_load_of_a_wrong_box_file_names_the_entry(tmp_path, changes, sign):
     with pytest.raises(lv.InputError, match=sign):
         lavender.io.load(box(tmp_path, **changes))
+
+
+@pytest.mark.skipif(os.name != "posix", reason="permissions of POSIX")
+@pytest.mark.parametrize("mode", [0o600, 0o640, 0o664])
+def test_save_over_a_file_keeps_its_permissions(tmp_path, mode):
+    problem, path = lv.Problem.lcp([[2.0]], [1.0]), tmp_path / "a.npz"
+    problem.save(path)
+    path.chmod(mode)
+    problem.save(path)
+    assert path.stat().st_mode & 0o777 == mode

@@ -235,3 +235,17 @@ def test_direct_with_a_good_factor_is_not_refined(m, half, bound):
     solution = lv.solve(lv.Problem.lcp(a, rng.normal(size=m), -bound, bound), "direct", tol=1e-12)
     assert solution.residual.relative < 1e-14
     assert "refinements" not in solution.work
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("m", [8, 80])
+def test_direct_shifts_a_singular_asymmetric_matrix_once(seed, m):
+    """Free sets of more than m / 2 rows are singular; exchanges may cycle, but no pivot is lost with the shift."""
+    rng = np.random.default_rng(seed)
+    g, skew = rng.normal(size=(m, m // 2)), rng.normal(size=(m // 2, m // 2))
+    a = g @ (np.eye(m // 2) + 0.7 * (skew - skew.T)) @ g.T
+    x = np.maximum(rng.normal(size=m), 0.0)
+    b = a @ x - np.where(x > 0.0, 0.0, rng.random(m))
+    solution = lv.solve(lv.Problem.lcp(a, b, 0.0, np.where(rng.random(m) < 0.5, 5.0, np.inf)), "direct", tol=1e-8)
+    assert solution.status in (lv.Status.CONVERGED, lv.Status.STALLED), str(solution)
+    assert solution.work["shifts"] == 1
