@@ -244,6 +244,26 @@ def test_backend_of_cones_with_every_kind_of_contact_agrees_with_newton(kind, fo
         np.testing.assert_allclose(found.impulse, expected.impulse, atol=1e-4)
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_every_solver_moves_a_row_that_no_velocity_feels_to_the_limit_that_b_requires(sign):
+    """If that limit is infinite, no solution exists."""
+    low, high = (-1.0, 2.0) if sign > 0.0 else (-2.0, 1.0)
+    for other in (low if sign > 0.0 else high, sign * -np.inf):
+        limits = sorted([other, 2.0 * sign])
+        for ends, is_solved in ((limits, True), (sorted([-1.0 * sign, sign * np.inf]), False)):
+            cones = lv.Cones.bounded([ends[0], 0.0], [ends[1], np.inf])
+            whole = lv.Problem.from_jacobian(
+                [[0.0, 0.0], [1.0, 0.0]], np.eye(2), [0.0, 0.0], target=[0.5 * sign, 1.0], cones=cones
+            )
+            for problem in (whole, lv.Problem(whole.b, whole.cones, whole.csr)):
+                for name in lv.available(problem, external=False):
+                    solution = lv.solve(problem, name)
+                    if is_solved:
+                        np.testing.assert_allclose(solution.impulse, [2.0 * sign, 1.0], atol=1e-6, err_msg=name)
+                    else:
+                        assert solution.status is lv.Status.INFEASIBLE and solution.claim_check == "confirmed", name
+
+
 @pytest.mark.parametrize("form", ["J and M", "matrix"])
 def test_every_solver_with_rows_of_every_kind_agrees_with_newton(form):
     problem = build_rows_of_every_kind()

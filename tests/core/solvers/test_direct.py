@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from hypothesis import assume, given
-from random_problems import good, seeds, without_solution
+from random_problems import good, random_lcp, seeds, without_solution
 
 import lavender as lv
 from lavender.base.lu import factor_sparse_lu
@@ -249,3 +249,20 @@ def test_direct_shifts_a_singular_asymmetric_matrix_once(seed, m):
     solution = lv.solve(lv.Problem.lcp(a, b, 0.0, np.where(rng.random(m) < 0.5, 5.0, np.inf)), "direct", tol=1e-8)
     assert solution.status in (lv.Status.CONVERGED, lv.Status.STALLED), str(solution)
     assert solution.work["shifts"] == 1
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_direct_of_a_singular_problem_ends_at_rounding(seed):
+    """The shift of 1e-10 is centred at the last point, so that it does not remain in the answer."""
+    solution = lv.solve(random_lcp(seed, m=30, rank=12), "direct", tol=1e-12)
+    assert solution.success and solution.work["shifts"] >= 1, str(solution)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_direct_never_exchanges_rows_with_equal_limits(seed):
+    rng, m = np.random.default_rng(seed), 20
+    a, b = spd(rng, m, 1.0), rng.normal(size=m)
+    fixed = np.where(np.arange(m) % 2 == 0, rng.normal(size=m), np.nan)
+    low, high = np.where(np.isnan(fixed), 0.0, fixed), np.where(np.isnan(fixed), np.inf, fixed)
+    solution = lv.solve(lv.Problem.lcp(a, 3.0 * b, low, high), "direct", tol=1e-12)
+    assert solution.success and solution.work.get("pivots", 0) <= 3, str(solution)

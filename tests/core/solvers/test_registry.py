@@ -147,6 +147,8 @@ def test_impulse_of_an_infeasible_problem_is_inside_its_bounds_whatever_the_solv
         impulse[:] = -5.0
         return lv.Claim(lv.Status.INFEASIBLE, 1, certificate=np.ones(2))
 
-    solution = lv.solve(lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0]], [1.0, 1.0]), plug_in(pull))
-    assert solution.status is lv.Status.INFEASIBLE and solution.claim_check == "confirmed"
-    assert (solution.impulse >= 0.0).all()
+    name = plug_in(pull)
+    for tol in (1e-6, 0.0):
+        solution = lv.solve(lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0]], [1.0, 1.0]), name, tol=tol)
+        assert solution.status is lv.Status.INFEASIBLE and solution.claim_check == "confirmed"
+        assert (solution.impulse >= 0.0).all()
