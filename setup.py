@@ -48,7 +48,7 @@ SHARED = "lavender_ext._utility"
 
 #: Modules whose loops need the update of a block inlined into them: -O3 and gcc's inlining limits raised (INLINE).
 #: With lower limits they execute 2 to 12 % more instructions; at -O2 a sweep takes up to 1.7 times as long.
-HOT = ("sweep/", "local/", "driver/", "engine/substep")
+HOT = ("sweep/", "local/", "driver/driver", "engine/substep")
 #: Modules compiled with -O3 and lower inlining limits: at -O2 a factorisation takes twice as long, and a solve of few
 #: bodies by Newton's method 1.2 to 1.3 times, also with -fpeel-loops.
 FAST = ("factor/linear", "judge/measure", "judge/program", "newton/solve")
@@ -56,7 +56,7 @@ FAST = ("factor/linear", "judge/measure", "judge/program", "newton/solve")
 #: vectoriser; solve times stay within 1 % of those at -O3, which takes a sixth longer to compile.
 COLD = (
     "_utility",
-    "host/",
+    "driver/memory",
     "engine/arrays",
     "engine/newton_substep",
     "core/blocks",

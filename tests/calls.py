@@ -147,7 +147,7 @@ def dense_h(problem):
 
 def block_diagonal(system, values):
     """The small matrices of the elements of Newton's method as one block diagonal matrix."""
-    sc = system.solve
+    sc = system.solve.view_arrays()
     out = np.zeros((sc.m, sc.m))
     for i, q in enumerate(sc.wptr[:-1]):
         j, end = sc.ptr[i], sc.ptr[i + 1]
@@ -156,12 +156,11 @@ def block_diagonal(system, values):
 
 
 def system_in(problem, form):
-    """The system of a problem; "sparse": the impulse form factored by panels whatever it costs."""
-    if form != "sparse":
-        return make_system(problem, form)
+    """The started system of a problem; "sparse": the impulse form factored by panels whatever it costs."""
     get_zero_impulse_reference(problem)
-    system = MatrixSystem(problem, may_be_dense=False)
-    assert not system.dense
+    system = MatrixSystem(problem, may_be_dense=False) if form == "sparse" else make_system(problem, form)
+    assert form != "sparse" or not system.dense
+    system.solve.start(problem.start(), 0.0, 1)
     return system
 
 

@@ -40,7 +40,7 @@ MODULES = (
     "factor.symbolic",
     "engine.arrays",
     "engine.substep",
-    "host.memory",
+    "driver.memory",
 )
 HEADER = HERE / "c" / "lavender.h"
 FRONT = [

@@ -343,7 +343,8 @@ class Newton(Solver):
         """Run the method over bodies or rows (`run_newton_method`). Over bodies, a warm start is tried first."""
         if system is None:
             system = make_system(problem, "impulse")
-            impulse[:] = system.solve.fixed
+            system.solve.start(impulse, tol, 1)
+            impulse[:] = system.solve.view_arrays().fixed
             return Claim(Status.STALLED, 0, {"factorisations": 0}, "no row can move")
         sweeps = warm_factorisations = 0
         if self.form == "auto" and problem.rows is not None and not is_continued:

@@ -28,7 +28,7 @@ from lavender_ext.batch.task cimport (copy_small_judgement, compute_missing_deri
                                       judge_task_workspace_size, prepare_task_for_small_call,
                                      solve_small_task, solve_task, task_t, task_workspaces_t)
 from lavender_ext.small.limits cimport estimate_newton_cost_terms, limits_t, max_newton_cost, newton_cost_t
-from lavender_ext.driver.host cimport grow_workspace_to, free_workspace
+from lavender_ext.host cimport grow_workspace_to, free_workspace
 from lavender_ext.batch.world cimport (BAD, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, LATE, LEFT, MASS, MU, N_ARRAYS, PLACES, READY,
                                        AT_ROW, ROWS, SOFT, STARTED, TARGET, TRIED, VELOCITIES, VELOCITY, worker_scratch_t,
                                        convert_generalized_world, worlds_t)

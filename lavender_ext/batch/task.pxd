@@ -12,14 +12,15 @@ from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles, take_int
 from lavender_ext.core.assemble cimport lav_form_delassus_matrix, lav_list_blocks_of_bodies
 from lavender_ext.core.validate cimport find_invalid_number
 from lavender_ext.core.deadline cimport deadline_t, has_passed
-from lavender_ext.core.method cimport MORE, REACHED, NEEDS_WORKSPACE, options_t, workspace_t, info_t
+from lavender_ext.core.method cimport MORE, REACHED, NEEDS_WORKSPACE, info_t, options_t, workspace_t
 from lavender_ext.core.islands cimport island_workspace_integers
 from lavender_ext.core.block_types cimport CONE, blocks_t, has_independent_rows, islands_t
 from lavender_ext.core.problem cimport (DERIVED, bind_derived_row_arrays, compute_derived_numbers_of_jacobian, derived_t,
                                         lav_compute_body_diagonal, lav_compute_csr_diagonal)
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
-from lavender_ext.driver.driver cimport NEWTON
+from lavender_ext.driver.driver cimport NEWTON, lav_analyse, lav_start, lav_step
 from lavender_ext.factor.factors cimport has_wide
+from lavender_ext.host cimport grow_workspace_to
 from lavender_ext.judge.bounds cimport project_far_excess, project_on_bounds
 from lavender_ext.judge.measure cimport (refine_reported_view, residual_above_floor, set_zero_impulse, relative_floor_of_score,
                                          score_given_generalized_slack, judge_zero_impulse,
@@ -30,7 +31,6 @@ from lavender_ext.small.call cimport (N_COUNTS, RESULT_IS_START, RESULT_SOLVED, 
                                       small_problem_t, small_rules_t, solve_small, solve_workspaces_t, can_use_small_call)
 from lavender_ext.small.limits cimport (estimate_newton_cost_terms, limits_t, max_factorisation_work,
                                         max_newton_cost, newton_cost_t)
-from lavender_ext.driver.host cimport grow_workspace_to, start_method, step_method
 from lavender_ext.small.workspace cimport fits_workspace, grow_workspace_to_arena
 from lavender_ext.batch.world cimport THIN_PADDING, LEFT, READY, STARTED, TRIED, compress_dense_rows
 from lavender_ext.velocity_newton.soft cimport needs_no_proximal_terms
@@ -171,7 +171,7 @@ cdef inline void solve_task(task_t* j, workspace_t* workspace, workspace_t* isla
     """Solve and judge a task of J and M by Newton's method, if its estimated cost is within the limits."""
     cdef view_t v
     cdef options_t o = options_t(NEWTON, NEWTON_STEPS_PER_ISLAND, 0, 0, has_wide(), tol, 0.0, 0.0, limits.values, 0.0,
-                                 j.deadline)
+                                 j.deadline, NULL)
     cdef info_t info = info_t(0, 0, 0, 0, 0.0, NULL, NULL)
     cdef workspace_t r
     cdef int32_t m = j.p.n_rows, code
@@ -192,7 +192,7 @@ cdef inline void solve_task(task_t* j, workspace_t* workspace, workspace_t* isla
     o.work = max_factorisation_work(&j.p, &j.g, limits, &cost, soft)
     if not o.work > 0.0:
         return
-    code = start_method(&v, &o, &r, j.lam, workspace, True)
+    code = lav_analyse(&v, &o, &r, workspace, grow_workspace_to)
     if code != NEEDS_WORKSPACE or cost.fixed + cost.per_work * r.work > max_newton_cost(&j.p, &j.g, limits, r.islands, soft):
         return
     # start and empty rows
@@ -205,9 +205,9 @@ cdef inline void solve_task(task_t* j, workspace_t* workspace, workspace_t* isla
     if j.made.n_empty and not set_impulse_of_empty_rows(j):
         return
     # steps, judgement
-    if start_method(&v, &o, &r, j.lam, workspace, False) != MORE:
+    if lav_start(&v, &o, &r, j.lam, workspace, grow_workspace_to) != MORE:
         return
-    code = step_method(&v, &o, &r, o.budget, j.lam, &info)
+    code = lav_step(&v, &o, &r, o.budget, j.lam, &info)
     j.counts[0], j.counts[1], j.counts[2], j.counts[3] = info.work, info.factorisations, info.rounds, info.evaluations
     j.is_late = has_passed(j.deadline, 0.0)
     if code != REACHED and not j.is_late:

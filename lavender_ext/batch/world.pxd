@@ -14,7 +14,7 @@ from lavender_ext.core.tree cimport find_tree_factor_pattern
 from lavender_ext.core.method cimport workspace_t
 from lavender_ext.core.block_types cimport blocks_t, offset_block_arrays
 from lavender_ext.judge.rounding cimport mass_t
-from lavender_ext.driver.host cimport grow_workspace_to
+from lavender_ext.host cimport grow_workspace_to
 from lavender_ext.core.thin cimport thin
 from lavender_ext.core.view cimport generalized_t
 

@@ -1,9 +1,5 @@
 """Addresses of NumPy arrays without typed views: creating a typed view costs as much as a pass over 500 numbers."""
-from cython cimport view
 from libc.stdint cimport int32_t
-from libc.stdlib cimport calloc, free
-
-import numpy as np
 
 from lavender_ext.core.validate cimport has_invalid_number
 
@@ -33,19 +29,6 @@ cdef enum:                          # NumPy's constants
     INT = 5                         # type numbers
     LONG = 7
     DOUBLE = 12
-
-
-cdef inline object allocate_zeros(Py_ssize_t n):
-    """Return n + 1 zeros (float64) from `calloc`: its pages are mapped on first use.
-
-    NumPy requests huge pages, and mapping a huge page may take long.
-    """
-    cdef view.array array = view.array(shape=(n + 1,), itemsize=sizeof(double), format="d", allocate_buffer=False)
-    array.data = <char*>calloc(n + 1, sizeof(double))
-    if array.data == NULL:
-        raise MemoryError(f"{n} numbers")
-    array.callback_free_data = free
-    return np.asarray(array)
 
 
 cdef inline bint has_element_type(ndarray x, int kind) noexcept:

@@ -44,6 +44,7 @@ cdef struct options_t:
     double most                 # maximum doubles of one factor; the method does not accept a problem that needs more
     double work                 # multiply-adds of one factor above which no workspace is bound; 0: no limit
     deadline_t* deadline        # time at which a step ends with the present result, or NULL
+    const void* host            # functions of a caller that this method calls, or NULL
 
 
 cdef struct workspace_t:
@@ -86,8 +87,9 @@ cdef class Method:
     cdef view_t view
     cdef options_t options
     cdef workspace_t space
+    cdef workspace_t memory     # in which `space` is
     cdef info_t info
     cdef method_t own
     cdef readonly Deadline deadline     # of `options.deadline`
     cdef readonly int how       # the last outcome: one of `OUTCOMES`
-    cdef void set_target_and_clear_statistics(self, double tol, int budget) noexcept
+    cdef int32_t analyse(self)

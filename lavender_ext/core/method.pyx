@@ -1,26 +1,43 @@
 """The class `Method`: steps and statistics of a method of core/method.pxd for Python."""
 import numpy as np
 
+from libc.stdint cimport int32_t
+
 from lavender_ext.core.deadline cimport get_pointer
-from lavender_ext.core.method cimport (BROKEN, CERTIFICATE, ROUNDOFF_LIMIT, LOST, MORE, REACHED, SPENT, STUCK, options_t, info_t)
+from lavender_ext.core.method cimport (BROKEN, CERTIFICATE, ROUNDOFF_LIMIT, LOST, MORE, REACHED, SPENT, STUCK, UNFIT, info_t,
+                                       options_t)
+from lavender_ext.host cimport analyse_for_method, free_workspace, grow_workspace_to, start_method
 
 OUTCOMES = {"more": MORE, "reached": REACHED, "floor": ROUNDOFF_LIMIT, "stuck": STUCK, "certificate": CERTIFICATE, "spent": SPENT,
             "broken": BROKEN, "lost": LOST}
 
 
 cdef class Method:
-    """Base class of started methods.
+    """Base class of methods on a problem, with workspace that is allocated when its size is known.
 
-    The data must know the judge's reference (the residual of the zero impulse) before a method starts.
+    A subclass sets the functions, the view and the options, and calls `analyse`. `start` may be called repeatedly. The data
+    must know the judge's reference (the residual of the zero impulse) before a method starts.
     """
 
-    cdef void set_target_and_clear_statistics(self, double tol, int budget) noexcept:
-        """Reset the options to a relative residual of `tol` and `budget` units of work, and clear the statistics."""
+    def __dealloc__(self):
+        free_workspace(&self.memory)
+
+    cdef int32_t analyse(self):
+        """Analyse the structure of the problem; return NEEDS_WORKSPACE or, if the method does not accept it, UNFIT."""
+        with nogil:
+            self.how = analyse_for_method(&self.own, &self.view, &self.options, &self.space, &self.memory, grow_workspace_to)
+        return self.how
+
+    def start(self, const double[::1] impulse, double tol, int budget):
+        """Start from impulse (m,) [N s], to a relative residual of `tol`, with `budget` units of work."""
         cdef options_t* o = &self.options
         o.tol, o.budget, o.proven, o.stop = tol, budget, 0, 0
         o.e0, o.v0 = self.data.reference_energy, self.data.reference_velocity
         self.info = info_t(0, 0, 0, 0, 1.0 / 0.0, NULL, NULL)
-        self.how = MORE
+        with nogil:
+            self.how = start_method(&self.own, &self.view, o, &self.space, &impulse[0], &self.memory, grow_workspace_to)
+        if self.how == UNFIT:
+            raise MemoryError(f"{self.space.n_real} numbers")
 
     def step(self, int work, double[::1] impulse):
         """Do `work` units of work and return one of `OUTCOMES`.
@@ -46,6 +63,11 @@ cdef class Method:
     def confirm_certificate(self):
         """Confirm to the method that `direction` proves that no solution exists."""
         self.options.proven = 1
+
+    @property
+    def work(self):
+        """Multiply-adds of one factorisation; over J and M, of forming and factoring N of every island."""
+        return self.space.work
 
     @property
     def relative(self):

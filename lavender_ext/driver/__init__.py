@@ -1,1 +1,1 @@
-"""Calls of a method's functions (workspace size, start, step) on plain structs, for Python, C and WebAssembly."""
+"""Functions of a method (workspace size, start, step) and memory of the engine, for Python, C and WebAssembly."""

@@ -6,8 +6,9 @@
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.method cimport options_t, workspace_t, info_t
+from lavender_ext.core.method cimport info_t, options_t, workspace_t
 from lavender_ext.core.view cimport view_t
+from lavender_ext.host cimport grow_t
 
 
 cdef enum:                      # methods
@@ -15,6 +16,9 @@ cdef enum:                      # methods
 
 
 cdef public int32_t lav_workspace_size(const view_t* v, const options_t* o, workspace_t* r) noexcept nogil
-cdef public int32_t lav_start(const view_t* v, const options_t* o, workspace_t* r, const double* lam) noexcept nogil
+cdef public int32_t lav_analyse(const view_t* v, const options_t* o, workspace_t* r, workspace_t* memory,
+                                grow_t grow) noexcept nogil
+cdef public int32_t lav_start(const view_t* v, const options_t* o, workspace_t* r, const double* lam, workspace_t* memory,
+                              grow_t grow) noexcept nogil
 cdef public int32_t lav_step(const view_t* v, const options_t* o, const workspace_t* r, int32_t work, double* lam,
                              info_t* info) noexcept nogil

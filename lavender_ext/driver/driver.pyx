@@ -6,8 +6,8 @@ from lavender_ext.core.method cimport NEEDS_WORKSPACE, UNFIT, Method, method_t, 
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport NEWTON
-from lavender_ext.driver.host cimport free_workspace, start_method
 from lavender_ext.factor.factors cimport has_wide
+from lavender_ext.host cimport analyse_for_method, grow_t, start_method, step_method
 from lavender_ext.velocity_newton.method cimport islands_workspace_size, start_islands, advance_islands
 from lavender_ext.newton.rows cimport are_generalized_rows_faster
 from lavender_ext.newton.solve cimport (bodies_workspace_size, start_newton_over_bodies, rows_workspace_size,
@@ -32,19 +32,29 @@ cdef public int32_t lav_workspace_size(const view_t* v, const options_t* o, work
     return find_method_functions(v).workspace(v, o, r)
 
 
-cdef public int32_t lav_start(const view_t* v, const options_t* o, workspace_t* r, const double* lam) noexcept nogil:
-    """Start from lam (m); return MORE, NEEDS_WORKSPACE with the required sizes in r, or another outcome."""
-    return find_method_functions(v).start(v, o, r, lam)
+cdef public int32_t lav_analyse(const view_t* v, const options_t* o, workspace_t* r, workspace_t* memory,
+                                grow_t grow) noexcept nogil:
+    """Analyse the structure (`analyse_for_method`); return NEEDS_WORKSPACE or UNFIT."""
+    cdef method_t f = find_method_functions(v)
+    return analyse_for_method(&f, v, o, r, memory, grow) if v.p.n_rows > 0 else UNFIT
+
+
+cdef public int32_t lav_start(const view_t* v, const options_t* o, workspace_t* r, const double* lam, workspace_t* memory,
+                              grow_t grow) noexcept nogil:
+    """Start from lam (m), if r has the sizes (`start_method`); return MORE or another outcome."""
+    cdef method_t f = find_method_functions(v)
+    return start_method(&f, v, o, r, lam, memory, grow)
 
 
 cdef public int32_t lav_step(const view_t* v, const options_t* o, const workspace_t* r, int32_t work, double* lam,
                              info_t* info) noexcept nogil:
-    """Do at least `work` units of work; lam (m) receives the best impulse so far."""
-    return find_method_functions(v).step(v, o, r, work, lam, info)
+    """Do up to `work` units of work, also past a certificate; lam (m) receives the best impulse so far."""
+    cdef method_t f = find_method_functions(v)
+    return step_method(&f, v, o, r, work, lam, info)
 
 
 cdef class Driver(Method):
-    """A method on a problem, with workspace that is allocated when its size is known; `start` may be called repeatedly.
+    """Run the method of the driver on a problem.
 
     Parameters
     ----------
@@ -59,7 +69,6 @@ cdef class Driver(Method):
     -----
     `fits` is whether the method accepts the problem.
     """
-    cdef workspace_t memory
     cdef readonly bint fits
 
     def __init__(self, Data data, double max_values=INFINITY, double work=INFINITY):
@@ -67,25 +76,7 @@ cdef class Driver(Method):
         self.options.method, self.options.wide, self.options.most = NEWTON, has_wide(), max_values
         self.options.work = work
         self.own = find_method_functions(&self.view)
-        with nogil:
-            self.fits = start_method(&self.view, &self.options, &self.space, NULL, &self.memory, True) == NEEDS_WORKSPACE
-
-    def __dealloc__(self):
-        free_workspace(&self.memory)
-
-    def start(self, const double[::1] impulse, double tol, int budget):
-        """Start from impulse (m,) [N s], to a relative residual of `tol`, with `budget` units of work."""
-        self.set_target_and_clear_statistics(tol, budget)
-        cdef int32_t how
-        with nogil:
-            how = start_method(&self.view, &self.options, &self.space, &impulse[0], &self.memory, False)
-        if how == UNFIT:
-            raise MemoryError(f"{self.space.n_real} numbers")
-
-    @property
-    def work(self):
-        """Multiply-adds of one factorisation; over J and M, of forming and factoring N of every island."""
-        return self.space.work
+        self.fits = data.blocks.n_rows > 0 and self.analyse() == NEEDS_WORKSPACE
 
     @property
     def islands(self):

@@ -14,13 +14,14 @@ from libc.stdint cimport int32_t, int64_t, uint64_t
 import numpy as np
 
 from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles, take_integers
-from lavender_ext.core.method cimport CERTIFICATE, MORE, options_t, workspace_t, info_t
+from lavender_ext.core.method cimport CERTIFICATE, MORE, info_t, method_t, options_t, workspace_t
 from lavender_ext.core.islands cimport find_islands, island_workspace_integers
 from lavender_ext.core.block_types cimport blocks_t, has_independent_rows, islands_t
 from lavender_ext.core.view cimport rows_t, view_t
 from lavender_ext.core.weights cimport compute_velocity_weights, set_angular_joint_weights
 from lavender_ext.engine.arrays cimport S_OUT, bind_engine_arrays, engine_t
 from lavender_ext.engine.view cimport bind_substep_problem
+from lavender_ext.host cimport analyse_for_method, start_method, step_method
 from lavender_ext.judge.measure cimport find_reference, score_given_slack
 from lavender_ext.judge.score cimport make_empty_score, score_t
 from lavender_ext.factor.factors cimport has_wide
@@ -39,7 +40,7 @@ cdef enum:
     MAX_SUBSTEP_FACTORISATIONS = 200    # maximum number of factorisations of a substep, because an image waits for the substep
 
 
-cdef struct memory_t:           # arrays of a substep, besides `warm_t`
+cdef struct substep_arrays_t:   # arrays of a substep, besides `warm_t`
     int32_t* header             # (SCRATCH_HEADER)
     int32_t* newton             # integers of Newton's method
     int32_t* islands            # `island_workspace_integers`
@@ -47,13 +48,19 @@ cdef struct memory_t:           # arrays of a substep, besides `warm_t`
     double* reference           # (blocks, 3)
 
 
-cdef inline void bind_substep_memory(const view_t* v, int64_t newton, warm_t* s, memory_t* memory, arena_t* a) noexcept nogil:
+cdef inline void bind_substep_memory(const view_t* v, int64_t newton, warm_t* s, substep_arrays_t* memory,
+                                     arena_t* a) noexcept nogil:
     """Take the arrays, with `newton` integers for Newton's method; s.width is set, unless only the integers are used."""
     memory.header, memory.newton = take_integers(a, SCRATCH_HEADER), take_integers(a, newton)
     memory.nu = take_doubles(a, v.p.n_rows)
     bind_warm_start(s, &v.p, v.r, a)
     memory.islands = take_integers(a, island_workspace_integers(v))
     memory.reference = take_doubles(a, 3 * <int64_t>v.p.n_blocks)
+
+
+cdef inline int32_t provides_memory(workspace_t* memory, int64_t n_index, int64_t n_real) noexcept nogil:
+    """Return whether the memory of the substep has these sizes; it does not grow within a call."""
+    return n_index <= memory.n_index and n_real <= memory.n_real
 
 
 cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* index, uint64_t* keys, int32_t all_stages,
@@ -65,14 +72,15 @@ cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* 
     """
     cdef engine_t e
     cdef int64_t used[3]
-    cdef int64_t needed = 0, own, n_index
-    cdef bint has_stages
+    cdef int64_t needed = 0, own
     cdef blocks_t p
     cdef rows_t r
     cdef view_t v
-    cdef workspace_t n
+    cdef options_t o = options_t(0, 0, 0, 0, 0, 0.0, 1.0, 1.0, 1.0 / 0.0, 0.0, NULL, NULL)
+    cdef workspace_t n, space
+    cdef method_t f = method_t(bodies_workspace_size, start_newton_over_bodies, step_newton_system)
     cdef warm_t s
-    cdef memory_t memory
+    cdef substep_arrays_t memory
     cdef arena_t a = make_arena(NULL, NULL)
     bind_engine_arrays(size, real, index, keys, &e, used)
     bind_substep_problem(&e, &p, &r)
@@ -80,17 +88,15 @@ cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* 
     s.width = 0
     bind_substep_memory(&v, 0, &s, &memory, &a)
     own, scratch[1] = a.n_index, 0
-    has_stages = all_stages and bodies_workspace_size(&v, NULL, &n)
-    n_index = own + (n.n_index if has_stages else 0)
-    if n_index >= INDEX_LIMIT:
+    if own >= INDEX_LIMIT:
         return -1
-    if n_index > available:
-        scratch[2] = <int32_t>n_index
+    if own > available:
+        scratch[2] = <int32_t>own
         return SCRATCH_TOO_SMALL
-    if has_stages:
+    if all_stages:                                      # Pattern, and size of the other workspace
         scratch[1] = <int32_t>(available - own)
-        n = workspace_t(scratch[1], 0, scratch + SCRATCH_HEADER, NULL, 0, 0, 0, 0.0)
-        start_newton_over_bodies(&v, NULL, &n, NULL)                # Computes the pattern and the size of the other workspace.
+        space = workspace_t(scratch[1], 0, scratch + SCRATCH_HEADER, NULL, 0, 0, 0, 0.0)
+        analyse_for_method(&f, &v, &o, &n, &space, provides_memory)
         if n.is_bound:
             needed = n.n_real
         elif scratch[1] < n.n_index < INDEX_LIMIT - own:
@@ -105,28 +111,19 @@ cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* 
     return <int32_t>needed if needed < INDEX_LIMIT else -1
 
 
-cdef inline int32_t run_newton_stages(const view_t* problem, const options_t* o, workspace_t* workspace, warm_t* s, double* lam,
-                                      double* v) noexcept nogil:
-    """Run Newton's method after `solve_from_warm_start`, also from lam = 0; return UNDECIDED with the best lam above tol."""
-    cdef info_t said
-    cdef int32_t result = start_newton_over_bodies(problem, o, workspace, lam)
-    while result == MORE or result == CERTIFICATE:
-        result = step_newton_system(problem, o, workspace, 1, lam, &said)
-        s.factorisations = said.factorisations
-        if s.trace != NULL:
-            judge_impulse(&problem.p, problem.r, s, said.tried, v, o.e0, o.v0)
-    s.relative = judge_impulse(&problem.p, problem.r, s, lam, v, o.e0, o.v0)
-    return FACTORED if said.relative <= o.tol else UNDECIDED
-
-
 cdef inline int32_t solve_newton_substep(const blocks_t* p, const rows_t* r, warm_t* s, double tol, int32_t all_stages,
-                                         const memory_t* memory, double* workspace, double* lam, double* v) noexcept nogil:
-    """Run the first phase, then with `all_stages` the further steps of Newton's method; return the phase's result code."""
+                                         const substep_arrays_t* memory, double* workspace, double* lam, double* v) noexcept nogil:
+    """Run the first phase, then with `all_stages` Newton's method, also from lam = 0; return the result code.
+
+    If it is UNDECIDED after all stages, lam is the best impulse.
+    """
     cdef int32_t j, result = solve_from_warm_start(p, r, s, tol, lam, v, 1)
     cdef double e0 = 1.0, v0 = 1.0
     cdef view_t problem
     cdef options_t o
-    cdef workspace_t n
+    cdef info_t info = info_t(0, 0, 0, 0, 1.0 / 0.0, NULL, NULL)
+    cdef workspace_t space = workspace_t(memory.header[1], INDEX_LIMIT, memory.newton, workspace, 1, 0, 0, 0.0), n = space
+    cdef method_t f = method_t(bodies_workspace_size, start_newton_over_bodies, step_newton_system)
     if result != UNDECIDED or p.n_rows == 0 or not all_stages:
         return result
     s.relative = 1.0 / 0.0
@@ -141,10 +138,15 @@ cdef inline int32_t solve_newton_substep(const blocks_t* p, const rows_t* r, war
     if not memory.header[1]:
         return UNDECIDED
     problem = view_t(p[0], NULL, r, NULL)
-    o = options_t(0, MAX_SUBSTEP_FACTORISATIONS, 0, 0, has_wide(), tol, e0, v0, 1.0 / 0.0, 0.0, NULL)
-    # `lav_newton_plan` computed the pattern
-    n = workspace_t(memory.header[1], INDEX_LIMIT, memory.newton, workspace, 1, 0, 0, 0.0)
-    return run_newton_stages(&problem, &o, &n, s, lam, v)
+    o = options_t(0, MAX_SUBSTEP_FACTORISATIONS, 0, 0, has_wide(), tol, e0, v0, 1.0 / 0.0, 0.0, NULL, NULL)
+    result = start_method(&f, &problem, &o, &n, lam, &space, provides_memory)   # `lav_newton_plan` computed the pattern.
+    while result == MORE or result == CERTIFICATE:
+        result = step_method(&f, &problem, &o, &n, 1 if s.trace != NULL else MAX_SUBSTEP_FACTORISATIONS, lam, &info)
+        s.factorisations = info.factorisations
+        if s.trace != NULL:
+            judge_impulse(p, r, s, info.tried, v, e0, v0)
+    s.relative = judge_impulse(p, r, s, lam, v, e0, v0)
+    return FACTORED if info.relative <= tol else UNDECIDED
 
 
 cdef inline void find_substep_islands(blocks_t* p, const rows_t* r, warm_t* s, int32_t* index, double* reference,
@@ -185,7 +187,7 @@ cdef public int32_t lav_newton_substep(const int32_t* size, double* real, int32_
     cdef rows_t r
     cdef warm_t s
     cdef islands_t islands
-    cdef memory_t memory
+    cdef substep_arrays_t memory
     cdef arena_t a = make_arena(workspace, scratch)
     cdef int32_t result
     cdef view_t v

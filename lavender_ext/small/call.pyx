@@ -30,7 +30,7 @@ from lavender_ext.small.call cimport (N_COUNTS, RESULT_FAILED, RESULT_IS_START, 
                                       small_rules_t, solve_workspaces_t)
 from lavender_ext.small.friction cimport friction_run_t, subproblem_t, solve_subproblem, subproblem_work_size
 from lavender_ext.small.limits cimport has_only_free_rows
-from lavender_ext.driver.host cimport free_workspace, grow_workspace_to
+from lavender_ext.host cimport free_workspace, grow_workspace_to
 from lavender_ext.small.workspace cimport fits_workspace, grow_workspace_to_arena
 from lavender_ext.judge.bounds cimport project_far_excess, project_on_bounds
 from lavender_ext.judge.measure cimport (set_zero_impulse, relative_floor_of_score, judge_view, make_judged,

@@ -8,11 +8,11 @@ from libc.string cimport memcmp, memcpy, memset
 from lavender_ext.accelerate.accelerated cimport acceleration_t, lav_anderson
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE
 from lavender_ext.core.deadline cimport deadline_t, has_passed
-from lavender_ext.core.method cimport MORE, NEEDS_WORKSPACE, options_t, workspace_t, info_t
+from lavender_ext.core.method cimport MORE, NEEDS_WORKSPACE, info_t, options_t, workspace_t
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport view_t
-from lavender_ext.driver.driver cimport NEWTON
-from lavender_ext.driver.host cimport start_method, step_method
+from lavender_ext.driver.driver cimport NEWTON, lav_analyse, lav_start, lav_step
+from lavender_ext.host cimport grow_workspace_to
 from lavender_ext.judge.measure cimport set_zero_impulse, find_reference, judge_view, relative_residual_of_score
 from lavender_ext.judge.score cimport make_empty_score, score_t
 from lavender_ext.sweep.serial cimport compute_sweep_velocities, sweep_context_t
@@ -136,12 +136,12 @@ cdef inline double run_newton(subproblem_run_t* t) noexcept nogil:
     """Run up to `MAX_SUBPROBLEM_FACTORISATIONS` of Newton's method from `answer`, and return the relative residual."""
     cdef int32_t how
     t.info.work = t.info.factorisations = 0
-    how = start_method(&t.s.v, &t.options, &t.workspace, t.s.answer, t.r, True)
+    how = lav_analyse(&t.s.v, &t.options, &t.workspace, t.r, grow_workspace_to)
     if how == NEEDS_WORKSPACE:
-        how = start_method(&t.s.v, &t.options, &t.workspace, t.s.answer, t.r, False)
+        how = lav_start(&t.s.v, &t.options, &t.workspace, t.s.answer, t.r, grow_workspace_to)
     if how != MORE:
         return 1.0 / 0.0
-    step_method(&t.s.v, &t.options, &t.workspace, MAX_SUBPROBLEM_FACTORISATIONS, t.s.answer, &t.info)
+    lav_step(&t.s.v, &t.options, &t.workspace, MAX_SUBPROBLEM_FACTORISATIONS, t.s.answer, &t.info)
     return judge_subproblem_impulse(t, t.s.answer)
 
 
@@ -180,7 +180,7 @@ cdef inline bint solve_subproblem(subproblem_t* s, friction_run_t* o, workspace_
     if now > o.tol and not has_passed(o.deadline, 0.0):
         o.factorised += 1
         t.options = options_t(NEWTON, MAX_SUBPROBLEM_FACTORISATIONS, 0, 0, o.wide, o.tol, t.e0, t.v0, 1.0 / 0.0, 0.0,
-                              o.deadline)
+                              o.deadline, NULL)
         now = run_newton(&t)
     # counters
     o.swept += t.c.iterations

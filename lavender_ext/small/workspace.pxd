@@ -1,7 +1,7 @@
 """Growing workspace with arrays taken from an arena: first to count them, then with memory."""
 from lavender_ext.core.arena cimport arena_t, make_arena
 from lavender_ext.core.method cimport workspace_t
-from lavender_ext.driver.host cimport grow_workspace_to
+from lavender_ext.host cimport grow_workspace_to
 
 
 cdef inline bint fits_workspace(const workspace_t* r, const arena_t* a) noexcept nogil:

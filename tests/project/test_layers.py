@@ -17,18 +17,18 @@ KERNELS = ROOT / "lavender_ext"
 #: Packages of lavender_ext, bottom to top, whose modules share inline headers by cimport.
 LEVELS = (
     {"core"}, {"factor", "judge", "local"}, {"derivative", "io", "sweep", "velocity_newton"}, {"newton", "pivot"},
-    {"accelerate", "engine"}, {"driver", "host"}, {"small"}, {"batch"},
+    {"accelerate", "engine"}, {"driver"}, {"small"}, {"batch"},
 )  # fmt: skip
 HEIGHT = {name: height for height, level in enumerate(LEVELS) for name in level}
 IMPORT = re.compile(r"^\s*(?:from|c?import)\s+(lavender\w*)([.\w]*)", re.MULTILINE)
 
 
 def find_breaches(package, text):
-    """Return the imports of a kernel's text that go up, sideways, to the root or to Python's package."""
+    """Return the imports of a kernel's text that go up, sideways, to Python, or to the root except `host.pxd`."""
     found = []
     for root, name in IMPORT.findall(text):
         other = name.split(".")[1] if name else ""
-        is_below = other == package or HEIGHT.get(other, 99) < HEIGHT[package]
+        is_below = other in {package, "host"} or HEIGHT.get(other, 99) < HEIGHT[package]
         if root != "lavender_ext" or not is_below:
             found.append(root + name)
     return found

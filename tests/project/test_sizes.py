@@ -11,7 +11,7 @@ GENERATED = {ROOT / "lavender" / "export" / "c" / "lavender.c"}
 #: package may exceed its number by 3 %. Lower a number, never raise it.
 LINES = {
     "lavender/sim": 6200,
-    "lavender_ext lavender_ext/driver lavender_ext/host": 300,
+    "lavender_ext lavender_ext/driver": 300,
     "lavender_ext/engine": 2500,
     "lavender_ext/io": 462,
     "lavender_ext/sweep": 1300,

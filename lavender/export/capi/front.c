@@ -56,7 +56,8 @@ struct lav_solver {
   struct core_view_view_t view; /* The problem for newton: rows of A if A was formed. */
   struct core_deadline_deadline_t limit; /* The same time, for the methods that read the clock. */
   struct core_method_options_t newton_options;
-  struct core_method_workspace_t drive;
+  struct core_method_workspace_t drive, newton_memory;
+  uint64_t newton_begin;       /* Offset of the memory of Newton's method. */
   int32_t driven;              /* Newton's method has begun with `newton_options`. */
   blocks_t q;                  /* Blocks with d, nu and step of A, for methods that use A. */
   struct pivot_direct_direct_t direct;

@@ -149,6 +149,15 @@ static int32_t form_matrix(lav_solver *s) {
 
 static const double CLOSEST = 1e-2;
 
+/* Take the memory of Newton's method after that of the problem; return 0 if the workspace is too small. */
+static int32_t grow_newton(struct core_method_workspace_t *memory, int64_t n_index, int64_t n_real) {
+  lav_solver *s = (lav_solver *)(void *)((char *)memory - offsetof(lav_solver, newton_memory));
+  s->used = s->newton_begin;
+  memory->index = TAKE(s, int32_t, n_index);
+  memory->real = TAKE(s, double, n_real);
+  return !s->is_short;
+}
+
 /* Start Newton's method at the present impulse, over bodies or over the rows of A if A was formed. */
 static int32_t begin_newton(lav_solver *s, double tol, int32_t budget) {
   s->newton_options.tol = tol;
@@ -156,12 +165,11 @@ static int32_t begin_newton(lav_solver *s, double tol, int32_t budget) {
   s->newton_options.e0 = s->start[0];
   s->newton_options.v0 = s->start[1];
   s->newton_options.most = INFINITY;
-  return k_start(&s->view, &s->newton_options, &s->drive, s->impulse);
+  return k_start(&s->view, &s->newton_options, &s->drive, s->impulse, &s->newton_memory, grow_newton);
 }
 
 static int32_t start_newton(lav_solver *s) {
-  uint64_t from = s->used;
-  int32_t how = core_method_NEEDS_WORKSPACE;
+  int32_t outcome;
   s->newton_options.method = driver_driver_NEWTON;
   s->newton_options.wide = LAVENDER_HAS_WIDE();
   s->view = s->read;
@@ -172,16 +180,11 @@ static int32_t start_newton(lav_solver *s) {
     s->view.r = NULL;
     s->view.a = &s->a;
     if (!k_workspace_size(&s->view, &s->newton_options, &s->drive)) return LAV_ERROR_UNSUPPORTED;
-    from = s->used;
   }
-  while (how == core_method_NEEDS_WORKSPACE) {
-    s->used = from;
-    s->drive.index = TAKE(s, int32_t, s->drive.n_index);
-    s->drive.real = TAKE(s, double, s->drive.n_real);
-    if (s->is_short) return LAV_ERROR_WORKSPACE;
-    how = begin_newton(s, s->newton_options.tol, s->newton_options.budget); /* Starting with the last options gives the workspace size. */
-  }
-  if (how == core_method_UNFIT) return LAV_ERROR_FACTOR;
+  s->newton_begin = s->used;
+  outcome = begin_newton(s, s->newton_options.tol, s->newton_options.budget); /* Starting with the last options gives the workspace size. */
+  if (s->is_short) return LAV_ERROR_WORKSPACE;
+  if (outcome == core_method_UNFIT) return LAV_ERROR_FACTOR;
   s->driven = 1;
   return LAV_OK;
 }
@@ -218,6 +221,7 @@ static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out)
         before = out->iterations;
         closer *= 0.25;
         begin_newton(s, closer * budget->tol, budget->iterations - before);
+        info.work = 0;
       }
     } else if (how == core_method_ROUNDOFF_LIMIT) out->outcome = LAV_ROUNDOFF_LIMIT;
     else if (how != core_method_MORE && how != core_method_CERTIFICATE) out->outcome = LAV_STALLED;

@@ -14,6 +14,7 @@ from lavender.sim.engine.values import SolverValues
 from lavender.sim.scene import Box, Plane, Scene, Sphere, arithmetic
 from lavender.sim.scene.parameters import SCENE_ORDERS, Parameters
 from lavender.sim.scene.parts import Body, Joint
+from lavender_ext.driver import memory
 from lavender_ext.engine import substep
 from lavender_ext.engine.arrays import (
     BOX,
@@ -28,7 +29,6 @@ from lavender_ext.engine.arrays import (
     compute_buffer_lengths,
 )
 from lavender_ext.engine.newton_substep import Substep
-from lavender_ext.host import memory
 
 Copy = Callable[[], np.ndarray]
 

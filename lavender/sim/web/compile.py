@@ -42,7 +42,7 @@ MODULES = (
     "core.order",
     "engine.arrays",
     "engine.substep",
-    "host.memory",
+    "driver.memory",
     "judge.measure",
     "sweep.packed",
     "sweep.pgs",

@@ -22,16 +22,15 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.lazy_import import sparse as sp
 from lavender.base.lu import factor_sparse_lu
-from lavender_ext.newton.solve import SYSTEMS, Layout, Solve
+from lavender.problem import Problem
+from lavender_ext.newton.solve import SYSTEMS, Layout, Solve, compute_body_jacobian
 
 
 class AugmentedSystem:
     """Factorises (1) and (2) for the kernel `Solve`. K is built at the first call."""
 
-    def __init__(self, system: Any, bodies: Any) -> None:
-        self.kernel: Solve = system.solve
-        self.layout: Layout = system.layout
-        self.system, self.bodies = system, bodies
+    def __init__(self, problem: Problem, layout: Layout, bodies: Any, kernel: Solve) -> None:
+        self.problem, self.layout, self.bodies, self.kernel = problem, layout, bodies, kernel
         self.k: Any = None
         self.lu: Any = None
 
@@ -43,9 +42,9 @@ class AugmentedSystem:
         deadline = self.kernel.deadline
         if deadline is not None and deadline.has_passed():
             return False
+        s = self.arrays = self.kernel.view_arrays()
         if self.k is None:
             self.k = self._build_jacobian()
-        s = self.kernel
         if what == SYSTEMS["natural"]:
             p = self._block_matrix(s.p)
             own = sp.eye_array(s.m) - p + p @ sp.diags_array(s.theta + eps)
@@ -66,8 +65,8 @@ class AugmentedSystem:
 
     def _build_jacobian(self) -> Any:
         """Build K (m, 6 n) without empty columns, and the positions of the entries of block matrices."""
-        sc, n = self.kernel, self.layout.n
-        panel, _ = sc.jacobian(self.bodies.pair, self.bodies.column)
+        sc, n = self.arrays, self.layout.n
+        panel, _ = compute_body_jacobian(self.problem.metric, self.bodies.pair, self.bodies.column)
         size, m = np.diff(sc.ptr), sc.m
         body = np.repeat(self.layout.body, size, axis=0)
         values = panel[sc.keep].reshape(m, 2, 6)
@@ -84,7 +83,7 @@ class AugmentedSystem:
 
     def _block_matrix(self, values: FloatArray) -> Any:
         """Return the block-diagonal matrix (m, m) with these values."""
-        return sp.csr_array((values, self.block_entries), shape=(self.kernel.m,) * 2)
+        return sp.csr_array((values, self.block_entries), shape=(self.arrays.m,) * 2)
 
     def _factor(self, left_factor: Any, right: Any, own: Any) -> bool:
         """Factor [[I, -(right K)^T], [left K, own]]; `right` None is the identity."""

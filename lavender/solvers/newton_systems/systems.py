@@ -6,9 +6,8 @@ dense or in compressed rows. The equations and the methods that use them are in 
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
-
-import numpy as np
 
 from lavender.base.arrays import IntArray
 from lavender.base.lu import splu
@@ -17,7 +16,7 @@ from lavender.problem import Problem
 from lavender.solvers.factors import USE_WIDE_LANES
 from lavender.solvers.newton_systems.augmented import AugmentedSystem
 from lavender_ext.factor import graph
-from lavender_ext.newton.solve import Layout, Solve
+from lavender_ext.newton.solve import Layout, Solve, compute_body_jacobian, list_element_blocks
 
 
 class Bodies(NamedTuple):
@@ -61,9 +60,7 @@ class System:
     factor_seconds = 0.0  # Upper bound of the time of a factorisation [s], on machines of the last ten years.
     dense = False  # Whether A is stored as a full matrix.
     entries = 0.0  # Number of entries of A.
-
-    def __init__(self, problem: Problem, solve: Solve) -> None:
-        self.problem, self.solve = problem, solve
+    solve: Solve
 
 
 class VelocitySystem(System):
@@ -73,19 +70,17 @@ class VelocitySystem(System):
 
     def __init__(self, problem: Problem, bodies: Bodies, like: System | None = None) -> None:
         """Build the system; the layout of an earlier system `like` between the same bodies is reused."""
-        super().__init__(problem, Solve(problem.metric))
-        solve = self.solve
-        panel, columns = solve.jacobian(bodies.pair, bodies.column)
-        structure = bodies.pair[solve.block], bodies.n, len(columns)
+        data = problem.metric
+        panel, columns = compute_body_jacobian(data, bodies.pair, bodies.column)
+        structure = bodies.pair[list_element_blocks(data)], bodies.n, len(columns)
         reused = like.layout if isinstance(like, VelocitySystem) and like.layout.serves(*structure) else None
         self.layout: Layout = reused or Layout(*structure)
         self.work = self.layout.work
         self.factor_seconds = 0.5e-9 * self.work
-        solve.use_bodies(
-            panel, columns, self.layout, solve.has_friction and problem.law == "coulomb", USE_WIDE_LANES
+        augmented = partial(AugmentedSystem, problem, self.layout, bodies)
+        self.solve = Solve.over_bodies(
+            data, panel, columns, self.layout, problem.law == "coulomb", USE_WIDE_LANES, augmented
         )
-        self.augmented = AugmentedSystem(self, bodies)
-        solve.set_external(self.augmented)
 
 
 class MatrixSystem(System):
@@ -94,16 +89,15 @@ class MatrixSystem(System):
     form = "impulse"
 
     def __init__(self, problem: Problem, may_be_dense: bool = True) -> None:
-        super().__init__(problem, Solve(problem.metric, problem.csr_data))
-        solve = self.solve
-        symmetric = problem.is_symmetric
-        with np.errstate(all="ignore"):  # Results that overflow are judged.
-            solve.use_rows(problem.csr_data, symmetric, USE_WIDE_LANES, splu, may_be_dense)
+        matrix, symmetric = problem.csr_data, problem.is_symmetric
+        solve = self.solve = Solve.over_rows(
+            problem.metric, matrix, symmetric, USE_WIDE_LANES, splu, may_be_dense
+        )
         self.dense = solve.is_dense
         if self.dense:
             self.work = solve.m**3 / 3.0  # As `costs.count_dense_work`.
         else:
-            self.work = (1.0 if symmetric else 2.0) * solve.cost
+            self.work = (1.0 if symmetric else 2.0) * solve.work
             self.entries = float(solve.entries)
         self.factor_seconds = (0.3e-9 if self.dense else 1e-9) * self.work
 

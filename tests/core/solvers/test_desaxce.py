@@ -8,8 +8,6 @@ from calls import block_diagonal, dense_h, system_in
 from hypothesis import given
 from random_problems import random_contact_problem, seeds
 
-from lavender.solvers.newton_systems.systems import make_system
-
 
 def problem_of(seed, compliant, friction="coulomb"):
     problem = random_contact_problem(seed, friction=friction, bodies=5, contacts=8)
@@ -21,8 +19,8 @@ def problem_of(seed, compliant, friction="coulomb"):
 
 @given(seed=seeds)
 def test_slip_is_de_saxces_term_and_psi_its_derivative(seed):
-    system = make_system(problem_of(seed, True), "velocity")
-    sc = solve = system.solve
+    solve = system_in(problem_of(seed, True), "velocity").solve
+    sc = solve.view_arrays()
     rng = np.random.default_rng(seed)
     s, ds = rng.normal(size=sc.m), rng.normal(size=sc.m)
     phi, psi = solve.normal_shift(s)
@@ -53,13 +51,13 @@ def test_slip_is_de_saxces_term_and_psi_its_derivative(seed):
 def test_de_saxce_step_solves_its_linear_system(form, compliant, seed):
     problem = problem_of(seed, compliant)
     system = system_in(problem, "velocity" if form == "augmented" else form)
-    sc = solve = system.solve
+    solve, sc = system.solve, system.solve.view_arrays()
     h = dense_h(problem)[np.ix_(sc.keep, sc.keep)]
     first = np.repeat(sc.ptr[:-1], np.diff(sc.ptr))
     solve.begin_interior(1e-10, 0.9)
     for _ in range(3):
         solve.scale_interior(1e-10)
-        w = np.linalg.inv(block_diagonal(system, solve.v)) - np.diag(sc.theta)
+        w = np.linalg.inv(block_diagonal(system, sc.v)) - np.diag(sc.theta)
         c = np.eye(sc.m)
         np.subtract.at(c, (first, np.arange(sc.m)), solve.form_de_saxce_matrices(0.9))
         assert solve.factor("pair", augmented=form == "augmented")
@@ -68,4 +66,4 @@ def test_de_saxce_step_solves_its_linear_system(form, compliant, seed):
         expected = np.linalg.solve(h + c @ w, r)
         # W holds entries up to 1e10 of delta's reciprocal beside 1: what the dense inverse keeps of 16 digits.
         np.testing.assert_allclose(x, expected, rtol=0, atol=2e-5 * np.abs(expected).max())
-        assert solve.step_interior()[0]
+        assert solve.step_interior()

@@ -51,20 +51,20 @@ def test_newton_interior_point_with_more_rows_than_velocities_takes_no_more_step
 def test_newton_system_is_the_derivative_and_is_solved(form, law, seed):
     problem = random_contact_problem(seed, friction="cone" if law == LAWS["cone"] else "coulomb", bodies=6, contacts=10)
     system = system_in(problem, "velocity" if form == "augmented" else form)
-    solve = system.solve
-    m, g, eps = solve.m, solve.g, 1e-3
+    solve, arrays = system.solve, system.solve.view_arrays()
+    m, g, eps = arrays.m, arrays.g, 1e-3
     rng = np.random.default_rng(seed)
     z, dz = rng.normal(size=m), rng.normal(size=m)
     solve.evaluate_natural_map(z, solve.multiply_matrix(z) - g, law, eps)
     slope = solve.multiply_by_natural_map_derivative(dz)
     # F is piecewise smooth: two nearby points on one piece give the derivative; other pieces tell nothing.
-    p = solve.p.copy()
+    p = arrays.p.copy()
     step = 1e-7
     sides = []
     for sign in (1.0, -1.0):
         near = z + sign * step * dz
         side = solve.evaluate_natural_map(near, solve.multiply_matrix(near) - g, law, eps)
-        sides.append((side, np.abs(solve.p - p).max()))
+        sides.append((side, np.abs(arrays.p - p).max()))
     if max(change for _, change in sides) < 1e-4:
         difference = (sides[0][0] - sides[1][0]) / (2.0 * step)
         # Central differences: third derivatives near the tip of a cone times step^2, rounding over step.
@@ -73,8 +73,8 @@ def test_newton_system_is_the_derivative_and_is_solved(form, law, seed):
     assert solve.factor("natural", eps, augmented=form == "augmented")
     r = rng.normal(size=m)
     x = solve.solve("natural", r)
-    matrix = np.eye(m) + block_diagonal(system, solve.p) @ (
-        dense_h(problem)[np.ix_(system.solve.keep, system.solve.keep)] + (eps - 1.0) * np.eye(m)
+    matrix = np.eye(m) + block_diagonal(system, arrays.p) @ (
+        dense_h(problem)[np.ix_(arrays.keep, arrays.keep)] + (eps - 1.0) * np.eye(m)
     )
     # eps = 1e-3 bounds the condition number by about 1e4 for these sizes.
     np.testing.assert_allclose(matrix @ x, r, rtol=0, atol=1e-9 * (1.0 + np.abs(x).max()))
@@ -117,10 +117,11 @@ def on_bodies(k, layout, lu, wide=True):
     """Newton's method whose H is K K^T, K (rows, 2, s) of the bodies `layout.node`, on rows of any problem."""
     m, s = len(k), layout.s
     problem = lv.Problem.lcp(np.eye(m), np.ones(m))
-    solve = Solve(problem.metric, problem.csr_data)
     panel = np.zeros((m, 2, 6))
     panel[:, :, :s] = np.where(layout.swapped[:, None, None] > 0, k[:, ::-1], k)
-    solve.use_bodies(panel.reshape(m, 12), np.arange(s, dtype=np.int32), layout, lu, wide)
+    columns = np.arange(s, dtype=np.int32)
+    solve = Solve.over_bodies(problem.metric, panel.reshape(m, 12), columns, layout, lu, wide)
+    solve.start(np.zeros(m), 0.0, 1)
     return solve
 
 
@@ -155,7 +156,7 @@ def test_factor_of_a_graph_of_bodies_solves_as_a_dense_matrix(s, n, m):
         outs = set()
         for wide in (True, False):
             solve = on_bodies(k, layout, what == "pair", wide)
-            solve.v[:] = v
+            solve.view_arrays().v[:] = v
             for _ in range(2):  # what a factor leaves behind does not reach the next
                 assert solve.factor(what)
                 out = solve.solve(what, r)
@@ -187,7 +188,7 @@ def test_newton_solves_sparse_free_rows_together_with_all_rows(even, seed):
     h, rng, eps = dense_h(problem), np.random.default_rng(seed), 1e-6
     free = rng.random(200) < 0.6
     r = rng.normal(size=200)
-    system.solve.p[:] = free
+    system.solve.view_arrays().p[:] = free
     assert system.solve.factor("natural", eps)
     assert not system.solve.uses_fallback
     expected = np.linalg.solve(np.where(free[:, None], h, 0.0) + np.diag(np.where(free, eps, 1.0)), r)

@@ -10,7 +10,7 @@ from worked import after
 import lavender as lv
 from lavender.sim.engine.layout import HEAD
 from lavender.sim.engine.state import State
-from lavender_ext.host import memory
+from lavender_ext.driver import memory
 
 SCENES = {
     "stack": {}, "pyramid": {"base": 4, "friction_shape": "box"}, "chain": {"n": 8}, "spinner": {},

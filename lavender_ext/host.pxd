@@ -1,0 +1,82 @@
+"""Start a method in memory of its caller, and step it: for Python, batches, small calls, the engine and the C library.
+
+A method is three functions (`core/method.pxd`) and reads the deadline of its options. Callers that may allocate use
+`grow_workspace_to`, and reuse their memory for a sequence of problems: allocating new pages costs more than solving a small one.
+"""
+from libc.stdint cimport int32_t, int64_t
+from libc.stdlib cimport free, malloc
+
+from lavender_ext.core.method cimport CERTIFICATE, MORE, NEEDS_WORKSPACE, UNFIT, info_t, method_t, options_t, workspace_t
+from lavender_ext.core.view cimport view_t
+
+
+cdef enum:
+    MAX_SPARE_NUMBERS = 1 << 20     # Memory grows to twice the requested size, or by this number of spare numbers.
+
+# Provide memory of at least these sizes, of which the first integers keep their content unless more are requested than before;
+# return 0 if there is not enough.
+ctypedef public int32_t (*grow_t)(workspace_t* memory, int64_t n_index, int64_t n_real) noexcept nogil
+
+
+cdef inline int32_t grow_workspace_to(workspace_t* r, int64_t n_index, int64_t n_real) noexcept nogil:
+    """Grow the workspace to at least these sizes; return 0 if out of memory. Growing discards the content."""
+    cdef int64_t size
+    if n_index > r.n_index:
+        free(r.index)
+        size = n_index + min(n_index, MAX_SPARE_NUMBERS)
+        r.index = <int32_t*>malloc(size * sizeof(int32_t))
+        r.n_index = size if r.index != NULL else 0
+    if n_real > r.n_real:
+        free(r.real)
+        size = n_real + min(n_real, MAX_SPARE_NUMBERS)
+        r.real = <double*>malloc(size * sizeof(double))
+        r.n_real = size if r.real != NULL else 0
+    return n_index <= r.n_index and n_real <= r.n_real
+
+
+cdef inline void free_workspace(workspace_t* r) noexcept nogil:
+    """Free both buffers of a workspace."""
+    free(r.index)
+    free(r.real)
+
+
+cdef inline int32_t analyse_for_method(const method_t* f, const view_t* v, const options_t* o, workspace_t* r,
+                                       workspace_t* memory, grow_t grow) noexcept nogil:
+    """Analyse the structure of the problem in the integers of `memory`, and set the sizes and `work` of r.
+
+    Return NEEDS_WORKSPACE if `start_method` may follow, and UNFIT if the method does not accept the problem or the memory does
+    not suffice. r then has the requested sizes.
+    """
+    cdef int32_t outcome = NEEDS_WORKSPACE
+    cdef int64_t n_index = -1
+    r[0] = workspace_t(0, 0, NULL, NULL, 0, 0, 0, 0.0)
+    if not f.workspace(v, o, r):
+        return UNFIT
+    while outcome == NEEDS_WORKSPACE and not r.is_bound and r.n_index != n_index:
+        n_index = r.n_index
+        if not grow(memory, n_index, 0):
+            return UNFIT
+        r.index, r.real = memory.index, NULL
+        outcome = f.start(v, o, r, NULL)
+    return outcome
+
+
+cdef inline int32_t start_method(const method_t* f, const view_t* v, const options_t* o, workspace_t* r, const double* lam,
+                                 workspace_t* memory, grow_t grow) noexcept nogil:
+    """Start from lam (m), if r has the sizes; return MORE or another outcome, UNFIT if the memory does not suffice."""
+    cdef int32_t outcome = NEEDS_WORKSPACE
+    while outcome == NEEDS_WORKSPACE:
+        if not grow(memory, r.n_index, r.n_real):
+            return UNFIT
+        r.index, r.real = memory.index, memory.real
+        outcome = f.start(v, o, r, lam)
+    return outcome
+
+
+cdef inline int32_t step_method(const method_t* f, const view_t* v, const options_t* o, const workspace_t* r, int32_t work,
+                                double* lam, info_t* info) noexcept nogil:
+    """Do up to `work` units of work, also past a certificate; return the outcome."""
+    cdef int32_t outcome = MORE, last = info.work + work
+    while (outcome == MORE or outcome == CERTIFICATE) and info.work < last:
+        outcome = f.step(v, o, r, last - info.work, lam, info)
+    return outcome
