@@ -2,11 +2,14 @@
 
     python -m benchmarks scale [--structures NAMES] [--rows N ...] [--sliding V ...] [--spread S ...] [--seed 7]
                                [--case NAME ...] [--limit 20] [--base CHECKOUT ...] [--siconos PYTHON] [--out FILE]
-                               [--from FILE ...] [--figure FILE]
+                               [--from FILE ...] [--figure FILE] [--law coulomb] [--tol 1e-6] [--without STATE ...]
+
+`--without` names a state of `lavender_ext/newton/plan.pxd`. `newton` of a copy of this checkout, built without that
+state, solves the same problems. A state remains in the plan if a problem is lost or takes 1.3 times as long without it.
 
 Every solve runs in a process of its own, which reads the problem from a file, solves a small problem first, and then
-solves to `TOL` without a start: CPU time of one thread, smallest of alternating runs if a run is short; increase of the
-peak memory of the process; factorisations. Answers are judged under Coulomb's law by this checkout. A mix is a list of
+solves to `--tol` without a start: CPU time of one thread, smallest of alternating runs if a run is short; increase of
+the peak memory of the process; factorisations. Answers are judged by this checkout, under `--law`. A mix is a list of
 stages (solver, law, iterations), each started from the impulse of the one before, which ends as soon as Coulomb's law
 is met. Regret is the time of `auto` divided by the time of the fastest named solver or mix. If `auto` solves a problem,
 the others end after `MAX_SLOWDOWN` times its time; the regret is 1 if none of them solves it until then. Limits
@@ -19,6 +22,8 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -36,7 +41,7 @@ from benchmarks.peers.adapters import check_siconos, contestants
 from benchmarks.scale_structures import HELD_OUT, STRUCTURES, build
 
 ROOT = Path(__file__).parents[1]
-TOL = 1e-6  # Relative residual to reach.
+PLAN = Path("lavender_ext", "newton", "plan.pxd")
 SIZES = (900, 3_000, 10_000, 30_000, 60_000, 200_000)
 MIN_GROWTH_ROWS = 2_500
 MAX_REPEATED_TIME = 0.5  # [s] Shorter solves run three times, and the smallest time counts.
@@ -44,7 +49,10 @@ MAX_SLOWDOWN, MIN_LIMIT = 3.0, 0.2  # Others may take this multiple of the time 
 START_TIME = 60.0  # [s] A process may take this much longer than the limit of its solve.
 SICONOS_MAX_ROWS = 8_000  # Larger problems take Siconos longer than any limit of a table.
 SICONOS_SOLVERS = ("siconos NSGS", "siconos ADMM", "siconos NSN_AC")
-Stage = tuple[str, str, int]  # solver, law, iterations (0: the solver's default)
+Stage = tuple[
+    str, str, int
+]  # solver, law ("coulomb": that of the problem), iterations (0: the solver's default)
+Copy = tuple[str, str, Path, str]  # name in tables, interpreter, folder of a built checkout, contestant
 CONTESTANTS: dict[str, tuple[Stage, ...]] = {
     "auto": (("auto", "coulomb", 0),),
     "newton": (("newton", "coulomb", 0),),
@@ -73,7 +81,7 @@ while best == float("inf") or (best < task["repeat"] and spent < 3.0 * best):
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     begun, start, impulse, work, names = time.perf_counter(), time.process_time(), None, {}, []
     for solver, law, count in task["stages"]:
-        law_problem = problem if law == problem.law else problem.relaxed(law)
+        law_problem = problem if law in ("coulomb", problem.law) else problem.relaxed(law)
         remaining = task["limit"] - (time.perf_counter() - begun)
         if remaining <= 0.01:
             break
@@ -94,10 +102,10 @@ print(json.dumps({"time": best, "memory": memory / 1024, "work": work, "stages":
 
 
 def run_worker(
-    python: str, folder: Path, path: Path, stages: tuple[Stage, ...], limit: float
+    python: str, folder: Path, path: Path, stages: tuple[Stage, ...], limit: float, tol: float
 ) -> dict[str, Any]:
     """Run stages on a problem's file in a new process; return its measurement, empty if the process failed."""
-    task = {"path": str(path), "stages": stages, "tol": TOL, "limit": limit, "repeat": MAX_REPEATED_TIME}
+    task = {"path": str(path), "stages": stages, "tol": tol, "limit": limit, "repeat": MAX_REPEATED_TIME}
     variables = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     Path(f"{path}.npy").unlink(missing_ok=True)
     try:
@@ -114,7 +122,9 @@ def run_worker(
     return measured
 
 
-def run_siconos(problem: lv.Problem, python: str, limit: float) -> Iterator[tuple[str, dict[str, Any]]]:
+def run_siconos(
+    problem: lv.Problem, python: str, limit: float, tol: float
+) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield (name, measurement) for each of Siconos' solvers: the first tolerance at which the judge accepts."""
     for contestant in contestants(python):
         if contestant.name not in SICONOS_SOLVERS or contestant.refuses(problem):
@@ -123,19 +133,38 @@ def run_siconos(problem: lv.Problem, python: str, limit: float) -> Iterator[tupl
         for call in contestant.runs(problem, limit):
             seconds, impulse = call()
             residual = lv.residual(problem, impulse).relative
-            if residual <= TOL:
+            if residual <= tol:
                 break
-        yield contestant.name, {"time": seconds, "residual": residual, "solved": residual <= TOL}
+        yield contestant.name, {"time": seconds, "residual": residual, "solved": residual <= tol}
+
+
+def build_without(state: str, folder: Path) -> Copy:
+    """Build a copy of this checkout in which Newton's plan leaves out a state, and return it."""
+    copy = folder / f"without {state}"
+    ignored = shutil.ignore_patterns(".git", ".venv", ".hypothesis", "__pycache__")
+    shutil.copytree(ROOT, copy, ignore=ignored, symlinks=True)
+    plan = (copy / PLAN).read_text(encoding="utf-8")
+    states = re.findall(
+        r"\b[A-Z_]+(?= = )", "".join(re.findall(r"# states of PLAN_.*?\n\n", plan, re.DOTALL))
+    )
+    branch = f"if state == {state}:\n"
+    if state not in states or plan.count(branch) != 1:
+        raise click.BadParameter(
+            f"{state!r} is not a state of {PLAN} with a phase; the states are {', '.join(states)}"
+        )
+    # The state begins no phase, so that the next state follows.
+    without = f"if state == {state}:\n        pass\n    elif state < 0:\n"
+    (copy / PLAN).write_text(plan.replace(branch, without), encoding="utf-8")
+    subprocess.run([sys.executable, "setup.py", "-q", "build_ext", "--inplace"], cwd=copy, check=True)
+    return f"newton without {state}", sys.executable, copy, "newton"
 
 
 def measure(
-    problem: lv.Problem, names: list[str], bases: list[Path], limit: float
+    problem: lv.Problem, names: list[str], copies: list[Copy], limit: float, tol: float
 ) -> dict[str, dict[str, Any]]:
     """Return {contestant: {time [s], memory [MiB], residual, solved, work}} on one problem."""
     tasks = [(name, sys.executable, ROOT, CONTESTANTS[name]) for name in names]
-    tasks[1:1] = [
-        (f"auto of {base.name}", str(base / ".venv/bin/python"), base, CONTESTANTS["auto"]) for base in bases
-    ]
+    tasks[1:1] = [(name, python, folder, CONTESTANTS[stages]) for name, python, folder, stages in copies]
     measured = {}
     with tempfile.TemporaryDirectory() as temporary:
         path = Path(temporary) / "problem.npz"
@@ -145,12 +174,12 @@ def measure(
             if name in CONTESTANTS and auto is not None and auto["solved"]:
                 allowed = min(limit, max(MIN_LIMIT, MAX_SLOWDOWN * auto["time"]))
             load_per_core = os.getloadavg()[0] / (os.cpu_count() or 1)
-            found = run_worker(python, folder, path, stages, allowed * max(1.0, load_per_core))
+            found = run_worker(python, folder, path, stages, allowed * max(1.0, load_per_core), tol)
             if found:
                 found["residual"] = float(lv.residual(problem, np.load(f"{path}.npy")).relative)
             else:
                 found = {"time": math.nan, "memory": math.nan, "residual": math.inf, "work": {}, "stages": []}
-            measured[name] = found | {"solved": found["residual"] <= TOL}
+            measured[name] = found | {"solved": found["residual"] <= tol}
     return measured
 
 
@@ -255,7 +284,7 @@ def draw_figure(lines: list[dict[str, Any]], path: Path) -> None:
         axis.grid(alpha=0.3)
     start = np.array([3e3, 2e5])
     axes[0].plot(start, 2e-6 * start, "k:", lw=1, label="proportional to rows")
-    axes[0].set_ylabel(f"CPU time of auto to {TOL:g} [s]")
+    axes[0].set_ylabel("CPU time of auto [s]")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center", fontsize=8)
     figure.savefig(path, dpi=120)
     plt.close(figure)
@@ -282,6 +311,17 @@ def draw_figure(lines: list[dict[str, Any]], path: Path) -> None:
 @click.option("--limit", default=20.0, show_default=True, help="Time limit of a solve [s].")
 @click.option("--base", "bases", multiple=True, type=click.Path(path_type=Path, exists=True),
               help="Built checkout with a .venv, whose auto solves the same problems; several times.")  # fmt: skip
+@click.option(
+    "--without", "states", multiple=True, help="State that a copy of Newton's plan leaves out; several times."
+)
+@click.option(
+    "--law",
+    type=click.Choice(["coulomb", "cone"]),
+    default="coulomb",
+    show_default=True,
+    help="Law of friction.",
+)
+@click.option("--tol", default=1e-6, show_default=True, help="Relative residual to reach.")
 @click.option("--siconos", envvar="LAVENDER_SICONOS", default="", help="Interpreter that has Siconos.")
 @click.option("--from", "read", multiple=True, type=click.Path(path_type=Path, exists=True),
               help="Print tables of --out files.")  # fmt: skip
@@ -289,8 +329,9 @@ def draw_figure(lines: list[dict[str, Any]], path: Path) -> None:
 @out_option("Write every measurement to this JSON file, after each problem.")
 def command(
     structures: str, rows: tuple[int, ...], sliding: tuple[float, ...], spread: tuple[float, ...],
-    seed: tuple[int, ...], cases: tuple[str, ...], solvers: str, limit: float, bases: tuple[Path, ...], siconos: str,
-    read: tuple[Path, ...], figure: Path | None, out: Path | None,
+    seed: tuple[int, ...], cases: tuple[str, ...], solvers: str, limit: float, bases: tuple[Path, ...],
+    states: tuple[str, ...], law: str, tol: float, siconos: str, read: tuple[Path, ...], figure: Path | None,
+    out: Path | None,
 ) -> None:  # fmt: skip
     """Measure the cost of exact friction against the number of rows."""
     names = ["auto", *(name for name in split_names(solvers, CONTESTANTS) if name != "auto")]
@@ -303,17 +344,24 @@ def command(
         for name, size, speed, deviation, draw in (() if read or cases else plan)
     )
     named = ((describe_case(case), case.problem) for case in map(lv.suite.case, cases))
-    for (name, size, speed, deviation, draw), problem in chain(problems, named):
-        runs = measure(problem, names, [base.resolve() for base in bases], limit)
-        if siconos and problem.m <= SICONOS_MAX_ROWS:
-            runs |= dict(run_siconos(problem, siconos, limit))
-        line = {"structure": name, "rows": size, "m": problem.m, "sliding": speed, "spread": deviation, "seed": draw,
-                "runs": runs}  # fmt: skip
-        lines.append(line)
-        click.echo(f"{problem.name} {problem.m} rows: " + ", ".join(
-            f"{key} {format_run(found)}" for key, found in runs.items()), err=True)  # fmt: skip
-        if out is not None:
-            write_json(out, lines)
+    copies: list[Copy] = [
+        (f"auto of {base.name}", str(base.resolve() / ".venv/bin/python"), base.resolve(), "auto")
+        for base in bases
+    ]
+    with tempfile.TemporaryDirectory() as folder:
+        copies += [build_without(state, Path(folder)) for state in states]
+        for (name, size, speed, deviation, draw), given in chain(problems, named):
+            problem = given.relaxed("cone") if law == "cone" else given
+            runs = measure(problem, names, copies, limit, tol)
+            if siconos and problem.m <= SICONOS_MAX_ROWS:
+                runs |= dict(run_siconos(problem, siconos, limit, tol))
+            line = {"structure": name, "rows": size, "m": problem.m, "sliding": speed, "spread": deviation,
+                    "seed": draw, "runs": runs}  # fmt: skip
+            lines.append(line)
+            click.echo(f"{given.name} {problem.m} rows: " + ", ".join(
+                f"{key} {format_run(found)}" for key, found in runs.items()), err=True)  # fmt: skip
+            if out is not None:
+                write_json(out, lines)
     print_tables(lines)
     if figure is not None:
         draw_figure(lines, figure)

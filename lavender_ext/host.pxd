@@ -1,7 +1,6 @@
 """Start a method in memory of its caller, and step it: for Python, batches, small calls, the engine and the C library.
 
-A method is three functions (`core/method.pxd`) and reads the deadline of its options. Callers that may allocate use
-`grow_workspace_to`, and reuse their memory for a sequence of problems: allocating new pages costs more than solving a small one.
+Callers that may allocate use `grow_workspace_to`, and reuse their memory: new pages cost more than solving a small problem.
 """
 from libc.stdint cimport int32_t, int64_t
 from libc.stdlib cimport free, malloc
@@ -13,8 +12,7 @@ from lavender_ext.core.view cimport view_t
 cdef enum:
     MAX_SPARE_NUMBERS = 1 << 20     # Memory grows to twice the requested size, or by this number of spare numbers.
 
-# Provide memory of at least these sizes, of which the first integers keep their content unless more are requested than before;
-# return 0 if there is not enough.
+# Provide at least these sizes, with the content of the integers unless they grow; return 0 if there is not enough memory.
 ctypedef public int32_t (*grow_t)(workspace_t* memory, int64_t n_index, int64_t n_real) noexcept nogil
 
 
@@ -42,11 +40,7 @@ cdef inline void free_workspace(workspace_t* r) noexcept nogil:
 
 cdef inline int32_t analyse_for_method(const method_t* f, const view_t* v, const options_t* o, workspace_t* r,
                                        workspace_t* memory, grow_t grow) noexcept nogil:
-    """Analyse the structure of the problem in the integers of `memory`, and set the sizes and `work` of r.
-
-    Return NEEDS_WORKSPACE if `start_method` may follow, and UNFIT if the method does not accept the problem or the memory does
-    not suffice. r then has the requested sizes.
-    """
+    """Analyse the structure in integers of `memory`; return NEEDS_WORKSPACE with the sizes in r, or UNFIT, also without memory."""
     cdef int32_t outcome = NEEDS_WORKSPACE
     cdef int64_t n_index = -1
     r[0] = workspace_t(0, 0, NULL, NULL, 0, 0, 0, 0.0)

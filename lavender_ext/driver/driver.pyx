@@ -64,12 +64,8 @@ cdef class Driver(Method):
         Maximum number of values of the matrix N of an island over J and M. A larger island is not accepted.
     work : float
         Number of multiply-adds of a factorisation above which an island may be rejected without analysis.
-
-    Notes
-    -----
-    `fits` is whether the method accepts the problem.
     """
-    cdef readonly bint fits
+    cdef readonly bint fits     # whether the method accepts the problem
 
     def __init__(self, Data data, double max_values=INFINITY, double work=INFINITY):
         self.data, self.view = data, data.get_pointers()

@@ -219,7 +219,7 @@ cdef inline void continue_damped_newton_stretches(newton_t* n) noexcept nogil:
         push_damped_newton(n, x.length)
         return
     x.is_running = 0
-    best = end_separate_best(n, NULL)
+    best = end_separate_best(n)
     if best > 0.5 * x.residual or best == 1.0 / 0.0 or is_at_roundoff(n):
         pop_phase(n)
         return

@@ -20,7 +20,7 @@ from libc.math cimport fabs
 from libc.stdint cimport int32_t
 from libc.string cimport memset
 
-from lavender_ext.core.block_types cimport CONE
+from lavender_ext.core.block_types cimport CONE, COULOMB
 from lavender_ext.core.validate cimport all_finite, norm_inf
 from lavender_ext.judge.score cimport relative_residual
 from lavender_ext.newton.active_set cimport begin_active_set
@@ -28,7 +28,7 @@ from lavender_ext.newton.cones cimport cone_gap, cone_size, has_lower_bound, has
 from lavender_ext.newton.damped_newton cimport begin_damped_newton, push_damped_newton
 from lavender_ext.newton.elements cimport elements_t, is_row
 from lavender_ext.newton.run cimport (AUGMENTED_NEWTON, INTERIOR_POINT, INTERIOR_WITH_NEWTON, MAX_INNER_STEPS,
-                                      N_AUGMENTED_DE_SAXCE, N_AUGMENTED_INTERIOR, N_AUGMENTED_NEWTON, N_DE_SAXCE, N_INTERIOR,
+                                      N_AUGMENTED_INTERIOR, N_AUGMENTED_NEWTON, N_DE_SAXCE, N_INTERIOR,
                                       PLAN_COULOMB, augmented_newton_t, compute_slack, copy_vector, is_at_roundoff,
                                       is_budget_spent, is_finished, judge_and_keep_best_point, newton_t, pop_phase, progress_t,
                                       push_phase)
@@ -263,10 +263,10 @@ cdef inline void step_interior_point(newton_t* n) noexcept nogil:
 # -- with Newton trials ------------------------------------------------------------------------------------------------
 
 
-cdef inline void begin_interior_with_newton(newton_t* n, int32_t law, int32_t augmented) noexcept nogil:
-    """Begin steps of De Saxce's interior point, or of an augmented one, with attempts to finish by Newton steps of `law`."""
+cdef inline void begin_interior_with_newton(newton_t* n, int32_t augmented) noexcept nogil:
+    """Begin steps of De Saxce's interior point, or of the augmented one, with attempts to finish by Newton steps."""
     reset_interior_progress(n, 1e-5 if augmented else 1e-3)
-    n.progress.law, n.progress.augmented = law, augmented
+    n.progress.augmented = augmented
     push_phase(n, INTERIOR_WITH_NEWTON)
 
 
@@ -283,10 +283,7 @@ cdef inline void step_interior_with_newton(newton_t* n) noexcept nogil:
             pop_phase(n)
             return
         k.steps += 1
-        if k.law == CONE:
-            n.counts[N_AUGMENTED_INTERIOR] += 1
-        else:
-            n.counts[N_AUGMENTED_DE_SAXCE if k.augmented else N_DE_SAXCE] += 1
+        n.counts[N_AUGMENTED_INTERIOR if k.augmented else N_DE_SAXCE] += 1
         residual = judge_and_keep_best_point(n, n.ip.z)
         k.idle = 0 if residual < 0.5 * k.lowest else k.idle + 1
         if residual < k.lowest:
@@ -298,7 +295,7 @@ cdef inline void step_interior_with_newton(newton_t* n) noexcept nogil:
             if k.augmented:
                 begin_augmented_newton(n, n.ip.z)
             else:
-                begin_damped_newton(n, n.ip.z, k.law, residual, TRIAL_INNER_STEPS)
+                begin_damped_newton(n, n.ip.z, COULOMB, residual, TRIAL_INNER_STEPS)
                 push_damped_newton(n, 1)
             return
     else:
@@ -333,7 +330,7 @@ cdef inline void step_augmented_newton(newton_t* n) noexcept nogil:
     x.steps_left -= 1
     n.s.augmented = 1
     compute_slack(n, x.z, n.slack)
-    evaluate_system_natural_map(&n.s, x.z, n.slack, n.progress.law, augmented_shift(), n.f)
+    evaluate_system_natural_map(&n.s, x.z, n.slack, CONE, augmented_shift(), n.f)
     factor_newton_system(&n.s, NATURAL, augmented_shift())
     n.counts[N_AUGMENTED_NEWTON] += 1
     for j in range(n.s.e.m):

@@ -20,30 +20,39 @@
                                               if many contacts slide
                     CONVEX_FLOW               Euler steps from it, if few contacts slide          FIRST_PATH
                     FIRST_PATH                path of smoothed problems, unless joints are rigid  SECOND_DE_SAXCE
-                    SECOND_DE_SAXCE           De Saxce's interior point with 0.7 of it            AUGMENTED_DE_SAXCE
-                    AUGMENTED_DE_SAXCE        De Saxce's on the augmented system, if joints are   LAST_FLOW
-                                              rigid
+                    SECOND_DE_SAXCE           De Saxce's interior point with 0.7 of it            LAST_FLOW
                     LAST_FLOW                 Euler steps from the best point                     COULOMB_DAMPED_NEWTON
                     COULOMB_DAMPED_NEWTON     proximal damped Newton from the best point          COULOMB_END
 
-Problems that need a state; those of weights are tests of tests/suite/test_newton_on_suite.py, the bridge is one of
-tests/sim/engine/test_engine_newton.py:
+Problems that need a state: they are lost without it, or take this many times as long. `python -m benchmarks scale --without
+STATE` measures it. The first word is a structure of benchmarks/scale_structures.py with rows, sliding [m/s] and spread of log
+mass, a case of the suite, or a file of the test data; tol is 1e-6 if there is no other number.
 
-    SECOND_CONE_WEIGHT   pyramid(k=30, friction="coulomb") under the cone law, to 1e-9
-    THIRD_CONE_WEIGHT    pyramid(k=6, mass_ratio=1e6, friction="coulomb", sliding=0.5) under the cone law, to 1e-8
-    AUGMENTED_INTERIOR_POINT, AUGMENTED_DE_SAXCE    Scene("bridge", friction=0.5), step 99, to 1e-8
-    FIRST_FLOW           pyramidF(k=14), to 1e-6 within 360 factorisations
-    LAST_FLOW            pyramidF(k=12, mass_ratio=1e6, sliding=2), to 1e-8
+    START_ACTIVE_SET          granular(n=6) from its solution, b changed by 1 %: 2.4
+    UNBOUNDED_ACTIVE_SET      mlcp_Buck2
+    ROWS_INTERIOR_POINT       mlcp_deltasigma
+    FIRST_CONE_WEIGHT         heap 3000 0.5 1, cone law, to 1e-8: 2.7
+    SECOND_CONE_WEIGHT        pyramid(k=30, friction="coulomb"), cone law, to 1e-9
+    THIRD_CONE_WEIGHT         pyramid(k=6, mass_ratio=1e6, friction="coulomb", sliding=0.5), cone law, to 1e-8
+    AUGMENTED_INTERIOR_POINT  Scene("bridge", friction=0.5), step 99, to 1e-8
+    CONVEX_DAMPED_NEWTON      lcpgen_psd-300, proof that it has no solution
+    START_FLOW                granularF(n=6, sliding=2, seed=2) from the solution of the cone law: 2.4
+    START_DAMPED_NEWTON       engine/balls_step_0030: 4.6
+    FIRST_DE_SAXCE            cards 3000 0.1 0: 20
+    FIRST_FLOW                cards 900 0.1 0: 5.0
+    CONVEX_POINT              pile 3000 0.5 0
+    CONVEX_FLOW               granularF(n=4, sliding=2, seed=10): 9
+    FIRST_PATH                wall 3000 0.5 1
+    SECOND_DE_SAXCE           ragdolls 300 0.5 0: 1.9
+    LAST_FLOW, COULOMB_DAMPED_NEWTON    wall 3000 0.5 1: each solves it without the other
 
 A host that has a better point begins Euler steps from it with `continue_from_better_point`.
 
 Every state ends the solve as soon as the best point is within tol or at the round-off limit, a certificate is proven,
 or the budget is spent. De Saxce's interior point has states of its own:
 
-    DE_SAXCE_INTERIOR    interior point                              far from a solution: end;  else DE_SAXCE_FIRST_END
-                         on the augmented system                     end
-    DE_SAXCE_FIRST_END   damped Newton from its best point           DE_SAXCE_SECOND_END
-    DE_SAXCE_SECOND_END  the same with a smaller proximal weight     end
+    DE_SAXCE_INTERIOR    interior point                              far from a solution: end;  else DE_SAXCE_END
+    DE_SAXCE_END         damped Newton from its best point           end
 """
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
@@ -92,16 +101,14 @@ cdef enum:                      # states of PLAN_COULOMB
     CONVEX_FLOW = 5
     FIRST_PATH = 6
     SECOND_DE_SAXCE = 7
-    AUGMENTED_DE_SAXCE = 8
-    LAST_FLOW = 9
-    COULOMB_DAMPED_NEWTON = 10
-    COULOMB_END = 11
+    LAST_FLOW = 8
+    COULOMB_DAMPED_NEWTON = 9
+    COULOMB_END = 10
 
 cdef enum:                      # states of DE_SAXCE
     DE_SAXCE_INTERIOR = 0
-    DE_SAXCE_FIRST_END = 1
-    DE_SAXCE_SECOND_END = 2
-    DE_SAXCE_ENDED = 3
+    DE_SAXCE_END = 1
+    DE_SAXCE_ENDED = 2
 
 cdef enum:
     POINT_REFINEMENTS = 3       # Refinements of an interior point's first z with the factor of its weighted system.
@@ -115,10 +122,9 @@ cdef enum:
     LAST_FLOW_PATIENCE = 300    # The last Euler steps end if so many factorisations do not halve the residual.
     FIRST_FLOW_FACTORISATIONS = 200     # Budget of Euler steps; walls and pyramids that they solve take up to 200.
     START_FACTORISATIONS = 8    # First stretch of damped Newton; a start near a solution gains within it.
-    FIRST_END_INNER_STEPS = 10
-    FIRST_END_FACTORISATIONS = 15   # Factorisations of the first damped Newton phase after De Saxce's interior point.
+    END_INNER_STEPS = 10
+    END_FACTORISATIONS = 15     # Factorisations of the damped Newton phase after De Saxce's interior point.
     MAX_AUGMENTED_ROWS = 10000  # With more rows, one factorisation of the augmented system may exceed 0.2 s.
-    SECOND_END_FACTORISATIONS = 12  # Factorisations and inner steps of the second damped Newton phase after it.
 
 
 cdef inline double first_derivative_fraction() noexcept nogil:
@@ -260,7 +266,7 @@ cdef inline void enter_next_convex_state(newton_t* n) noexcept nogil:
     """Enter the next state of the convex laws."""
     cdef int32_t state = n.stage
     cdef double* z
-    n.stage = state + 1
+    n.stage = AUGMENTED_INTERIOR_POINT if state == ROWS_INTERIOR_POINT else state + 1
     if state != START_ACTIVE_SET and state != FIRST_CONE_WEIGHT and is_over(n):
         state = CONVEX_END
     if state == START_ACTIVE_SET:
@@ -272,7 +278,6 @@ cdef inline void enter_next_convex_state(newton_t* n) noexcept nogil:
             begin_active_set(n, n.ip.unbounded_z)
     elif state == ROWS_INTERIOR_POINT:
         begin_interior_steps(n, True)
-        n.stage = AUGMENTED_INTERIOR_POINT
     elif state == FIRST_CONE_WEIGHT:
         begin_interior_point(n, first_cone_weight(), 0.0)
         begin_interior_steps(n, False)
@@ -287,7 +292,7 @@ cdef inline void enter_next_convex_state(newton_t* n) noexcept nogil:
             n.s.augmented = 1
             begin_interior_point(n, augmented_shift(), 0.0)
             n.s.augmented = 0
-            begin_interior_with_newton(n, CONE, 1)
+            begin_interior_with_newton(n, 1)
     elif state == CONVEX_DAMPED_NEWTON:
         # Of cones, the last interior point is nearer to a solution than the point with the lowest residual, unless its
         # steps failed at once, as with inactive rows of b = 1e60.
@@ -303,45 +308,26 @@ cdef inline void enter_next_convex_state(newton_t* n) noexcept nogil:
 
 cdef inline void begin_de_saxce(newton_t* n, double derivative_fraction, double max_residual) noexcept nogil:
     """Begin De Saxce's interior point; damped Newton ends it if its residual is at most `max_residual`."""
-    n.de_saxce = de_saxce_t(derivative_fraction, max_residual, DE_SAXCE_INTERIOR, False)
+    n.de_saxce = de_saxce_t(derivative_fraction, max_residual, DE_SAXCE_INTERIOR)
     push_phase(n, DE_SAXCE)
-
-
-cdef inline void begin_augmented_de_saxce(newton_t* n) noexcept nogil:
-    """Begin De Saxce's interior point on the augmented system. No damped Newton phase follows."""
-    n.de_saxce = de_saxce_t(second_derivative_fraction(), 0.0, DE_SAXCE_INTERIOR, True)
-    push_phase(n, DE_SAXCE)
-
-
-cdef inline void begin_damped_newton_after_de_saxce(newton_t* n, double alpha, int32_t max_inner_steps,
-                                                    int32_t limit) noexcept nogil:
-    """Begin damped Newton from the best point of De Saxce's interior point."""
-    begin_damped_newton(n, n.progress.best_z, COULOMB, alpha, max_inner_steps)
-    begin_separate_best(n)
-    push_damped_newton(n, limit)
 
 
 cdef inline void enter_next_de_saxce_state(newton_t* n) noexcept nogil:
     """Enter the next state of De Saxce's interior point."""
     cdef de_saxce_t* x = &n.de_saxce
     cdef int32_t state = x.stage
-    cdef double best
     x.stage = state + 1
     if state == DE_SAXCE_INTERIOR:
-        n.s.augmented = x.augmented
-        begin_interior_point(n, augmented_shift() if x.augmented else compute_proximal_weight(), x.derivative_fraction)
-        n.s.augmented = 0
-        begin_interior_with_newton(n, COULOMB, x.augmented)
-        return
-    best = n.progress.lowest if state == DE_SAXCE_FIRST_END else end_separate_best(n, n.progress.best_z)
-    if is_over(n) or state == DE_SAXCE_ENDED:
-        pop_phase(n)
-    elif state == DE_SAXCE_FIRST_END and (x.augmented or best > x.max_residual):
-        pop_phase(n)
-    elif state == DE_SAXCE_FIRST_END:
-        begin_damped_newton_after_de_saxce(n, min(best, 1e-3), FIRST_END_INNER_STEPS, FIRST_END_FACTORISATIONS)
+        begin_interior_point(n, compute_proximal_weight(), x.derivative_fraction)
+        begin_interior_with_newton(n, 0)
+    elif state == DE_SAXCE_END and n.progress.lowest <= x.max_residual and not is_over(n):
+        begin_damped_newton(n, n.progress.best_z, COULOMB, min(n.progress.lowest, 1e-3), END_INNER_STEPS)
+        begin_separate_best(n)
+        push_damped_newton(n, END_FACTORISATIONS)
     else:
-        begin_damped_newton_after_de_saxce(n, min(best, 1e-7), SECOND_END_FACTORISATIONS, SECOND_END_FACTORISATIONS)
+        if state == DE_SAXCE_ENDED:
+            end_separate_best(n)
+        pop_phase(n)
 
 
 cdef inline bint has_convex_law(const newton_t* n) noexcept nogil:
@@ -394,9 +380,6 @@ cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
             begin_path(n)
     elif state == SECOND_DE_SAXCE:
         begin_de_saxce(n, second_derivative_fraction(), 1.0 / 0.0)
-    elif state == AUGMENTED_DE_SAXCE:
-        if n.has_augmented and has_rigid_joints(n):
-            begin_augmented_de_saxce(n)
     elif state == LAST_FLOW:
         begin_flow(n, n.best_z, LAST_FLOW_FACTORISATIONS, LAST_FLOW_PATIENCE)
     elif state == COULOMB_DAMPED_NEWTON:

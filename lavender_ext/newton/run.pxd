@@ -43,11 +43,10 @@ cdef enum:                      # counters
     N_PROXIMAL = 3
     N_DE_SAXCE = 4
     N_AUGMENTED_INTERIOR = 5
-    N_AUGMENTED_DE_SAXCE = 6
-    N_AUGMENTED_NEWTON = 7
-    N_PATH = 8
-    N_FLOW = 9
-    N_COUNTED = 10
+    N_AUGMENTED_NEWTON = 6
+    N_PATH = 7
+    N_FLOW = 8
+    N_COUNTED = 9
 
 cdef enum:
     MAX_PHASE_DEPTH = 8         # Phases nest at most four deep.
@@ -95,8 +94,7 @@ cdef struct progress_t:         # progress of an interior point's steps
     int32_t steps
     int32_t trial_runs          # a trial is on the stack
     int32_t bounded_rows        # the problem has bounded rows alone
-    int32_t law                 # law that the Newton steps use
-    int32_t augmented
+    int32_t augmented           # steps of the cone law on the augmented system
     int32_t is_counted          # Coulomb's law: the contacts that slide fast have been counted
 
 
@@ -137,7 +135,6 @@ cdef struct de_saxce_t:
     double derivative_fraction
     double max_residual         # damped Newton follows only if the relative residual does not exceed this
     int32_t stage
-    int32_t augmented
 
 
 cdef struct path_t:             # a path of smoothed problems
@@ -461,14 +458,12 @@ cdef inline void begin_separate_best(newton_t* n) noexcept nogil:
     n.best = 1.0 / 0.0
 
 
-cdef inline double end_separate_best(newton_t* n, double* z) noexcept nogil:
+cdef inline double end_separate_best(newton_t* n) noexcept nogil:
     """End a phase of `begin_separate_best`, and keep the better of its best point and the best impulse of all.
 
-    Return the lowest residual of the phase; z (m), unless NULL, receives its best point.
+    Return the lowest residual of the phase.
     """
     cdef double best = n.best, all_phases = relative_residual_of_best(&n.island_best)
-    if z != NULL:
-        copy_vector(n, z, n.best_z)
     if all_phases < best:
         n.best = all_phases
         write_unknown(n, n.island_best.impulse, n.best_z)

@@ -55,7 +55,6 @@ COUNTED = (
     "proximal iterations",
     "De Saxce steps",
     "augmented interior point steps",
-    "augmented De Saxce steps",
     "augmented steps",
     "path steps",
     "Euler steps",

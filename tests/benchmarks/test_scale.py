@@ -2,12 +2,14 @@
 
 import json
 
+import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
 import lavender as lv
-from benchmarks.scale import command, compute_regret, fit_exponent
+from benchmarks import scale
+from benchmarks.scale import build_without, command, compute_regret, fit_exponent
 from benchmarks.scale_structures import STRUCTURES, build
 
 
@@ -83,3 +85,21 @@ def test_command_reads_measurements_prints_their_exponent_and_draws_them(tmp_pat
     assert "| wall | 0 | 3000 | 30000 | 1.50 | 0 |" in done.output
     assert "median 0.50, worst 0.50; 1 of 4 problems not solved by auto" in done.output
     assert figure.read_bytes().startswith(b"\x89PNG")
+
+
+def test_copy_without_a_state_begins_no_phase_in_it(tmp_path, monkeypatch):
+    root = tmp_path / "checkout"
+    plan = root / scale.PLAN
+    plan.parent.mkdir(parents=True)
+    plan.write_text((scale.ROOT / scale.PLAN).read_text())
+    (root / "setup.py").write_text("")
+    monkeypatch.setattr(scale, "ROOT", root)
+    name, _, copy, contestant = build_without("FIRST_FLOW", tmp_path)
+    changed = [line for line in (copy / scale.PLAN).read_text().splitlines() if line not in plan.read_text()]
+    assert (name, contestant, changed) == (
+        "newton without FIRST_FLOW",
+        "newton",
+        ["        pass", "    elif state < 0:"],
+    )
+    with pytest.raises(click.BadParameter, match="COULOMB_END"):
+        build_without("DE_SAXCE_END", tmp_path)
