@@ -232,8 +232,10 @@ class _Task:
         """Judge the start: if it meets tol, nothing runs."""
         assert self.start is not None
         self.judge.keep(self.qp.recover_variables(self.start), self.qp.select_row_multipliers(self.start))
-        status = CONVERGED if self.judge.error <= self.tol else STALLED
-        self.runs.append(Run("start", status, "the start is a solution", {}, self.judge.error))
+        status, message = STALLED, "no better point than the start was found"
+        if self.judge.error <= self.tol:
+            status, message = CONVERGED, "the start is a solution"
+        self.runs.append(Run("start", status, message, {}, self.judge.error))
 
     def _call_backend(self, spec: SolverSpec, options: dict[str, Any]) -> None:
         """Solve the program by a backend."""

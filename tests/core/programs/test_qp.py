@@ -448,3 +448,11 @@ def test_solve_qp_limits_reach_the_solver_and_a_start_that_is_a_solution_is_retu
         again = lv.solve_qp(problem, name, tol=1e-6, impulse=solved.impulse)
         assert again.found and not any(again.solution.work.values()), name
         np.testing.assert_allclose(again.x, solved.x, atol=1e-12)
+    # A start near the solution is better than the point of a backend that is stopped early: the answer says so.
+    start = (1.0 + 1e-6) * solved.impulse
+    for name in installed("clarabel", "daqp", "highs", "piqp", "qpalm"):
+        answer = lv.solve_qp(problem, name, tol=1e-12, impulse=start, max_iter=1)
+        is_of_start = np.array_equal(answer.impulse, start)
+        assert is_of_start == ("the start" in answer.solution.message), name
+        assert is_of_start == (answer.solution.status is lv.Status.STALLED), name
+        assert "is a solution" not in answer.solution.message, name
