@@ -60,6 +60,7 @@ def test_residual_of_exact_acceleration_without_digits_in_forces_is_at_floor(con
         problem, impulse = lv.io.from_mujoco(model, data), adapter.impulse(model, data)
         found = lv.residual(problem, impulse)
         assert found.verdict in ("at its floor", "close enough")
+        assert found.at_floor == found.rounds
         assert found.velocity < 1e-13
         if found.lost_digits:
             judged += 1

@@ -177,6 +177,18 @@ def test_newton_on_rows_of_islands_that_alternate(cones, size, other, seed, comp
     np.testing.assert_allclose(problem.velocity(whole.impulse), problem.velocity(apart.impulse), atol=1e-6)
 
 
+@given(pairs=st.lists(st.lists(st.integers(0, 8), min_size=2, max_size=2, unique=True), min_size=1, max_size=6))
+def test_islands_of_rows_between_trees_are_the_components_of_the_matrix(pairs):
+    first, second = np.array(pairs).T
+    jac = np.eye(9)[first] - np.eye(9)[second]
+    cones = lv.Cones.bounded(np.zeros(len(jac)), 1.0)
+    problem = lv.Problem.from_jacobian(jac, np.eye(9), np.arange(1.0, 10.0) ** 2, cones=cones)
+    expected = sp.csgraph.connected_components(abs(jac) @ abs(jac.T), directed=False)[1]
+    for same in (problem, lv.Problem(problem.b, cones, problem.csr)):
+        label = lv.residual(same, np.full(len(jac), 0.5)).islands.label
+        np.testing.assert_array_equal(label, expected)
+
+
 def cloth(side, seed, friction="cone"):
     """Masses on a square grid, each of one velocity, stiff rows between neighbours, contacts of three rows."""
     rng = np.random.default_rng(seed)
