@@ -60,7 +60,7 @@ from lavender.solvers.costs import (
     estimate_newton_cost,
 )
 from lavender.solvers.newton_systems import general
-from lavender.solvers.newton_systems.systems import System, find_bodies, make_system
+from lavender.solvers.newton_systems.systems import System, find_bodies, make_system, run_newton_method
 from lavender.solvers.registry import Solver, SolverSpec
 from lavender.solvers.small import NEWTON, estimate_velocity_newton_cost
 from lavender.solvers.warm_start import make_warm_start_claim, warm_start
@@ -355,7 +355,7 @@ class Newton(Solver):
                 if judged.relative <= tol:
                     return replace(claim, judged=judged)
         solve, steps = system.solve, max(1, int(INTERRUPT_CHECK_INTERVAL / max(system.factor_seconds, 1e-6)))
-        run = general.run_newton_method(
+        run = run_newton_method(
             problem,
             solve,
             impulse,

@@ -16,7 +16,7 @@ from lavender import registry, suite
 from lavender.base.deadline import Deadline
 from lavender.base.rates import RATES
 from lavender.solvers.newton_systems import general
-from lavender.solvers.newton_systems.systems import make_system
+from lavender.solvers.newton_systems.systems import make_system, run_newton_method
 from lavender_ext.factor.linear import LinearSystem
 
 MAX_WORK = 2e6  # ns of counted work between two readings, as docs/choose.md promises
@@ -71,7 +71,7 @@ def test_newton_reads_the_clock_within_two_milliseconds_of_counted_work(form):
         assert claim.iterations == n
     else:
         system = make_system(problem, "velocity" if form == "bodies" else "impulse")
-        general.run_newton_method(problem, system.solve, impulse, n, 1e-9, deadline, 1)
+        run_newton_method(problem, system.solve, impulse, n, 1e-9, deadline, 1)
     total, longest = deadline.counted
     assert total >= 0.3 * n * RATES["velocity contact row" if form == "velocities" else "row"] * problem.m
     assert longest <= MAX_WORK
@@ -122,7 +122,7 @@ def test_newton_whose_deadline_passes_inside_a_factorisation_returns_a_finite_im
             ).status
         else:
             system = make_system(problem, "velocity" if form == "bodies" else "impulse")
-            status = general.run_newton_method(problem, system.solve, impulse, 9, 1e-9, deadline, 1).status
+            status = run_newton_method(problem, system.solve, impulse, 9, 1e-9, deadline, 1).status
         assert status is lv.Status.TIME_LIMIT and np.isfinite(impulse).all()
 
 
