@@ -38,9 +38,6 @@ NO_WORK_MESSAGES = {
     Status.ROUNDOFF_LIMIT: "the start is at its floor: its residual is rounding",
 }
 NO_TIME_MESSAGE = "the time limit left no time for a solver"
-# Newton's method starts from the iterate of the sweeps if its relative residual does not exceed this, else from zero.
-WARM_START_MAX_RESIDUAL = 1e-3
-MAX_SWEEPS_BEFORE_FACTOR = 32  # Largest number of sweeps of an island before its first factorisation.
 # If an island has at least this many rows per velocity, Newton's matrix N over velocities is treated as full: it is
 # then smaller than the data from which it is formed.
 DENSE_ROWS_PER_VELOCITY = 10.0
@@ -148,10 +145,7 @@ class SmallCall:
     rules: Rules = field(init=False)
 
     def __post_init__(self) -> None:
-        rules = Rules(
-            SMALL_ROWS, MAX_SWEEPS_BEFORE_FACTOR, WARM_START_MAX_RESIDUAL, self.pivots, self.hands_over
-        )
-        object.__setattr__(self, "rules", rules)
+        object.__setattr__(self, "rules", Rules(DECISIONS, self.pivots, self.hands_over))
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the name only, because `rules` and `limits` cannot be pickled; a copy is the call of that name."""

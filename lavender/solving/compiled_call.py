@@ -15,7 +15,8 @@ from lavender.solvers.decisions import DECISIONS, SMALL_ROWS
 from lavender.solvers.registry import SolverSpec
 from lavender.solving.finish import FinishedRun, make_fields
 from lavender.solving.loop import select_best_impulse
-from lavender_ext.batch.many import bind_types, solve_compiled
+from lavender_ext.batch.many import solve_new_generalized_problem
+from lavender_ext.small.call import bind_types, solve_compiled
 
 NO_STAGE_MESSAGE = "the time limit was over before its turn: the start"
 
@@ -82,6 +83,6 @@ def compute_postponed_fields(
 bind_types(
     (
         Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, perf_counter,
-        get_zero_impulse_reference,
+        get_zero_impulse_reference, solve_new_generalized_problem,
     )
 )  # fmt: skip

@@ -19,7 +19,7 @@ from lavender.solving.limits import check_time_limit, make_deadline
 from lavender.solving.loop import Callback
 from lavender.solving.prepared import Prepared, check_arguments
 from lavender.solving.velocity import accept_velocity, relative_tolerance
-from lavender_ext.batch.many import make_solve
+from lavender_ext.small.call import make_solve
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

@@ -14,15 +14,12 @@ cimport cython
 
 import numpy as np
 
-from lavender_ext.core.arrays cimport (C_CONTIGUOUS, DOUBLE, as_double_pointer, as_int_pointer, has_element_type, make_read_only,
-                                       ndarray)
+from lavender_ext.core.arrays cimport as_double_pointer, as_int_pointer, make_read_only, ndarray
 from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.deadline cimport deadline_t, get_pointer, has_passed, reading_interval
 from lavender_ext.core.method cimport workspace_t
 from lavender_ext.core.problem cimport Data, bind_body_arrays, derived_t
 from lavender_ext.core.problem import LAWS
-from lavender_ext.core.checks cimport make_instance
-from lavender_ext.core.validate cimport all_finite
 from lavender_ext.small.call cimport N_COUNTS, Rules, small_rules_t, small_problem_t, judge_small_impulse
 from lavender_ext.batch.task cimport (copy_small_judgement, compute_missing_derived_numbers, judge_task, judge_zero_impulse_of_task,
                                       judge_task_workspace_size, prepare_task_for_small_call,
@@ -32,7 +29,7 @@ from lavender_ext.host cimport grow_workspace_to, free_workspace
 from lavender_ext.batch.world cimport (BAD, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, LATE, LEFT, MASS, MU, N_ARRAYS, PLACES, READY,
                                        AT_ROW, ROWS, SOFT, STARTED, TARGET, TRIED, VELOCITIES, VELOCITY, worker_scratch_t,
                                        convert_generalized_world, worlds_t)
-from lavender_ext.judge.measure cimport Judged, set_zero_impulse, make_judged, count_judge_scratch
+from lavender_ext.judge.measure cimport set_zero_impulse, make_judged, count_judge_scratch
 from lavender_ext.judge.rounding cimport float32_floor_of_score, compute_squared_float32_rounding
 from lavender_ext.judge.tally cimport compute_rhs_energy_norm
 from lavender_ext.velocity_newton.soft cimport needs_no_proximal_terms
@@ -194,101 +191,6 @@ def solve_new_generalized_problem(Data p, start, double tol, Limits limits, dead
         limits.exchange_kept_workspaces(&r)
     free_call_workspaces(&r)
     return make_task_result(&j, p, impulse, results)
-
-
-# [s] A limit of at least this does not end the call of few rows, which `solve_general` may repeat if the call fails.
-cdef double MIN_LONG_LIMIT = 0.1
-cdef tuple NO_CALL = (None, None, None, None), LAWS_OF_ROWS = ("linear", "lcp")
-cdef object Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, read_clock, get_zero_impulse_reference
-
-
-def bind_types(types):
-    """Set the classes and functions of the package that `solve_compiled` needs; this package does not import it."""
-    global Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, read_clock, get_zero_impulse_reference
-    Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, read_clock, get_zero_impulse_reference = types
-
-
-cdef bint is_plain_start(impulse, Py_ssize_t m) noexcept:
-    """Return whether a start is a contiguous array (m,) of finite numbers, which needs no conversion."""
-    if type(impulse) is not ndarray:
-        return False
-    cdef ndarray x = <ndarray>impulse
-    return (x.nd == 1 and x.dimensions[0] == m and x.flags & C_CONTIGUOUS and has_element_type(x, DOUBLE)
-            and all_finite(<const double*>x.data, m))
-
-
-def solve_compiled(problem, spec, impulse, tol, deadline=None):
-    """Solve and judge a problem by the compiled call of a solver, unless the call does not accept the problem.
-
-    Parameters
-    ----------
-    problem : Problem
-    spec : SolverSpec
-    impulse : (m,) N s, or None
-    tol : float, -
-    deadline : Deadline, optional
-        Time at which the call ends with the iterate so far.
-
-    Returns
-    -------
-    tuple
-        Solution, or None if there is no result within tol; judged result or None; work counts, None if no call was made or
-        the start is the result; start (m,) of the call or None.
-    """
-    small, solution, view = spec.small, None, problem.derived.view
-    if small is None or not spec.builtin or not isinstance(tol, float) or not 0.0 < <double>tol < INFINITY:
-        return NO_CALL
-    if view is not None:
-        if small.limits is None or (<Data>view).has_ellipse:
-            return NO_CALL
-    elif (not (small.pivots if problem.law in LAWS_OF_ROWS else small.hands_over) or problem.has_singular_program
-            or len(problem.b) > (<Rules>small.rules).at.rows or (<Blocks>problem.cones._blocks).has_ellipse):
-        # Islands of larger problems may take long, so `Prepared` solves them between checks of the clock.
-        return NO_CALL
-    began, first = read_clock(), impulse
-    if impulse is None:
-        first = problem.guess
-    elif not is_plain_start(impulse, len(problem.b)):
-        first = problem.impulse_array(impulse)
-    if view is not None and (<Data>view).blocks.n_rows:
-        judged, counts = solve_new_generalized_problem(view, first, tol, small.limits, deadline)
-        if judged is None and (<Data>view).reference_energy < 0.0:      # The reference of a row needs v*.
-            get_zero_impulse_reference(problem)
-            judged, counts = solve_new_generalized_problem(view, first, tol, small.limits, deadline)
-    else:
-        judged, counts = small.solve_and_judge(problem, first, tol, deadline)
-    if judged is not None and (<Judged>judged).relative <= <double>tol and (<Judged>judged).roundoff_floor <= <double>tol:
-        kept = first if first is None or impulse is None else first.copy()      # The caller may change the array later.
-        solution = make_instance(Solution, {
-            "impulse": (<Judged>judged).impulse, "status": CONVERGED, "tol": tol, "setup_time": 0.0,
-            "solve_time": read_clock() - began, "_late_residual": (make_residual, (problem, judged)),
-            "_rest": (compute_postponed_fields, (problem, spec, judged, counts, kept, CONVERGED)),
-        })
-    return solution, judged, counts, first
-
-
-def make_solve(solve_general, solve_after_call, dict registered):
-    """Return `lavender.solve`: the compiled call if all arguments have their defaults, otherwise `solve_general`.
-
-    `solve_after_call` solves a problem that the call did not solve.
-    """
-    def solve(problem, solver="auto", *surplus, impulse=None, tol=1e-6, velocity_tol=None, max_iter=None, time_limit=None,
-              history=False, callback=None, **options):
-        if (velocity_tol is None and max_iter is None and callback is None and history is False and not options
-                and not surplus and type(problem) is Problem and type(tol) is float and type(solver) is str):
-            spec = registered.get(solver)
-            if time_limit is None and spec is not None:
-                solution, _, counts, _ = solve_compiled(problem, spec, impulse, tol)
-                return solution if solution is not None else solve_after_call(problem, spec, impulse, tol, counts)
-            if spec is not None and type(time_limit) is float and time_limit >= MIN_LONG_LIMIT and spec.small is not None \
-                    and len(problem.b) <= (<Rules>spec.small.rules).at.rows:
-                solution = solve_compiled(problem, spec, impulse, tol)[0]
-                if solution is not None:
-                    return solution
-        return solve_general(problem, solver, *surplus, impulse=impulse, tol=tol, velocity_tol=velocity_tol, max_iter=max_iter,
-                             time_limit=time_limit, history=history, callback=callback, **options)
-
-    return solve
 
 
 cdef enum:                      # rows of `Worlds.numbers`: results of each world

@@ -314,7 +314,7 @@ cdef inline int32_t solve_small_task(task_t* j, task_workspaces_t* workspaces, c
     cdef small_problem_t s
     cdef int32_t code
     cdef bint pivots = are_all_rows_bounded(&j.p)
-    if j.p.n_rows > rules.rows or not can_use_small_call(&j.p) or not (rules.pivots if pivots else rules.follows):
+    if j.p.n_rows > rules.small_rows or not can_use_small_call(&j.p) or not (rules.pivots if pivots else rules.follows):
         return LEFT
     if (not prepare_task_for_small_call(j, &s, workspaces)
             or (pivots and j.factored and not form_matrix_of_bodies(j, &s, &workspaces.formed))):

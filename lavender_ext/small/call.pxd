@@ -17,10 +17,13 @@ cdef enum:                      # result code of a call
     RESULT_IS_START = 2         # the start is a solution and was not changed
 
 
-cdef struct small_rules_t:      # settings
-    int32_t rows                # largest number of rows of a call, unless the call solves island by island
-    int32_t swept               # largest number of sweeps before the first factorisation
-    double warm                 # pivots start from an impulse with at most this relative residual
+cdef struct small_rules_t:      # numbers of lavender/solvers/decisions.py by their names, and the kind of call
+    int32_t small_rows
+    int32_t call_sweeps
+    int32_t call_island_rows
+    int32_t call_factorisations
+    int32_t call_extrapolation
+    double warm_residual
     bint pivots                 # solve problems in which all rows are bounded
     # Another method follows, which also solves friction. Then a start that is a solution is returned, and a start with a
     # larger residual than the zero impulse is replaced by the zero impulse.

@@ -18,22 +18,26 @@ cimport cython
 import numpy as np
 
 from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles, take_integers
-from lavender_ext.core.arrays cimport as_double_pointer, make_read_only, ndarray
+from lavender_ext.core.arrays cimport C_CONTIGUOUS, DOUBLE, as_double_pointer, has_element_type, make_read_only, ndarray
+from lavender_ext.core.blocks cimport Blocks
+from lavender_ext.core.checks cimport make_instance
 from lavender_ext.core.deadline cimport deadline_t, get_pointer, has_passed
 from lavender_ext.core.csr cimport measure_asymmetry_and_bandwidth
 from lavender_ext.core.block_types cimport CONE, CONTACT_ROLLING, ROUND, blocks_t, has_independent_rows, islands_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.method cimport workspace_t
-from lavender_ext.core.view cimport get_block_bodies, csr_t, rows_t, view_t
+from lavender_ext.core.validate cimport all_finite
+from lavender_ext.core.view cimport csr_t
 from lavender_ext.factor.factors cimport has_wide
 from lavender_ext.small.call cimport (N_COUNTS, RESULT_FAILED, RESULT_IS_START, RESULT_SOLVED, Rules, small_problem_t,
                                       small_rules_t, solve_workspaces_t)
 from lavender_ext.small.friction cimport friction_run_t, subproblem_t, solve_subproblem, subproblem_work_size
+from lavender_ext.small.island cimport are_islands_identical, copy_island, island_index_t, island_t
 from lavender_ext.small.limits cimport has_only_free_rows
 from lavender_ext.host cimport free_workspace, grow_workspace_to
 from lavender_ext.small.workspace cimport fits_workspace, grow_workspace_to_arena
 from lavender_ext.judge.bounds cimport project_far_excess, project_on_bounds
-from lavender_ext.judge.measure cimport (set_zero_impulse, relative_floor_of_score, judge_view, make_judged,
+from lavender_ext.judge.measure cimport (Judged, set_zero_impulse, relative_floor_of_score, judge_view, make_judged,
                                          relative_residual_of_score, count_judge_scratch)
 from lavender_ext.judge.score cimport make_empty_score
 from lavender_ext.local.gauss_seidel cimport prepare_exact_blocks, index_prepared_numbers
@@ -49,7 +53,6 @@ cdef enum:
     ACTIVE_SET_SWEEPS = 2       # number of sweeps that predict which rows are free
     MAX_PASS_EXCHANGES = 32     # largest number of rounds of exchanges in one pass
     LEMKE_PIVOTS_PER_ROW = 8    # largest number of pivots of Lemke's paths, per row
-    FULL_SWEEP_ROWS = 12        # Islands with at most this many rows get all sweeps before their factorisations.
     MAX_KEPT_DOUBLES = 4096     # A larger workspace is freed after a run, since many problems may be kept for long.
     INTERRUPT_CHECK_WORK = 5000000      # multiply-adds between two checks for Ctrl-C, a few milliseconds
     ISLAND_ROW_DOUBLES = 33     # Doubles of a copied island per row, if all are rows of joints: 8, J, M^-1 J^T and the result,
@@ -145,7 +148,7 @@ cdef bint set_start_of_small_problem(small_problem_t* s, const small_rules_t* ru
         residual = residual if cold else s.relative
     if residual <= tol:
         return True
-    if not residual <= (rules.warm if s.pivots else 1.0):
+    if not residual <= (rules.warm_residual if s.pivots else 1.0):
         memcpy(own, scratch, m * sizeof(double))
     return False
 
@@ -236,12 +239,12 @@ cdef inline void store_work_counts(const friction_run_t* o, int32_t n_subproblem
     counts[3], counts[4], counts[5] = <int32_t>o.factorisations, o.factorised, n_subproblems
 
 
-cdef bint solve_by_sweeps(const small_problem_t* s, double* own, double tol, int32_t swept, deadline_t* deadline,
+cdef bint solve_by_sweeps(const small_problem_t* s, const small_rules_t* rules, double* own, double tol, deadline_t* deadline,
                           solve_workspaces_t* workspaces, int32_t* counts) noexcept nogil:
-    """Solve contacts as one subproblem, with at most `swept` sweeps before factorisations; counts as in `store_work_counts`."""
+    """Solve contacts as one subproblem; counts as in `store_work_counts`."""
     cdef int32_t m = s.v.p.n_rows, n = s.over.r.n_bodies if s.over.r != NULL else 0
     cdef subproblem_t sub
-    cdef friction_run_t o = friction_run_t(tol, swept, has_wide(), 0, 0, 0, 0.0, deadline, 0, 0)
+    cdef friction_run_t o = friction_run_t(rules, tol, rules.call_sweeps, has_wide(), 0, 0, 0, 0.0, deadline, 0, 0)
     cdef bint good
     if not grow_workspace_to(&workspaces.work, s.v.p.n_blocks, subproblem_work_size(m, n) + m):
         return False
@@ -254,130 +257,14 @@ cdef bint solve_by_sweeps(const small_problem_t* s, double* own, double tol, int
     return good or has_passed(deadline, 0.0)
 
 
-cdef struct island_t:           # an island copied from A or the bodies; its doubles and its integers are contiguous
-    subproblem_t s
-    csr_t a
-    rows_t r
-    double* numbers
-    int32_t* integers
-    int64_t n_numbers
-    int64_t n_integers
-
-
-cdef struct island_index_t:     # rows, contacts and bodies of an island
-    int32_t* row                # (m) rows of the problem
-    int32_t* place              # (rows of the problem) row of the island, -1 in no island or in another one
-    int32_t* contact            # (contacts of the island) contacts of the problem
-    int32_t* body               # (n) bodies of the problem
-    int32_t* number             # (bodies of the problem) body of the island, -1 outside of `copy_island_bodies`
-
-
-cdef inline const double* gather(arena_t* arena, const double* x, int32_t width, const int32_t* index, int32_t n) noexcept nogil:
-    """Copy the entries `index` (n) of x, each of `width` numbers, to an arena."""
-    cdef double* out = take_doubles(arena, <int64_t>width * n)
-    cdef int32_t i
-    for i in range(n):
-        if width == 1:
-            out[i] = x[index[i]]
-        else:
-            memcpy(out + width * i, x + <int64_t>width * index[i], width * sizeof(double))
-    return out
-
-
-cdef inline void copy_island_matrix(island_t* x, const csr_t* a, const island_index_t* z, arena_t* arena) noexcept nogil:
-    """Copy the entries of A between the island's rows; other entries are zeros of immovable bodies."""
-    cdef int32_t i, q, m = x.s.v.p.n_rows, count = 0
-    cdef int32_t* indptr = take_integers(arena, m + 1)
-    cdef int32_t* indices = take_integers(arena, 0)
-    cdef double* data = take_doubles(arena, 0)
-    for i in range(m):
-        indptr[i] = count
-        for q in range(a.indptr[z.row[i]], a.indptr[z.row[i] + 1]):
-            if z.place[a.indices[q]] >= 0:
-                indices[count], data[count] = z.place[a.indices[q]], a.data[q]
-                count += 1
-    indptr[m] = count
-    x.a.indptr, x.a.indices, x.a.data = indptr, take_integers(arena, count), take_doubles(arena, count)
-    x.s.v.a = &x.a
-
-
-cdef inline void copy_island_bodies(island_t* x, const blocks_t* p, const rows_t* r, const int32_t* block,
-                                    const island_index_t* z, arena_t* arena) noexcept nogil:
-    """Copy the island's joints, contacts and bodies, which are numbered in the order of appearance."""
-    cdef rows_t* y = &x.r
-    cdef int32_t i, body, n = 0, k = x.s.v.p.n_blocks, m = x.s.v.p.n_rows, kj = x.s.split, mj = x.s.v.p.ptr[kj], c = k - kj
-    cdef int32_t* pair = take_integers(arena, 2 * k)
-    for i in range(2 * k):
-        body = get_block_bodies(r, block[i // 2])[i % 2]
-        if body >= 0 and z.number[body] < 0:
-            z.number[body], z.body[n] = n, body
-            n += 1
-        pair[i] = z.number[body] if body >= 0 else -1
-    for i in range(n):
-        z.number[z.body[i]] = -1                        # Islands may share immovable bodies.
-    y.n_bodies, y.n_joints, y.n_contacts, y.joint_body, y.contact_body = n, kj, c, pair, pair + 2 * kj
-    y.inv_mass, y.inv_inertia = gather(arena, r.inv_mass, 1, z.body, n), gather(arena, r.inv_inertia, 9, z.body, n)
-    y.compliance = gather(arena, r.compliance, 1, z.row, m)
-    y.jac, y.minv_jac = gather(arena, r.jac, 12, z.row, mj), gather(arena, r.minv_jac, 12, z.row, mj)
-    for i in range(c):
-        z.contact[i] = block[kj + i] - r.n_joints
-    y.normal, y.tangent = gather(arena, r.normal, 3, z.contact, c), gather(arena, r.tangent, 3, z.contact, c)
-    y.arm_a, y.arm_b = gather(arena, r.arm_a, 3, z.contact, c), gather(arena, r.arm_b, 3, z.contact, c)
-    y.coupling = gather(arena, r.coupling, 5, z.contact, c)
-    for i in range(mj, m):
-        z.row[i] -= p.ptr[r.n_joints]
-    y.inv_inertia_arm = gather(arena, r.inv_inertia_arm, 6, z.row + mj, m - mj)
-    x.s.v.r = y
-
-
-cdef inline void copy_island(island_t* x, const view_t* v, const double* lam, const int32_t* block, int32_t k,
-                             const island_index_t* z, arena_t arena) noexcept nogil:
-    """Copy the island of k blocks out of a problem over A or bodies, with its start out of lam, to an arena."""
-    cdef const blocks_t* p = &v.p
-    cdef blocks_t* own = &x.s.v.p
-    cdef int32_t i, q, m = 0
-    cdef int32_t* ptr = take_integers(&arena, k + 1)
-    cdef int32_t* kind = take_integers(&arena, k)
-    x.numbers, x.integers = arena.real, arena.index
-    x.s.split = 0
-    for i in range(k):
-        ptr[i], kind[i] = m, p.kind[block[i]]
-        x.s.split += v.r != NULL and block[i] < v.r.n_joints
-        for q in range(p.ptr[block[i]], p.ptr[block[i] + 1]):
-            z.row[m], z.place[q] = q, m
-            m += 1
-    ptr[k] = m
-    own.n_blocks, own.n_rows, own.law, own.ptr, own.kind, own.islands = k, m, p.law, ptr, kind, NULL
-    own.mu, own.patch_radius = gather(&arena, p.mu, 1, block, k), gather(&arena, p.patch_radius, 1, block, k)
-    own.rolling = gather(&arena, p.rolling, 1, block, k)
-    own.lower, own.upper = gather(&arena, p.lower, 1, z.row, m), gather(&arena, p.upper, 1, z.row, m)
-    own.b, own.d = gather(&arena, p.b, 1, z.row, m), gather(&arena, p.d, 1, z.row, m)
-    own.nu, own.step = gather(&arena, p.nu, 1, z.row, m), gather(&arena, p.step, 1, z.row, m)
-    x.s.lam = <double*>gather(&arena, lam, 1, z.row, m)
-    x.s.v.a = x.s.v.r = x.s.v.g = NULL
-    if v.r != NULL:
-        copy_island_bodies(x, p, v.r, block, z, &arena)
-    else:
-        copy_island_matrix(x, v.a, z, &arena)
-    x.n_numbers, x.n_integers = arena.n_real, arena.n_index
-    x.s.answer = take_doubles(&arena, m)
-
-
-cdef inline bint are_islands_identical(const island_t* x, const island_t* y) noexcept nogil:
-    """Return whether two islands have bitwise identical data."""
-    return (x.n_numbers == y.n_numbers and x.n_integers == y.n_integers
-            and memcmp(x.numbers, y.numbers, x.n_numbers * sizeof(double)) == 0
-            and memcmp(x.integers, y.integers, x.n_integers * sizeof(int32_t)) == 0)
-
-
-cdef inline int32_t count_first_sweeps(const blocks_t* p, int32_t max_sweeps) noexcept nogil:
+cdef inline int32_t count_first_sweeps(const blocks_t* p, const small_rules_t* rules) noexcept nogil:
     """Return the sweeps of an island before its factorisations: fewer for many rows, none under the cone law."""
-    if p.n_rows <= FULL_SWEEP_ROWS:
-        return max_sweeps
-    return 0 if p.law == CONE else max_sweeps * FULL_SWEEP_ROWS // p.n_rows
+    if p.n_rows <= rules.call_island_rows:
+        return rules.call_sweeps
+    return 0 if p.law == CONE else rules.call_sweeps * rules.call_island_rows // p.n_rows
 
 
-cdef bint solve_by_islands(const small_problem_t* s, double* own, double tol, int32_t swept, deadline_t* deadline,
+cdef bint solve_by_islands(const small_problem_t* s, const small_rules_t* rules, double* own, double tol, deadline_t* deadline,
                            solve_workspaces_t* workspaces, int32_t* counts) except -1 nogil:
     """Solve contacts island by island from `own` (m) [N s], until one is above tol; counts as in `store_work_counts`."""
     cdef const blocks_t* p = &s.over.p
@@ -385,7 +272,7 @@ cdef bint solve_by_islands(const small_problem_t* s, double* own, double tol, in
     cdef const csr_t* a = s.over.a
     cdef int32_t i, j, q, rows, m = 0, k = 0, n_bodies = s.over.r.n_bodies if a == NULL else 0
     cdef int64_t entries = 0, count, numbers, integers, work, unchecked = 0
-    cdef friction_run_t o = friction_run_t(tol, swept, has_wide(), 0, 0, 0, 0.0, deadline, 0, 0), before
+    cdef friction_run_t o = friction_run_t(rules, tol, rules.call_sweeps, has_wide(), 0, 0, 0, 0.0, deadline, 0, 0), before
     cdef island_index_t z
     cdef arena_t arena
     cdef const int32_t* block
@@ -427,7 +314,7 @@ cdef bint solve_by_islands(const small_problem_t* s, double* own, double tol, in
                 for j in range(k):
                     at[j] = s.at[block[j]]
                 x.s.at, x.s.prepared = at, s.prepared
-            o.max_sweeps = count_first_sweeps(&x.s.v.p, swept)
+            o.max_sweeps = count_first_sweeps(&x.s.v.p, rules)
             before = o
             good = solve_subproblem(&x.s, &o, &workspaces.more, scratch, order)
             unchecked += <int64_t>(o.factored - before.factored)
@@ -461,8 +348,8 @@ cdef int32_t solve_small(small_problem_t* s, const small_rules_t* rules, double*
     if set_start_of_small_problem(s, rules, own, cold, tol, both, workspaces.work.real):
         return RESULT_IS_START
     if not (solve_by_pivoting(s, own, tol, rules.follows, deadline, workspaces, counts) if s.pivots
-            else solve_by_islands(s, own, tol, rules.swept, deadline, workspaces, counts) if s.by_island
-            else solve_by_sweeps(s, own, tol, rules.swept, deadline, workspaces, counts)):
+            else solve_by_islands(s, rules, own, tol, deadline, workspaces, counts) if s.by_island
+            else solve_by_sweeps(s, rules, own, tol, deadline, workspaces, counts)):
         return RESULT_FAILED
     if not grow_workspace_to(&workspaces.work, 0, scratch):
         return RESULT_FAILED
@@ -471,10 +358,12 @@ cdef int32_t solve_small(small_problem_t* s, const small_rules_t* rules, double*
 
 
 cdef class Rules:
-    """Settings of the calls for small problems: `small_rules_t`."""
+    """Settings of the calls for small problems, `small_rules_t`, from `DECISIONS` of lavender/solvers/decisions.py."""
 
-    def __init__(self, int rows, int swept, double warm, bint pivots, bint follows):
-        self.at.rows, self.at.swept, self.at.warm, self.at.pivots, self.at.follows = rows, swept, warm, pivots, follows
+    def __init__(self, decisions, bint pivots, bint follows):
+        self.at = small_rules_t(decisions.small_rows, decisions.call_sweeps, decisions.call_island_rows,
+                                decisions.call_factorisations, decisions.call_extrapolation, decisions.warm_residual, pivots,
+                                follows)
 
 
 cdef class Small:
@@ -542,3 +431,101 @@ cdef class Small:
             free_workspace(&workspaces.more)
         judged = make_judged(self.data, answer, both, &s.score, s.relative, s.floor) if code != RESULT_FAILED else None
         return judged, None if code == RESULT_IS_START else tuple([counts[i] for i in range(N_COUNTS)])
+
+
+# [s] A limit of at least this does not end the call of few rows, which `solve_general` may repeat if the call fails.
+cdef double MIN_LONG_LIMIT = 0.1
+cdef tuple NO_CALL = (None, None, None, None), LAWS_OF_ROWS = ("linear", "lcp")
+cdef object Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, read_clock, get_zero_impulse_reference
+cdef object solve_new_generalized_problem
+
+
+def bind_types(types):
+    """Set the classes and functions that `solve_compiled` needs; this package does not import them."""
+    global Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, read_clock, get_zero_impulse_reference
+    global solve_new_generalized_problem
+    (Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, read_clock, get_zero_impulse_reference,
+     solve_new_generalized_problem) = types
+
+
+cdef bint is_plain_start(impulse, Py_ssize_t m) noexcept:
+    """Return whether a start is a contiguous array (m,) of finite numbers, which needs no conversion."""
+    if type(impulse) is not ndarray:
+        return False
+    cdef ndarray x = <ndarray>impulse
+    return (x.nd == 1 and x.dimensions[0] == m and x.flags & C_CONTIGUOUS and has_element_type(x, DOUBLE)
+            and all_finite(<const double*>x.data, m))
+
+
+def solve_compiled(problem, spec, impulse, tol, deadline=None):
+    """Solve and judge a problem by the compiled call of a solver, unless the call does not accept the problem.
+
+    Parameters
+    ----------
+    problem : Problem
+    spec : SolverSpec
+    impulse : (m,) N s, or None
+    tol : float, -
+    deadline : Deadline, optional
+        Time at which the call ends with the iterate so far.
+
+    Returns
+    -------
+    tuple
+        Solution, or None if there is no result within tol; judged result or None; work counts, None if no call was made or
+        the start is the result; start (m,) of the call or None.
+    """
+    small, solution, view = spec.small, None, problem.derived.view
+    if small is None or not spec.builtin or not isinstance(tol, float) or not 0.0 < <double>tol < INFINITY:
+        return NO_CALL
+    if view is not None:
+        if small.limits is None or (<Data>view).has_ellipse:
+            return NO_CALL
+    elif (not (small.pivots if problem.law in LAWS_OF_ROWS else small.hands_over) or problem.has_singular_program
+            or len(problem.b) > (<Rules>small.rules).at.small_rows or (<Blocks>problem.cones._blocks).has_ellipse):
+        # Islands of larger problems may take long, so `Prepared` solves them between checks of the clock.
+        return NO_CALL
+    began, first = read_clock(), impulse
+    if impulse is None:
+        first = problem.guess
+    elif not is_plain_start(impulse, len(problem.b)):
+        first = problem.impulse_array(impulse)
+    if view is not None and (<Data>view).blocks.n_rows:
+        judged, counts = solve_new_generalized_problem(view, first, tol, small.limits, deadline)
+        if judged is None and (<Data>view).reference_energy < 0.0:      # The reference of a row needs v*.
+            get_zero_impulse_reference(problem)
+            judged, counts = solve_new_generalized_problem(view, first, tol, small.limits, deadline)
+    else:
+        judged, counts = small.solve_and_judge(problem, first, tol, deadline)
+    if judged is not None and (<Judged>judged).relative <= <double>tol and (<Judged>judged).roundoff_floor <= <double>tol:
+        kept = first if first is None or impulse is None else first.copy()      # The caller may change the array later.
+        solution = make_instance(Solution, {
+            "impulse": (<Judged>judged).impulse, "status": CONVERGED, "tol": tol, "setup_time": 0.0,
+            "solve_time": read_clock() - began, "_late_residual": (make_residual, (problem, judged)),
+            "_rest": (compute_postponed_fields, (problem, spec, judged, counts, kept, CONVERGED)),
+        })
+    return solution, judged, counts, first
+
+
+def make_solve(solve_general, solve_after_call, dict registered):
+    """Return `lavender.solve`: the compiled call if all arguments have their defaults, otherwise `solve_general`.
+
+    `solve_after_call` solves a problem that the call did not solve.
+    """
+    def solve(problem, solver="auto", *surplus, impulse=None, tol=1e-6, velocity_tol=None, max_iter=None, time_limit=None,
+              history=False, callback=None, **options):
+        if (velocity_tol is None and max_iter is None and callback is None and history is False and not options
+                and not surplus and type(problem) is Problem and type(tol) is float and type(solver) is str):
+            spec = registered.get(solver)
+            if time_limit is None and spec is not None:
+                solution, _, counts, _ = solve_compiled(problem, spec, impulse, tol)
+                return solution if solution is not None else solve_after_call(problem, spec, impulse, tol, counts)
+            if spec is not None and type(time_limit) is float and time_limit >= MIN_LONG_LIMIT and spec.small is not None \
+                    and len(problem.b) <= (<Rules>spec.small.rules).at.small_rows:
+                solution = solve_compiled(problem, spec, impulse, tol)[0]
+                if solution is not None:
+                    return solution
+        return solve_general(problem, solver, *surplus, impulse=impulse, tol=tol, velocity_tol=velocity_tol, max_iter=max_iter,
+                             time_limit=time_limit, history=history, callback=callback, **options)
+
+    return solve

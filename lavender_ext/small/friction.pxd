@@ -15,14 +15,13 @@ from lavender_ext.driver.driver cimport NEWTON, lav_analyse, lav_start, lav_step
 from lavender_ext.host cimport grow_workspace_to
 from lavender_ext.judge.measure cimport set_zero_impulse, find_reference, judge_view, relative_residual_of_score
 from lavender_ext.judge.score cimport make_empty_score, score_t
+from lavender_ext.small.call cimport small_rules_t
 from lavender_ext.sweep.serial cimport compute_sweep_velocities, sweep_context_t
 
 
 cdef enum:
     MIXING_MEMORY = 5           # number of sweeps that Anderson mixing combines
     MIN_CHECK_INTERVAL = 4      # Sweeps before the first check of the residual. Later checks follow after half as many as are done.
-    MAX_SUBPROBLEM_FACTORISATIONS = 120    # largest number of factorisations of one subproblem
-    EXTRAPOLATION_FACTOR = 4    # Sweeps continue if the present rate reaches tol within this multiple of the remaining checks.
     SWEEP_NS_PER_ROW = 15       # estimated cost of a sweep with its mixing [ns] per row of A; in addition 1 ns per entry of A
     SWEEP_NS_PER_BODY_ROW = 32  # estimated cost of a sweep with its mixing [ns] per row over bodies
 
@@ -40,6 +39,7 @@ cdef struct subproblem_t:
 
 
 cdef struct friction_run_t:     # settings and counters of a run over one or several subproblems
+    const small_rules_t* rules
     double tol
     int32_t max_sweeps          # largest number of sweeps of one subproblem, before the first factorisation
     int32_t wide
@@ -127,13 +127,13 @@ cdef inline double run_sweeps(subproblem_run_t* t, double now) noexcept nogil:
         lav_anderson(&t.c, t.swept, t.c.iterations == 0, step)
         now = judge_subproblem_impulse(t, t.swept)
         step = t.c.iterations // 2 if t.c.iterations // 2 > MIN_CHECK_INTERVAL else MIN_CHECK_INTERVAL
-        if not predicts_convergence(before, now, tol, EXTRAPOLATION_FACTOR * (max_sweeps - t.c.iterations) // step):
+        if not predicts_convergence(before, now, tol, t.o.rules.call_extrapolation * (max_sweeps - t.c.iterations) // step):
             break
     return now
 
 
 cdef inline double run_newton(subproblem_run_t* t) noexcept nogil:
-    """Run up to `MAX_SUBPROBLEM_FACTORISATIONS` of Newton's method from `answer`, and return the relative residual."""
+    """Run up to `call_factorisations` of Newton's method from `answer`, and return the relative residual."""
     cdef int32_t how
     t.info.work = t.info.factorisations = 0
     how = lav_analyse(&t.s.v, &t.options, &t.workspace, t.r, grow_workspace_to)
@@ -141,7 +141,7 @@ cdef inline double run_newton(subproblem_run_t* t) noexcept nogil:
         how = lav_start(&t.s.v, &t.options, &t.workspace, t.s.answer, t.r, grow_workspace_to)
     if how != MORE:
         return 1.0 / 0.0
-    lav_step(&t.s.v, &t.options, &t.workspace, MAX_SUBPROBLEM_FACTORISATIONS, t.s.answer, &t.info)
+    lav_step(&t.s.v, &t.options, &t.workspace, t.o.rules.call_factorisations, t.s.answer, &t.info)
     return judge_subproblem_impulse(t, t.s.answer)
 
 
@@ -179,7 +179,7 @@ cdef inline bint solve_subproblem(subproblem_t* s, friction_run_t* o, workspace_
         memcpy(s.answer, t.swept, p.n_rows * sizeof(double))
     if now > o.tol and not has_passed(o.deadline, 0.0):
         o.factorised += 1
-        t.options = options_t(NEWTON, MAX_SUBPROBLEM_FACTORISATIONS, 0, 0, o.wide, o.tol, t.e0, t.v0, 1.0 / 0.0, 0.0,
+        t.options = options_t(NEWTON, o.rules.call_factorisations, 0, 0, o.wide, o.tol, t.e0, t.v0, 1.0 / 0.0, 0.0,
                               o.deadline, NULL)
         now = run_newton(&t)
     # counters
