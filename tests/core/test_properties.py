@@ -100,6 +100,22 @@ def test_residual_many_arrays_equal_the_numbers_of_single_residuals(kind):
             assert worlds.start(i).tolist() == problem.start().tolist()
 
 
+def test_solve_many_invalid_world_between_valid_ones_has_no_numbers():
+    batch = draw_worlds("batch")
+    assert (np.abs([s.impulse for s in lv.solve_many(batch)]).max(axis=1) > 0.0).all()
+    free = np.array([p.generalized.v_free for p in batch])
+    free[2] = np.nan
+    jac, mass = (np.array([getattr(p.generalized, n).toarray() for p in batch]) for n in ("jac", "mass"))
+    start = np.full((6, 6), 0.1)
+    start[4, 3] = np.inf
+    many = lv.solve_many(lv.Batch(jac, mass, free, cones=batch[0].cones), impulse=start, errors="status")
+    assert sorted(many.faults) == [2, 4]
+    for i in (2, 4):
+        assert many.status[i] is lv.Status.INVALID_PROBLEM and f"world {i}" in str(many.faults[i])
+        assert (many.iterations[i], many.worst_row[i]) == (0, -1)
+        assert np.isnan(many.velocity[i]).all() and np.isnan(many.impulse[i]).all()
+
+
 # -- verdicts and proofs -----------------------------------------------------------------------------------------------
 
 
