@@ -10,7 +10,8 @@
                      2. the same after an analysis of Newton's matrix, for at least `sweep_fraction` of its cost
                      3. `admm` from zero, up to 0.4 times that cost, if this pays for 150 iterations
                      4. interior points of `newton` on the relaxation. Contacts slip if their residual of it falls below
-                        `slip_ratio` times Coulomb's; if Coulomb's is above `trial_residual`, they end
+                        `slip_ratio` times Coulomb's. They then end if Coulomb's is above `trial_residual`, or if few
+                        contacts are near sliding
                      5. `admm` from the relaxation's solution, `trial_iterations` at a time while it is predicted to end
                      The alternation follows
     sweeps           `anderson`, unless the problem is linear or large: `first_sweeps` sweeps. Sweeping continues up to

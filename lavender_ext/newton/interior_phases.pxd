@@ -20,6 +20,7 @@ from libc.math cimport fabs
 from libc.stdint cimport int32_t
 from libc.string cimport memset
 
+from lavender_ext.core.block cimport euclidean_norm
 from lavender_ext.core.block_types cimport CONE, COULOMB
 from lavender_ext.core.validate cimport all_finite, norm_inf
 from lavender_ext.judge.score cimport relative_residual
@@ -194,6 +195,26 @@ cdef inline double compute_sliding_fraction(newton_t* n, const double* z, double
             loaded += 1
             sliding += n.t2[j] > slow * size
     return <double>sliding / loaded if loaded else 1.0
+
+
+cdef inline double compute_fraction_near_sliding(const elements_t* e, const double* z) noexcept nogil:
+    """Return the fraction of the loaded contacts with a friction component of at least 0.95 of its bound at z."""
+    cdef double load = 0.0
+    cdef int32_t i, j, g, contacts = 0, loaded = 0, near = 0
+    cdef bint is_near
+    for i in range(e.n):
+        if not is_row(e, i):
+            contacts += 1
+            load += z[e.ptr[i]]
+    for i in range(e.n):
+        j = e.ptr[i]
+        if not is_row(e, i) and z[j] * contacts > 1e-3 * load:
+            is_near = False
+            for g in range(e.part[i], e.part[i + 1]):
+                is_near = is_near or euclidean_norm(z + e.first[g], e.size[g]) > 0.95 * e.reach[g] * z[j]
+            loaded += 1
+            near += is_near
+    return <double>near / loaded if loaded else 1.0
 
 
 cdef inline void end_interior_steps(newton_t* n, bint may_continue) noexcept nogil:

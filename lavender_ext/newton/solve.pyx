@@ -28,6 +28,7 @@ from lavender_ext.newton.bodies cimport (bind_pattern, form_panel, form_velocity
                                          pattern_t, use_panel)
 from lavender_ext.newton.elements cimport elements_t
 from lavender_ext.newton.interior cimport compute_scaling
+from lavender_ext.newton.interior_phases cimport compute_fraction_near_sliding
 from lavender_ext.newton.path cimport path_compliance
 from lavender_ext.newton.plan cimport continue_from_better_point, start_newton_solve, step_newton_solve
 from lavender_ext.newton.run cimport (N_COUNTED, bind_indices, bind_values, newton_t, scale_problem, set_problem, set_reference,
@@ -560,6 +561,11 @@ cdef class Solve(Method):
     def write_interior_impulse(self, double[::1] impulse):
         """Write the impulse (rows,) [N s] of the last interior point."""
         write_impulse(self.get_state(), self.get_state().ip.z, &impulse[0])
+
+    @property
+    def fraction_near_sliding(self):
+        """Fraction of the loaded contacts with at least 0.95 of their friction bound at the last interior point."""
+        return compute_fraction_near_sliding(self.get_state().s.e, self.get_state().ip.z)
 
     @property
     def counts(self):

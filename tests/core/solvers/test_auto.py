@@ -75,6 +75,20 @@ def test_auto_admm_from_relaxation_solves_pyramid_with_slip():
     assert work["newton on the relaxation"]["factorisations"] <= 24 and "newton" not in work
 
 
+def test_fraction_near_sliding_of_interior_point_equals_that_of_its_impulses():
+    problem = lv.suite.case("pyramidF(k=10)").problem.relaxed("cone")
+    state, impulse = Newton().prepare(problem), problem.start()
+    Newton().advance(state, impulse, 8, 1e-9)
+    state.system.solve.write_interior_impulse(impulse)
+    # In z = D^1/2 impulse, as in the kernel: the mean load of contacts depends on the scale.
+    z, normal = impulse * np.sqrt(problem.d), problem.cones.normal_rows
+    bound = problem.cones.friction_coefficient[normal + 1] * impulse[normal]
+    loaded = z[normal] > 1e-3 * z[normal].mean()
+    near = np.hypot(impulse[normal + 1], impulse[normal + 2]) > 0.95 * bound
+    assert 0.0 < near[loaded].mean() < 1.0
+    assert state.system.solve.fraction_near_sliding == near[loaded].mean()
+
+
 def test_auto_continues_only_with_islands_that_the_relaxation_has_not_solved():
     """Beside a pile that rests, a pyramid that slips takes about as many factorisations as alone."""
     pile, pyramid = (lv.suite.case(name).problem for name in ("granularF(n=6)", "pyramidF(k=6, sliding=0.5)"))
