@@ -1,7 +1,11 @@
-"""The length t of a Newton step, for `newton` and `velocity_newton`; interior points limit theirs in `newton/interior.pxd`.
+"""The length t of a Newton step, for `newton` and `velocity_newton`.
 
     convex function       |f'(t)| <= |f'(0)| / 10                      doubling, then regula falsi               (1)
     any other system      |F(t)| <= (1 - 1e-4 t) max |F| of the last steps      halving                          (2)
+
+Other rules are in the files of their phases: interior points keep a fraction of the distance to the boundary
+(newton/interior.pxd), Euler steps halve t until |F| falls (newton/flow.pxd), a path halves its predictor (newton/path.pxd),
+and exchanges take t = 1 (newton/active_set.pxd).
 
 (1) is used where a step descends on a convex function f: convex laws over velocities (`velocity_newton/newton.pxd`). (2), a
 non-monotone line search (Grippo, Lampariello, Lucidi 1986), is used by damped Newton (`newton/damped_newton.pxd`) and over

@@ -2,8 +2,9 @@
 
     (1) A is symmetric, and the island has bounded rows or cones: the iterate with the lowest objective f
     (2) otherwise: from Gauss-Seidel sweeps the last iterate, from every other method the iterate with the smallest E
-    (3) a start that the user gives is projected on its bounds and counts as an iterate; under (2), the zero impulse from which
-        a solve begins by default does not, because E rises while a motor runs up to its bound
+    (3) a start that the user gives is projected on its bounds and counts as an iterate in each island in which it is then not
+        zero; under (2), the zero impulse, from which a solve begins by default, does not count, because E rises while a motor
+        runs up to its bound
 
     f = 1/2 lam.A lam - b.lam = 1/2 lam.(w - b)
 

@@ -14,8 +14,8 @@ point takes, or if c_k does not fall:
                        (2) is too large, c_k has stalled, z is not finite, no budget        end
                        else                                                                 exchange
 
-The step has the length 1. The weight eps keeps the matrix regular if a row depends on others; a z that is not finite, as after
-a lost pivot, ends the phase.
+The step has the length 1. The weight eps keeps the matrix regular if a row depends on others; a z that is not finite, as
+without a factor (system.pxd), ends the phase.
 """
 from libc.stdint cimport int32_t
 

@@ -9,8 +9,8 @@ alone, dense or in compressed rows (coupled.pxd); a dense (3) has the rows with 
 (factor/linear.pxd). The augmented system of the bodies, [I -R K^T; L K I], is factored by the caller (`external_t`).
 
 If a pivot fails, L U replaces a dense L L^T, and the host's factorisation a sparse factor, or L U if there is none. If that
-fails too, `factor_newton_system` returns 0, and the phases use the step only if it is finite: else an interior point and
-exchanges end, an inner problem of damped Newton or an Euler step fails, and a path halves its step.
+fails too, the step is infinite: an interior point and exchanges end, an inner problem of damped Newton or an Euler step
+fails, and a path halves its step. Over bodies the factor stays: the step is 0 in the row of the failed pivot, and is used.
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t

@@ -19,10 +19,10 @@ Coulomb's law has no such function. A round has two stages:
 
     stage           steps                                                 event                    next
     CONVEX_STAGE    descent under the cone law                            solved or stuck          COULOMB_STAGE
-    COULOMB_STAGE   Newton's method with the derivative of Coulomb's      |G| no longer falls      CONVEX_STAGE of a new round
-                    law, which is not symmetric
+    COULOMB_STAGE   Newton's method with the derivative of Coulomb's      |G| no longer falls, a   CONVEX_STAGE of a new round
+                    law, which is not symmetric                           pivot is lost
     any                                                                   error within tol         REACHED
-    any                                                                   numbers are not finite   LOST, BROKEN
+    CONVEX_STAGE                                                          not finite, lost pivot   LOST, BROKEN
 
 After the second stage the normals are lowered by phi = sum of a_g |w_g| over the friction components (3) for the next
 convex problem (De Saxce, Feng 1998; Cadoux 2009). A run that was given a start begins with the second stage.

@@ -1,8 +1,8 @@
 """The linear system of a step of one island (`newton.pxd`): N = I + Y^T V Y, or over few rows a part of A = Y Y^T.
 
-N has the pattern of L; under Coulomb's law it is a full matrix, since it is not symmetric. `form_normal_matrix` forms it and
-`factor_normal_matrix` factors it. A lost pivot ends the island with BROKEN (`descend_island`), and the host continues over
-bodies or over the rows of A.
+N has the pattern of L; in COULOMB_STAGE it is a full matrix, since it is not symmetric. `form_normal_matrix` forms it and
+`factor_normal_matrix` factors it. A lost pivot ends a descent (`descend_island`): in COULOMB_STAGE a new round begins, else the
+island ends with BROKEN, and `_run_over_velocities` of lavender/solvers/newton.py continues over bodies or the rows of A.
 
 If an island has few rows, its steps are taken over these: y = Y^T mu and p = Y^T pi. A column of A is formed when its row first
 becomes free (V != 0). By the matrix inversion lemma, with a the free rows, if all rows are bounded rows:
