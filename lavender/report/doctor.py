@@ -27,7 +27,7 @@ HASHES = {
     "pgs, coulomb": "52377527e1e47d29",
     "block_gauss_seidel, coulomb": "3fee2e4ddfd0a648",
     "nncg, coulomb": "87a3f0bf4120fd7f",
-    "anderson, cone": "d15a96b2b5096e0f",
+    "anderson, cone": "33e117bfa881adf7",
     "sequential_impulses, bodies": "5102002ece9a6f08",
     "anderson, bodies": "35b3604eec1d5e0b",
     "stack, 60 steps": "e5f91394fb7c66b5",

@@ -15,8 +15,8 @@ problem takes, and rises if one fails.
     2       adapt alpha                         a certificate is proven, or the round-off limit is reached   end
                                                 else                                                         0
 
-If a step is not finite, as without a factor (system.pxd), the inner problem fails and alpha rises. Stretches repeat the phase as long as
-each of them halves the residual.
+If a step is not finite, as without a factor (system.pxd), the inner problem fails and alpha rises. Stretches repeat the phase
+as long as each of them halves the residual.
 """
 from libc.math cimport fabs
 from libc.stdint cimport int32_t

@@ -343,7 +343,7 @@ cdef inline void begin_augmented_newton(newton_t* n, const double* z) noexcept n
 cdef inline void step_augmented_newton(newton_t* n) noexcept nogil:
     """Take a Newton step on the augmented system. End the phase if the judge accepts or steps do not lower the residual."""
     cdef augmented_newton_t* x = &n.augmented
-    cdef int32_t j
+    cdef int32_t j, law = COULOMB if n.problem.p.law == COULOMB else CONE
     cdef double residual
     if x.steps_left == 0 or is_finished(n):
         pop_phase(n)
@@ -351,7 +351,7 @@ cdef inline void step_augmented_newton(newton_t* n) noexcept nogil:
     x.steps_left -= 1
     n.s.augmented = 1
     compute_slack(n, x.z, n.slack)
-    evaluate_system_natural_map(&n.s, x.z, n.slack, CONE, augmented_shift(), n.f)
+    evaluate_system_natural_map(&n.s, x.z, n.slack, law, augmented_shift(), n.f)
     factor_newton_system(&n.s, NATURAL, augmented_shift())
     n.counts[N_AUGMENTED_NEWTON] += 1
     for j in range(n.s.e.m):

@@ -20,7 +20,9 @@
                                               if many contacts slide
                     CONVEX_FLOW               Euler steps from it, if few contacts slide          FIRST_PATH
                     FIRST_PATH                path of smoothed problems, unless joints are rigid  SECOND_DE_SAXCE
-                    SECOND_DE_SAXCE           De Saxce's interior point with 0.7 of it            LAST_FLOW
+                    SECOND_DE_SAXCE           De Saxce's interior point with 0.7 of it            AUGMENTED_DE_SAXCE
+                    AUGMENTED_DE_SAXCE        the same on the augmented system, if joints are     LAST_FLOW
+                                              rigid
                     LAST_FLOW                 Euler steps from the best point                     COULOMB_DAMPED_NEWTON
                     COULOMB_DAMPED_NEWTON     proximal damped Newton from the best point          COULOMB_END
 
@@ -34,7 +36,7 @@ mass, a case of the suite, or a file of the test data; tol is 1e-6 if there is n
     FIRST_CONE_WEIGHT         heap 3000 0.5 1, cone law, to 1e-8: 2.7
     SECOND_CONE_WEIGHT        pyramid(k=30, friction="coulomb"), cone law, to 1e-9
     THIRD_CONE_WEIGHT         pyramid(k=6, mass_ratio=1e6, friction="coulomb", sliding=0.5), cone law, to 1e-8
-    AUGMENTED_INTERIOR_POINT  Scene("bridge", friction=0.5), step 99, to 1e-8
+    AUGMENTED_INTERIOR_POINT, AUGMENTED_DE_SAXCE    Scene("bridge", friction=0.5), step 99, cone and Coulomb's law, to 1e-8
     CONVEX_DAMPED_NEWTON      lcpgen_psd-300, proof that it has no solution
     START_FLOW                granularF(n=6, sliding=2, seed=2) from the solution of the cone law: 2.4
     START_DAMPED_NEWTON       engine/balls_step_0030: 4.6
@@ -101,9 +103,10 @@ cdef enum:                      # states of PLAN_COULOMB
     CONVEX_FLOW = 5
     FIRST_PATH = 6
     SECOND_DE_SAXCE = 7
-    LAST_FLOW = 8
-    COULOMB_DAMPED_NEWTON = 9
-    COULOMB_END = 10
+    AUGMENTED_DE_SAXCE = 8
+    LAST_FLOW = 9
+    COULOMB_DAMPED_NEWTON = 10
+    COULOMB_END = 11
 
 cdef enum:                      # states of DE_SAXCE
     DE_SAXCE_INTERIOR = 0
@@ -262,6 +265,14 @@ cdef inline bint has_rigid_joints(const newton_t* n) noexcept nogil:
 # -- bounded rows and cones --------------------------------------------------------------------------------------------
 
 
+cdef inline void begin_augmented_interior_point(newton_t* n, double derivative_fraction) noexcept nogil:
+    """Begin an interior point on the augmented system of bodies, with attempts to finish by Newton steps."""
+    n.s.augmented = 1
+    begin_interior_point(n, augmented_shift(), derivative_fraction)
+    n.s.augmented = 0
+    begin_interior_with_newton(n, 1)
+
+
 cdef inline void enter_next_convex_state(newton_t* n) noexcept nogil:
     """Enter the next state of the convex laws."""
     cdef int32_t state = n.stage
@@ -289,10 +300,7 @@ cdef inline void enter_next_convex_state(newton_t* n) noexcept nogil:
         begin_interior_steps(n, False)
     elif state == AUGMENTED_INTERIOR_POINT:
         if n.best < 1e-3 and n.has_augmented and has_rigid_joints(n):   # Nearly dependent rows may prevent further progress.
-            n.s.augmented = 1
-            begin_interior_point(n, augmented_shift(), 0.0)
-            n.s.augmented = 0
-            begin_interior_with_newton(n, 1)
+            begin_augmented_interior_point(n, 0.0)
     elif state == CONVEX_DAMPED_NEWTON:
         # Of cones, the last interior point is nearer to a solution than the point with the lowest residual, unless its
         # steps failed at once, as with inactive rows of b = 1e60.
@@ -380,6 +388,9 @@ cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
             begin_path(n)
     elif state == SECOND_DE_SAXCE:
         begin_de_saxce(n, second_derivative_fraction(), 1.0 / 0.0)
+    elif state == AUGMENTED_DE_SAXCE:
+        if n.has_augmented and has_rigid_joints(n):
+            begin_augmented_interior_point(n, second_derivative_fraction())
     elif state == LAST_FLOW:
         begin_flow(n, n.best_z, LAST_FLOW_FACTORISATIONS, LAST_FLOW_PATIENCE)
     elif state == COULOMB_DAMPED_NEWTON:
