@@ -5,15 +5,13 @@ Callers that may allocate use `grow_workspace_to`, and reuse their memory: new p
 from libc.stdint cimport int32_t, int64_t
 from libc.stdlib cimport free, malloc
 
-from lavender_ext.core.method cimport CERTIFICATE, MORE, NEEDS_WORKSPACE, UNFIT, info_t, method_t, options_t, workspace_t
+from lavender_ext.core.method cimport (CERTIFICATE, MORE, NEEDS_WORKSPACE, UNFIT, grow_t, info_t, method_t, options_t,
+                                       workspace_t)
 from lavender_ext.core.view cimport view_t
 
 
 cdef enum:
     MAX_SPARE_NUMBERS = 1 << 20     # Memory grows to twice the requested size, or by this number of spare numbers.
-
-# Provide at least these sizes, with the content of the integers unless they grow; return 0 if there is not enough memory.
-ctypedef public int32_t (*grow_t)(workspace_t* memory, int64_t n_index, int64_t n_real) noexcept nogil
 
 
 cdef inline int32_t grow_workspace_to(workspace_t* r, int64_t n_index, int64_t n_real) noexcept nogil:

@@ -58,6 +58,10 @@ cdef struct workspace_t:
     double work                 # multiply-adds of one factor
 
 
+# Provide at least these sizes, with the content of the integers unless they grow; return 0 if there is not enough memory.
+ctypedef public int32_t (*grow_t)(workspace_t* memory, int64_t n_index, int64_t n_real) noexcept nogil
+
+
 cdef struct info_t:             # statistics since the start
     int32_t work                # units of work of the method
     int32_t factorisations

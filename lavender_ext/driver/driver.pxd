@@ -6,9 +6,8 @@
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.method cimport info_t, options_t, workspace_t
+from lavender_ext.core.method cimport grow_t, info_t, options_t, workspace_t
 from lavender_ext.core.view cimport view_t
-from lavender_ext.host cimport grow_t
 
 
 cdef enum:                      # methods

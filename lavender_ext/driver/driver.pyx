@@ -2,12 +2,12 @@
 from libc.math cimport INFINITY
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.method cimport NEEDS_WORKSPACE, UNFIT, Method, method_t, options_t, workspace_t, info_t
+from lavender_ext.core.method cimport NEEDS_WORKSPACE, UNFIT, Method, grow_t, info_t, method_t, options_t, workspace_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport NEWTON
 from lavender_ext.factor.factors cimport has_wide
-from lavender_ext.host cimport analyse_for_method, grow_t, start_method, step_method
+from lavender_ext.host cimport analyse_for_method, start_method, step_method
 from lavender_ext.velocity_newton.method cimport islands_workspace_size, start_islands, advance_islands
 from lavender_ext.newton.rows cimport are_generalized_rows_faster
 from lavender_ext.newton.solve cimport (bodies_workspace_size, start_newton_over_bodies, rows_workspace_size,
