@@ -23,7 +23,8 @@
     alternation      the factorising solvers, `admm` and sweeps in turn, with doubled work in each round, until none
                      improves the residual in two rounds or the total cost exceeds `total_ratio` times the cheapest's.
                      On large problems with friction, sweeps do not run, `newton` begins with `turn_factorisations`,
-                     and both continue from the other's impulse if it is better (`lavender_ext/newton/flow.pxd`)
+                     which its last 30 extend while they halve the residual, and both continue from the other's impulse
+                     if it is better (`lavender_ext/newton/flow.pxd`). After the last round `newton` uses the rest
     end              a search for a certificate by a linear program, if none was tried before (`certify.py`)
 
 Linear problems given by a matrix, and others with a narrow band as A, start with `direct`. A program with a singular P
@@ -69,8 +70,7 @@ assert __doc__ is not None
 __doc__ += describe_numbers() + "\n"
 
 MIN_ITERATIONS_FOR_COMPILED_CALL = 200  # With fewer allowed, the compiled call is not made.
-# [ns] If no solver gains and Newton's method has not ended, it runs on up to this cost. On nine rows of J and M with
-# masses over many orders, it took 1,460 factorisations of 30 us.
+# [ns] Newton's method that has not ended runs on up to this cost: nine rows of masses over many orders took 4.4e7.
 MAX_LAST_NEWTON_COST = 1e8
 
 
@@ -194,10 +194,10 @@ def solve(log: SolveLog, tree: DecisionTree) -> None:
             return
     newton = steps.get("newton")
     if newton is not None and not newton.over and not log.done() and not log.deadline.is_set:
-        # No solver gained, but Newton's method has not ended. By name it would go on.
         state = tree.newton_state
         step_cost = tree.solver_costs["newton"] / state.steps if state is not None else inf
-        newton.run(min(get("newton").max_iter, MAX_LAST_NEWTON_COST / step_cost))
+        rest = tree.remaining_cost if starts_relaxed(log.problem) else 0.0
+        newton.run(min(get("newton").max_iter, max(rest, MAX_LAST_NEWTON_COST) / step_cost))
     if log.timed_out and not log.done():
         sweep_until_deadline(log, tree, steps)
     can_continue = log.remaining_iterations > 0 or log.last_stage_failed

@@ -34,6 +34,7 @@ FIRST_SWEEPS_OF_LARGE_PROBLEM = 8  # Sweeps of `is_large` problems before the fi
 FIRST_RELAXED_FACTORISATIONS = 6  # Interior points on the relaxation need at least as many factorisations.
 RELAXED_TOLERANCE = 0.01  # The relaxation's tolerance relative to tol, since Coulomb's residual is larger.
 FORMATION_COST_RATIO = 4.0  # Sweeps use a formed A only if this multiple of the cost to form it remains.
+HALVING_FACTORISATIONS = 30  # A turn of Newton's method continues while the last ones halve the residual.
 #: Solver of each step, by its name. On large piles, `admm` needs fewer iterations from zero than from sweeps.
 METHODS = {
     "anderson": "anderson", "newton": "newton", "direct": "direct", "admm": "admm", "admm from zero": "admm",
@@ -148,20 +149,25 @@ class Newton(Step):
                 super().run(end - log.iterations)
 
     def advance(self, n: int) -> Claim:
-        """Run about n iterations; choose the start at the first call."""
-        log = self.log
+        """Run about n iterations, on large problems with friction more; choose the start at the first call."""
+        log, is_large, done, work = self.log, starts_relaxed(self.log.problem), 0, dict[str, int]()
         if not self.state.begun:
             self.impulse = log.problem.start() if self.is_second_start else log.impulse.copy()
             self.started_from_zero = self.started_from_zero or not (self.impulse - log.problem.start()).any()
-        elif log.best < self.best and starts_relaxed(log.problem) and self.state.system is not None:
+        elif log.best < self.best and is_large and self.state.system is not None:
             self.state.system.solve.continue_from_better_point(log.impulse, n)
-        claim = self.solver.advance(
-            self.state, self.impulse, n, log.tol, log.time_left, log.remaining_iterations
-        )
-        self.has_stalled = claim.status is Status.STALLED
-        self.store_iterate_in_log(claim.judged)
-        self.best = log.best
-        return claim
+        count = max(1, n - HALVING_FACTORISATIONS) if is_large else n
+        while True:
+            before, left = log.best, log.remaining_iterations - done
+            claim = self.solver.advance(self.state, self.impulse, count, log.tol, log.time_left, left)
+            self.store_iterate_in_log(claim.judged)
+            done, work = done + claim.iterations, sum_work_counts((work, claim.work))
+            is_slow = not is_large or (done >= n and log.best > 0.5 * before)
+            if is_slow or claim.status is not Status.MAX_ITERATIONS or done >= log.remaining_iterations:
+                break
+            count = HALVING_FACTORISATIONS
+        self.has_stalled, self.best = claim.status is Status.STALLED, log.best
+        return replace(claim, iterations=done, work=work)
 
 
 class RelaxedNewton(Step):

@@ -75,6 +75,16 @@ def test_auto_admm_from_relaxation_solves_pyramid_with_slip():
     assert work["newton on the relaxation"]["factorisations"] <= 24 and "newton" not in work
 
 
+def test_auto_turn_of_newton_that_halves_the_residual_continues():
+    problem = lv.suite.case("granularF(n=6, sliding=2, seed=4)").problem
+    solution = lv.solve(problem, "auto", tol=1e-6)
+    assert solution.success and lv.residual(problem, solution.impulse).relative <= 1e-6
+    turns = [stage.work["factorisations"] for stage in solution.stages if stage.solver == "newton"]
+    # After the first turn of 180, the residual is 3e-3; 30 factorisations before it was 1e-2.
+    assert len(turns) == 1 and 180 < turns[0] <= 270
+    assert "admm" not in {stage.solver for stage in solution.stages}
+
+
 def test_fraction_near_sliding_of_interior_point_equals_that_of_its_impulses():
     problem = lv.suite.case("pyramidF(k=10)").problem.relaxed("cone")
     state, impulse = Newton().prepare(problem), problem.start()
