@@ -11,7 +11,7 @@ from lavender_ext.core.view cimport view_t
 
 
 cdef enum:
-    MAX_SPARE_NUMBERS = 1 << 20     # Memory grows to twice the requested size, or by this number of spare numbers.
+    MAX_SPARE_NUMBERS = 1 << 20     # Memory that grows again doubles, with at most so many spare numbers.
 
 
 cdef inline int32_t grow_workspace_to(workspace_t* r, int64_t n_index, int64_t n_real) noexcept nogil:
@@ -19,12 +19,12 @@ cdef inline int32_t grow_workspace_to(workspace_t* r, int64_t n_index, int64_t n
     cdef int64_t size
     if n_index > r.n_index:
         free(r.index)
-        size = n_index + min(n_index, MAX_SPARE_NUMBERS)
+        size = max(n_index, min(2 * r.n_index, n_index + MAX_SPARE_NUMBERS))
         r.index = <int32_t*>malloc(size * sizeof(int32_t))
         r.n_index = size if r.index != NULL else 0
     if n_real > r.n_real:
         free(r.real)
-        size = n_real + min(n_real, MAX_SPARE_NUMBERS)
+        size = max(n_real, min(2 * r.n_real, n_real + MAX_SPARE_NUMBERS))
         r.real = <double*>malloc(size * sizeof(double))
         r.n_real = size if r.real != NULL else 0
     return n_index <= r.n_index and n_real <= r.n_real
