@@ -3,13 +3,10 @@
     convex function       |f'(t)| <= |f'(0)| / 10                      doubling, then regula falsi               (1)
     any other system      |F(t)| <= (1 - 1e-4 t) max |F| of the last steps      halving                          (2)
 
-Other rules are in the files of their phases: interior points keep a fraction of the distance to the boundary
-(newton/interior.pxd), Euler steps halve t until |F| falls (newton/flow.pxd), a path halves its predictor (newton/path.pxd),
-and exchanges take t = 1 (newton/active_set.pxd).
-
-(1) is used where a step descends on a convex function f: convex laws over velocities (`velocity_newton/newton.pxd`). (2), a
-non-monotone line search (Grippo, Lampariello, Lucidi 1986), is used by damped Newton (`newton/damped_newton.pxd`) and over
-velocities under Coulomb's law. The caller evaluates f' or |F| at each t:
+(1) descends on the convex functions of `velocity_newton/newton.pxd`. (2), a non-monotone line search (Grippo, Lampariello,
+Lucidi 1986), serves damped Newton (`newton/damped_newton.pxd`) and Coulomb's law over velocities. Elsewhere interior points
+keep a fraction of the distance to the boundary (newton/interior.pxd), Euler steps halve t until |F| falls (newton/flow.pxd),
+a path halves its predictor (newton/path.pxd), and exchanges take t = 1 (newton/active_set.pxd). The caller of (1) evaluates f':
 
     begin_line_search(&x, slope)
     while not narrow_line_search(&x, f'(x.t)): pass             x.t is the length, 0 if f' is not a number

@@ -21,8 +21,9 @@
                     CONVEX_FLOW               Euler steps from it, if few contacts slide          FIRST_PATH
                     FIRST_PATH                path of smoothed problems, unless joints are rigid  SECOND_DE_SAXCE
                     SECOND_DE_SAXCE           De Saxce's interior point with 0.7 of it            AUGMENTED_DE_SAXCE
-                    AUGMENTED_DE_SAXCE        the same on the augmented system, if joints are     LAST_FLOW
+                    AUGMENTED_DE_SAXCE        the same on the augmented system, if joints are     LAST_PATH
                                               rigid
+                    LAST_PATH                 the path of smoothed problems, if joints are rigid  LAST_FLOW
                     LAST_FLOW                 Euler steps from the best point                     COULOMB_DAMPED_NEWTON
                     COULOMB_DAMPED_NEWTON     proximal damped Newton from the best point          COULOMB_END
 
@@ -46,6 +47,8 @@ mass, a case of the suite, or a file of the test data; tol is 1e-6 if there is n
     CONVEX_FLOW               granularF(n=4, sliding=2, seed=10): 9
     FIRST_PATH                wall 3000 0.5 1
     SECOND_DE_SAXCE           ragdolls 300 0.5 0: 1.9
+    DE_SAXCE_SECOND_END       ragdolls 3000 0.5 1, seed 31: 3.2
+    LAST_PATH                 ragdolls 3000 0 1, seed 31
     LAST_FLOW, COULOMB_DAMPED_NEWTON    wall 3000 0.5 1: each solves it without the other
 
 A host that has a better point begins Euler steps from it with `continue_from_better_point`.
@@ -54,7 +57,8 @@ Every state ends the solve as soon as the best point is within tol or at the rou
 or the budget is spent. De Saxce's interior point has states of its own:
 
     DE_SAXCE_INTERIOR    interior point                              far from a solution: end;  else DE_SAXCE_END
-    DE_SAXCE_END         damped Newton from its best point           end
+    DE_SAXCE_END         damped Newton from its best point           DE_SAXCE_SECOND_END
+    DE_SAXCE_SECOND_END  the same with a smaller proximal weight     end
 """
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
@@ -104,14 +108,16 @@ cdef enum:                      # states of PLAN_COULOMB
     FIRST_PATH = 6
     SECOND_DE_SAXCE = 7
     AUGMENTED_DE_SAXCE = 8
-    LAST_FLOW = 9
-    COULOMB_DAMPED_NEWTON = 10
-    COULOMB_END = 11
+    LAST_PATH = 9
+    LAST_FLOW = 10
+    COULOMB_DAMPED_NEWTON = 11
+    COULOMB_END = 12
 
 cdef enum:                      # states of DE_SAXCE
     DE_SAXCE_INTERIOR = 0
     DE_SAXCE_END = 1
-    DE_SAXCE_ENDED = 2
+    DE_SAXCE_SECOND_END = 2
+    DE_SAXCE_ENDED = 3
 
 cdef enum:
     POINT_REFINEMENTS = 3       # Refinements of an interior point's first z with the factor of its weighted system.
@@ -127,6 +133,7 @@ cdef enum:
     START_FACTORISATIONS = 8    # First stretch of damped Newton; a start near a solution gains within it.
     END_INNER_STEPS = 10
     END_FACTORISATIONS = 15     # Factorisations of the damped Newton phase after De Saxce's interior point.
+    SECOND_END_FACTORISATIONS = 12  # Factorisations and inner steps of the second damped Newton phase after it.
     MAX_AUGMENTED_ROWS = 10000  # With more rows, one factorisation of the augmented system may exceed 0.2 s.
 
 
@@ -320,22 +327,34 @@ cdef inline void begin_de_saxce(newton_t* n, double derivative_fraction, double 
     push_phase(n, DE_SAXCE)
 
 
+cdef inline void begin_damped_newton_after_de_saxce(newton_t* n, double alpha, int32_t max_inner_steps,
+                                                    int32_t limit) noexcept nogil:
+    """Begin damped Newton from the best point of De Saxce's interior point."""
+    begin_damped_newton(n, n.progress.best_z, COULOMB, alpha, max_inner_steps)
+    begin_separate_best(n)
+    push_damped_newton(n, limit)
+
+
 cdef inline void enter_next_de_saxce_state(newton_t* n) noexcept nogil:
     """Enter the next state of De Saxce's interior point."""
     cdef de_saxce_t* x = &n.de_saxce
     cdef int32_t state = x.stage
+    cdef double best
     x.stage = state + 1
     if state == DE_SAXCE_INTERIOR:
         begin_interior_point(n, compute_proximal_weight(), x.derivative_fraction)
         begin_interior_with_newton(n, 0)
     elif state == DE_SAXCE_END and n.progress.lowest <= x.max_residual and not is_over(n):
-        begin_damped_newton(n, n.progress.best_z, COULOMB, min(n.progress.lowest, 1e-3), END_INNER_STEPS)
-        begin_separate_best(n)
-        push_damped_newton(n, END_FACTORISATIONS)
-    else:
-        if state == DE_SAXCE_ENDED:
-            end_separate_best(n)
+        begin_damped_newton_after_de_saxce(n, min(n.progress.lowest, 1e-3), END_INNER_STEPS, END_FACTORISATIONS)
+    elif state == DE_SAXCE_END:
         pop_phase(n)
+    else:
+        copy_vector(n, n.progress.best_z, n.best_z)
+        best = end_separate_best(n)
+        if state == DE_SAXCE_ENDED or is_over(n):
+            pop_phase(n)
+        else:
+            begin_damped_newton_after_de_saxce(n, min(best, 1e-7), SECOND_END_FACTORISATIONS, SECOND_END_FACTORISATIONS)
 
 
 cdef inline bint has_convex_law(const newton_t* n) noexcept nogil:
@@ -391,6 +410,9 @@ cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
     elif state == AUGMENTED_DE_SAXCE:
         if n.has_augmented and has_rigid_joints(n):
             begin_augmented_interior_point(n, second_derivative_fraction())
+    elif state == LAST_PATH:
+        if has_rigid_joints(n):
+            begin_path(n)
     elif state == LAST_FLOW:
         begin_flow(n, n.best_z, LAST_FLOW_FACTORISATIONS, LAST_FLOW_PATIENCE)
     elif state == COULOMB_DAMPED_NEWTON:

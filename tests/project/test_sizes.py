@@ -41,7 +41,7 @@ LINES = {
     "lavender_ext/factor": 3251,
     "lavender_ext/judge": 3070,
     "lavender_ext/local": 950,
-    "lavender_ext/newton lavender_ext/velocity_newton": 7700,
+    "lavender_ext/newton lavender_ext/velocity_newton": 7720,
     "lavender_ext/pivot": 1719,
 }
 
