@@ -23,8 +23,8 @@
     alternation      the factorising solvers, `admm` and sweeps in turn, with doubled work in each round, until none
                      improves the residual in two rounds or the total cost exceeds `total_ratio` times the cheapest's.
                      On large problems with friction, sweeps do not run, `newton` begins with `turn_factorisations`,
-                     which its last 30 extend while they halve the residual, and both continue from the other's impulse
-                     if it is better (`lavender_ext/newton/flow.pxd`). After the last round `newton` uses the rest
+                     which its last 30 extend while they halve the residual, and continues its own plan; `admm` starts
+                     from the best impulse. After the last round `newton` uses the rest
     end              a search for a certificate by a linear program, if none was tried before (`certify.py`)
 
 Linear problems given by a matrix, and others with a narrow band as A, start with `direct`. A program with a singular P
@@ -193,7 +193,7 @@ def solve(log: SolveLog, tree: DecisionTree) -> None:
         if stage.position and not log.done() and solve_unsolved_islands(log, stage.position + 1):
             return
     newton = steps.get("newton")
-    if newton is not None and not newton.over and not log.done() and not log.deadline.is_set:
+    if newton is not None and not newton.over and not log.done():
         state = tree.newton_state
         step_cost = tree.solver_costs["newton"] / state.steps if state is not None else inf
         rest = tree.remaining_cost if starts_relaxed(log.problem) else 0.0

@@ -130,7 +130,6 @@ class Newton(Step):
     """
 
     started_from_zero = is_second_start = has_stalled = False
-    best = inf  # Smallest residual of all stages when this step ended.
 
     def run(self, n: float) -> None:
         """Run at most n iterations, with a second start from zero and over rows of A if the method stalls."""
@@ -154,8 +153,6 @@ class Newton(Step):
         if not self.state.begun:
             self.impulse = log.problem.start() if self.is_second_start else log.impulse.copy()
             self.started_from_zero = self.started_from_zero or not (self.impulse - log.problem.start()).any()
-        elif log.best < self.best and is_large and self.state.system is not None:
-            self.state.system.solve.continue_from_better_point(log.impulse, n)
         count = max(1, n - HALVING_FACTORISATIONS) if is_large else n
         while True:
             before, left = log.best, log.remaining_iterations - done
@@ -166,7 +163,7 @@ class Newton(Step):
             if is_slow or claim.status is not Status.MAX_ITERATIONS or done >= log.remaining_iterations:
                 break
             count = HALVING_FACTORISATIONS
-        self.has_stalled, self.best = claim.status is Status.STALLED, log.best
+        self.has_stalled = claim.status is Status.STALLED
         return replace(claim, iterations=done, work=work)
 
 

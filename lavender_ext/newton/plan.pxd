@@ -51,8 +51,6 @@ mass, a case of the suite, or a file of the test data; tol is 1e-6 if there is n
     LAST_PATH                 ragdolls 3000 0 1, seed 31
     LAST_FLOW, COULOMB_DAMPED_NEWTON    wall 3000 0.5 1: each solves it without the other
 
-A host that has a better point begins Euler steps from it with `continue_from_better_point`.
-
 Every state ends the solve as soon as the best point is within tol or at the round-off limit, a certificate is proven,
 or the budget is spent. De Saxce's interior point has states of its own:
 
@@ -420,13 +418,6 @@ cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
         push_damped_newton(n, UNLIMITED)
     else:
         pop_phase(n)
-
-
-cdef inline void continue_from_better_point(newton_t* n, const double* lam, int32_t limit) noexcept nogil:
-    """Begin Euler steps from lam (rows), for at most `limit` factorisations; the present phase continues after them."""
-    write_unknown(n, lam, n.da)
-    judge_and_keep_best_point(n, n.da)
-    begin_flow(n, n.da, limit, FLOW_PATIENCE)
 
 
 # -- start and step ----------------------------------------------------------------------------------------------------

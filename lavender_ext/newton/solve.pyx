@@ -30,7 +30,7 @@ from lavender_ext.newton.elements cimport elements_t
 from lavender_ext.newton.interior cimport compute_scaling
 from lavender_ext.newton.interior_phases cimport compute_fraction_near_sliding
 from lavender_ext.newton.path cimport path_compliance
-from lavender_ext.newton.plan cimport continue_from_better_point, start_newton_solve, step_newton_solve
+from lavender_ext.newton.plan cimport start_newton_solve, step_newton_solve
 from lavender_ext.newton.run cimport (N_COUNTED, bind_indices, bind_values, newton_t, scale_problem, set_problem, set_reference,
                                       write_certificate, write_impulse)
 from lavender_ext.newton.rows cimport (ANY_FORM, MAX_ALWAYS_DENSE_ROWS, analyse_row_system, bind_row_values,
@@ -553,10 +553,6 @@ cdef class Solve(Method):
         Method.step(self, work, impulse)
         self.python.raise_error()
         return self.how
-
-    def continue_from_better_point(self, const double[::1] impulse, int limit):
-        """Begin Euler steps from impulse (rows,), for at most `limit` factorisations; the present phase continues after them."""
-        continue_from_better_point(self.get_state(), &impulse[0], limit)
 
     def write_interior_impulse(self, double[::1] impulse):
         """Write the impulse (rows,) [N s] of the last interior point."""

@@ -11,7 +11,6 @@ from lavender.judge.solution import Status
 from lavender.solvers.newton import Newton, NewtonState
 from lavender.solvers.newton_systems.systems import make_system
 from lavender.suite import box_stack
-from lavender_ext.newton.solve import COUNTED
 
 
 @pytest.mark.parametrize(("ratio", "speed"), [(1.0, 0.5), (1e3, 0.0), (1e3, 0.5), (1e6, 0.5)])
@@ -159,16 +158,3 @@ def test_newton_pyramid_with_slip_needs_euler_steps():
     solution = lv.solve(problem, "newton", tol=1e-6, max_iter=150)
     assert solution.success and "Euler steps" in solution.message
     assert lv.residual(problem, solution.impulse).relative <= 1e-6
-
-
-def test_newton_better_point_is_continued_by_euler_steps():
-    problem = lv.suite.case("pyramidF(k=14)").problem
-    near = lv.solve(problem, "newton", tol=1e-4).impulse
-    newton = Newton()
-    state, impulse = newton.prepare(problem), problem.start()
-    newton.advance(state, impulse, 10, 1e-6)
-    assert lv.residual(problem, impulse).relative > 1e-3  # Far from a solution
-    state.system.solve.continue_from_better_point(near, 60)
-    claim = newton.advance(state, impulse, 60, 1e-6)
-    assert claim.status is Status.CONVERGED and lv.residual(problem, impulse).relative <= 1e-6
-    assert state.system.solve.counts[COUNTED.index("Euler steps")] > 0
