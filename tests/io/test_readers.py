@@ -34,7 +34,7 @@ def read_newton_mujoco(cone, **changes):
     return step, data.qvel.array + dt * data.qacc.array
 
 
-STEPS = {
+READERS_BY_ENGINE = {
     **{f"kamino, {m}": lambda m=m, **more: read_kamino(m, **more) for m in ("mixed", "stacks", "dvi")},
     **{f"genesis, {m}": lambda m=m, **more: read_genesis(m, **more) for m in ("arm", "convex", "pyramids")},
     **{f"newton's mujoco, {m}": lambda m=m, **more: read_newton_mujoco(m, **more) for m in ("elliptic", "pyramidal")},
@@ -51,9 +51,11 @@ def spoil(world, value):
     return change
 
 
-@pytest.mark.parametrize("name", [name for name in STEPS if name != "kamino, stacks"])  # a world has no finite velocity
+@pytest.mark.parametrize(
+    "name", [name for name in READERS_BY_ENGINE if name != "kamino, stacks"]
+)  # a world has no finite velocity
 def test_reader_impulses_give_the_next_velocity_of_the_engine(name):
-    step, after = STEPS[name]()
+    step, after = READERS_BY_ENGINE[name]()
     assert step.claims.converged.shape == (len(step.batch),) and step.batch.precision == "float32"
     for i, problem in enumerate(step.batch):
         impulse = step.impulse[step.batch.rows_of(i)] if step.impulse.ndim == 1 else step.impulse[i, : problem.m]
@@ -70,11 +72,11 @@ def test_reader_impulses_give_the_next_velocity_of_the_engine(name):
     ],
 )  # fmt: skip
 def test_reader_of_a_world_with_bad_numbers_has_no_answer_for_it_alone(name, world, changes):
-    step, _ = STEPS[name](**changes)
+    step, _ = READERS_BY_ENGINE[name](**changes)
     found = lv.residual_many(step.batch, step.impulse, errors="status")
     assert np.flatnonzero(~np.isfinite(found.velocity_error)).tolist() == [world]
     assert set(found.faults) <= {world} and step.claims.converged.shape == (len(step.batch),)
-    clean = found if name == "kamino, stacks" else lv.residual_many(*STEPS[name]()[0][:2])
+    clean = found if name == "kamino, stacks" else lv.residual_many(*READERS_BY_ENGINE[name]()[0][:2])
     others = np.delete(np.arange(len(step.batch)), world)
     np.testing.assert_array_equal(found.relative[others], clean.relative[others])
 
