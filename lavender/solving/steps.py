@@ -1,4 +1,4 @@
-"""Steps of `auto`: solvers that run in turns, each of which continues from its last turn."""
+"""Steps of `auto`: the solvers that it runs in turns. A solver continues from its last turn."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def starts_relaxed(problem: Problem) -> bool:
 
 
 class Step:
-    """A solver that runs on the problem of a log in turns, each of which continues where the last one stopped.
+    """A solver on the problem of a log. It runs in turns, and continues at the end of its last turn.
 
     `over` is true if the step cannot continue, `late` if it has no time to continue. The step stops if it predicts that
     more than `least` iterations are still needed.

@@ -27,9 +27,10 @@
                     LAST_FLOW                 Euler steps from the best point                     COULOMB_DAMPED_NEWTON
                     COULOMB_DAMPED_NEWTON     proximal damped Newton from the best point          COULOMB_END
 
-Problems that need a state: they are lost without it, or take this many times as long. `python -m benchmarks scale --without
-STATE` measures it. The first word is a structure of benchmarks/scale_structures.py with rows, sliding [m/s] and spread of log
-mass, a case of the suite, or a file of the test data; tol is 1e-6 if there is no other number.
+Each state with a problem that needs it: without the state the problem is lost, or takes this many times as long. `python -m
+benchmarks scale --without STATE` measures this, except for states of DE_SAXCE. A problem is a structure of
+benchmarks/scale_structures.py with rows, sliding [m/s] and spread of log mass, a case of the suite, or a file of the test data.
+tol is 1e-6 unless the line names another one.
 
     START_ACTIVE_SET          granular(n=6) from its solution, b changed by 1 %: 2.4
     UNBOUNDED_ACTIVE_SET      mlcp_Buck2

@@ -56,7 +56,7 @@ cdef enum:
     MAX_KEPT_DOUBLES = 4096     # A larger workspace is freed after a run, since many problems may be kept for long.
     INTERRUPT_CHECK_WORK = 5000000      # multiply-adds between two checks for Ctrl-C, a few milliseconds
     ISLAND_ROW_DOUBLES = 33     # Doubles of a copied island per row, if all are rows of joints: 8, J, M^-1 J^T and the result,
-    ISLAND_BLOCK_DOUBLES = 40   # and per block, if all are contacts between two bodies of their own.
+    ISLAND_BLOCK_DOUBLES = 40   # and per block, if every block is a contact between two bodies that no other block has.
 
 
 cdef bint are_all_rows_bounded(const blocks_t* p) noexcept nogil:
