@@ -92,8 +92,8 @@ A *backend* is a solver of another package. Backends accept the laws linear and 
 read matrices and rows. The table shows results on small programs with known solutions, for each backend alone, at its
 default settings, in the given version. The programs are: the same row twice (*repeated*), dependent equalities
 (*dependent*), *contradictory* equalities, an *unbounded* objective, a *singular* P, an indefinite P that is convex on
-the rows (*convex on rows*), and an indefinite P with a *saddle*. The first four columns also have the arrays of a
-start that the backend uses. *Wrong* names programs that are reported as solved although the answer is wrong; *fails*
+the rows (*convex on rows*), and an indefinite P with a *saddle*. *Start* names the arrays of a warm start that
+the backend uses. *Wrong* names programs that are reported as solved although the answer is wrong; *fails*
 names solvable programs without an answer."""
 BACKENDS_CALLED = """\
 lavender judges every answer, so a wrong one is marked as a contradicted claim. It scales programs to numbers near 1,
