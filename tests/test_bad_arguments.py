@@ -177,7 +177,7 @@ add({"rows": ROWS, "target": np.zeros(N_ROWS), "lower": -np.ones(len(ROWS.jac)),
      "shape": "disk"}, lv.Problem.from_rows)  # fmt: skip
 add({"J": EYE, "M": A, "v_free": B, "target": B, "cones": lv.Cones.free(2), "compliance": ONES, "friction": "cone",
      "names": ["x", "y"], "dof_names": ["u", "v"], "guess": B, "impulse": B}, lv.Problem.from_jacobian, GENERAL.updated,
-    GENERAL.velocity)  # fmt: skip
+    GENERAL.velocity, GENERAL.energy_change)  # fmt: skip
 add({"J": sp.csr_array(EYE), "M": [np.eye(1)] * 2, "v_free": B, "cones": lv.Cones.free(2)}, lv.Problem.from_jacobian)
 add({"P": A, "q": B, "G": A, "h": ONES, "A": np.ones((1, 2)), "b": np.ones(1), "lb": np.zeros(2), "ub": ONES,
      "solver": "auto", "tol": 1e-9, "time_limit": 1.0}, lv.Problem.from_qp, lv.solve_qp)  # fmt: skip

@@ -16,7 +16,7 @@ from lavender_ext.core import assemble
 from lavender_ext.core.assemble import dense_to_csr
 from lavender_ext.core.checks import MAX_MAGNITUDE, has_entry_above, make_instance
 from lavender_ext.core.problem import LAWS as FRICTION_NUMBER
-from lavender_ext.core.problem import Data, clip_zero_to_bounds
+from lavender_ext.core.problem import Data, clip_zero_to_bounds, multiply_body_jacobian
 from lavender_ext.factor import sparse
 from lavender_ext.factor.linear import LinearSystem
 from lavender_ext.judge import measure
@@ -371,6 +371,26 @@ class Operators(ProblemData):
         v = np.zeros((self.rows.n_bodies, 6))
         measure.write_velocity_change(self.data, impulse, v)
         return v
+
+    def energy_change(self, impulse: ArrayLike) -> float:
+        """Compute the change of the kinetic energy [J] by `impulse` (m,) [N s]: its work lambda.J (v* + v+) / 2.
+
+        A solution of contacts whose target is 0 never gains energy.
+
+        Raises
+        ------
+        CapabilityError
+            The problem was given as a matrix.
+        """
+        velocity = self.velocity(impulse)
+        velocity += self.rows.v_free if self.generalized is None else self.generalized.v_free  # type: ignore[union-attr]
+        if self.generalized is not None:
+            relative = self.generalized.velocity_of(velocity)
+        else:
+            relative = np.empty(self.m)
+            multiply_body_jacobian(self.data, velocity, relative)
+        with np.errstate(over="ignore", invalid="ignore"):  # Large impulses may overflow without a warning.
+            return float(0.5 * (self.impulse_array(impulse) @ relative))
 
     def start(self) -> FloatArray:
         """Return Pi(0) (m,) [N s], the zero impulse clipped to the bounds, as a new array."""

@@ -41,14 +41,45 @@ ERROR, KILLED, CRASHED = "ERROR", "KILLED", "CRASHED"
 KEY = ("run", "case", "sha", "solver", "start", "mode", "tol", "max_iter", "time_limit", "order")
 #: Columns of runs with their defaults, which are the values of a run without an answer and determine the types.
 RUN_COLUMNS: Row = {
-    "run": "", "case": "", "sha": "", "solver": "", "start": "cold", "mode": "tol", "tol": math.nan, "max_iter": 0,
-    "time_limit": math.nan, "order": "given", "step": -1, "status": "", "relative": math.inf, "energy": math.inf,
-    "velocity": math.inf, "roundoff_floor": math.nan, "motion_error": math.nan, "worst_row": -1, "worst_name": "",
-    "success": False, "claims": False, "claim_check": CONFIRMED, "status_conflict": "", "iterations": 0, "work": "{}",
-    "form": "", "message": "", "time": math.nan, "time_median": math.nan, "repetitions": 0, "carry_time": math.nan,
-    "setup_time": math.nan, "solve_time": math.nan, "calibration_time": math.nan, "load": math.nan,
-    "solution_hash": "", "times": (),
-}  # fmt: skip
+    "run": "",
+    "case": "",
+    "sha": "",
+    "solver": "",
+    "start": "cold",
+    "mode": "tol",
+    "tol": math.nan,
+    "max_iter": 0,
+    "time_limit": math.nan,
+    "order": "given",
+    "step": -1,
+    "status": "",
+    "relative": math.inf,
+    "error_energy": math.inf,
+    "velocity": math.inf,
+    "roundoff_floor": math.nan,
+    "energy_change": math.nan,
+    "motion_error": math.nan,
+    "worst_row": -1,
+    "worst_name": "",
+    "success": False,
+    "claims": False,
+    "claim_check": CONFIRMED,
+    "status_conflict": "",
+    "iterations": 0,
+    "work": "{}",
+    "form": "",
+    "message": "",
+    "time": math.nan,
+    "time_median": math.nan,
+    "repetitions": 0,
+    "carry_time": math.nan,
+    "setup_time": math.nan,
+    "solve_time": math.nan,
+    "calibration_time": math.nan,
+    "load": math.nan,
+    "solution_hash": "",
+    "times": (),
+}
 #: Columns of cases with their defaults. The second line of names is not repeated in the rows of runs.
 CASE_COLUMNS: Row = {
     "law": "", "rows": 0, "blocks": 0, "islands": 0, "contacts": 0, "mass_ratio": math.nan, "structure": "",
@@ -214,6 +245,8 @@ def read(path: str | Path) -> DataFrame:
             f"{path}{reason}. Give a records.jsonl that `lavender report` wrote, or remove this line"
         )
     lines = lines if len(lines) else make_lines([])
+    if "error_energy" not in lines:  # Files of development versions before 2026-11-30.
+        lines = lines.rename(columns={"energy": "error_energy"})
     lines.attrs = {"source": str(path), "dropped": int(dropped > 0)}
     select_runs(lines)  # Raises the errors of invalid columns.
     return lines

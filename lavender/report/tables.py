@@ -711,5 +711,5 @@ def tabulate_idle(report: Contents) -> Frame:
     """Tabulate cases that the zero impulse solves, with the largest error of any solver, in units."""
     idle = report.newest[report.newest["nothing_to_do"].astype(bool)].sort_values("velocity")
     idle = idle.drop_duplicates("case", keep="last")
-    columns = {"velocity": "velocity error [m/s]", "energy": "energy [√J]"}
-    return idle[["case", "rows", "solver", "velocity", "energy"]].rename(columns=columns)
+    columns = {"velocity": "velocity error [m/s]", "error_energy": "error energy [√J]"}
+    return idle[["case", "rows", "solver", "velocity", "error_energy"]].rename(columns=columns)

@@ -305,18 +305,32 @@ def make_solution(problem: Problem, task: Task, outcome: Row) -> Solution:
 def make_row(problem: Problem, task: Task, s: Solution, outcome: Row) -> Row:
     """Return the row of a measurement; its last repeat returned the solution `s`."""
     r = s.residual
+    is_known = problem.matrix is None and bool(np.isfinite(s.impulse).all())
     is_false = s.claim_check == CONTRADICTED
     observed = explain_contradicted_claim(task.solver, problem, s.status) if is_false else ""
     return task.make_row(
-        outcome["times"], status=s.status.name, relative=float(r.relative), energy=float(r.energy),
-        velocity=float(r.velocity), roundoff_floor=float(r.roundoff_floor), worst_row=int(r.worst_row),
-        worst_name=r.worst_name, success=bool(s.success) and task.mode == "tol", claim_check=s.claim_check,
+        outcome["times"],
+        status=s.status.name,
+        relative=float(r.relative),
+        error_energy=float(r.energy),
+        velocity=float(r.velocity),
+        roundoff_floor=float(r.roundoff_floor),
+        energy_change=problem.energy_change(s.impulse) if is_known else math.nan,
+        worst_row=int(r.worst_row),
+        worst_name=r.worst_name,
+        success=bool(s.success) and task.mode == "tol",
+        claim_check=s.claim_check,
         status_conflict="; ".join(filter(None, (s.status_conflict, observed))),
-        claims=s.status in CLAIM_STATUSES, iterations=int(s.iterations),
-        work=json.dumps({k: int(v) for k, v in s.work.items()}), form=s.solver.form, message=s.message[:500],
-        setup_time=outcome["setup_time"], solve_time=outcome["solve_time"],
-        calibration_time=outcome["calibration_time"], load=machine.count_runnable_processes(),
-    )  # fmt: skip
+        claims=s.status in CLAIM_STATUSES,
+        iterations=int(s.iterations),
+        work=json.dumps({k: int(v) for k, v in s.work.items()}),
+        form=s.solver.form,
+        message=s.message[:500],
+        setup_time=outcome["setup_time"],
+        solve_time=outcome["solve_time"],
+        calibration_time=outcome["calibration_time"],
+        load=machine.count_runnable_processes(),
+    )
 
 
 # -- plans -------------------------------------------------------------------------------------------------

@@ -22,8 +22,9 @@ def record(case, solver, time, relative, **more):
     """The row of a run of three repetitions, the smallest of which took `time`."""
     values = {
         "kind": "run", "run": "run", "case": case, "sha": "sha" + case, "solver": solver, "tol": 1e-6,
-        "time_limit": 2.0, "relative": relative, "energy": relative, "velocity": relative, "roundoff_floor": 1e-15,
-        "status": "CONVERGED", "claims": True, "success": relative <= more.get("tol", 1e-6), "calibration_time": 1e-4,
+        "time_limit": 2.0, "relative": relative, "error_energy": relative, "velocity": relative,
+        "roundoff_floor": 1e-15, "status": "CONVERGED", "claims": True,
+        "success": relative <= more.get("tol", 1e-6), "calibration_time": 1e-4,
     }  # fmt: skip
     times = more.pop("times", (1.02 * time, time, 1.04 * time))
     return add_times(RUN_COLUMNS | values | more, times)

@@ -56,7 +56,7 @@ def test_run_records_have_the_judged_result_of_each_target_and_its_times():
     for r in found:
         again = lv.solve(p, "pgs", tol=r.tol, max_iter=r.max_iter, order=r.order)
         error = again.residual
-        assert (r.relative, r.energy, r.velocity) == (error.relative, error.energy, error.velocity)
+        assert (r.relative, r.error_energy, r.velocity) == (error.relative, error.energy, error.velocity)
         found = r.status, r.worst_row, json.loads(r.work)
         assert found == (again.status.name, error.worst_row, dict(again.work))
         assert r.success == (r.mode == "tol") and 1 <= r.repetitions <= (1 if r.mode == "budget" else 2)

@@ -102,6 +102,32 @@ def test_every_form_has_one_matrix_one_slack_and_one_velocity(seed, kind):
         np.testing.assert_array_equal(p.dense(), p.dense().T)
         if form != "matrix":
             np.testing.assert_allclose(p.velocity(lam).ravel(), free + minv @ jac.T @ lam, atol=10 * atol)
+            work = lam @ (jac @ free + 0.5 * (jac @ minv @ jac.T @ lam))
+            size = np.abs(lam) @ (np.abs(jac) @ np.abs(free) + np.abs(a) @ np.abs(lam))
+            assert p.energy_change(lam) == pytest.approx(work, abs=100 * atol * size)
+
+
+@given(seed=seeds)
+def test_energy_change_is_the_difference_of_kinetic_energies(seed):
+    problem = random_contact_problem(seed)
+    problem = FORMS["J and M"](problem)
+    lam, general = np.random.default_rng(seed).normal(size=problem.m), problem.generalized
+    before, after = (0.5 * v @ general.momentum_of(v) for v in (general.v_free, problem.velocity(lam)))
+    # Both energies are sums of a few dozen products, with a solve with M before them.
+    assert problem.energy_change(lam) == pytest.approx(after - before, abs=1e-10 * (before + after))
+
+
+@given(seed=seeds)
+def test_energy_change_of_a_solution_without_targets_is_not_positive(seed):
+    problem = random_contact_problem(seed)
+    free = problem.generalized if problem.rows is None else problem.rows
+    problem = lv.Problem.from_jacobian(
+        problem.jacobian, np.linalg.inv(problem.rows.inverse_mass_matrix().toarray()), free.v_free.ravel(),
+        cones=problem.cones, compliance=problem.compliance,
+    )  # fmt: skip
+    solution = lv.solve(problem, tol=1e-9)
+    before = 0.5 * problem.generalized.v_free @ problem.generalized.momentum_of(problem.generalized.v_free)
+    assert solution.success and problem.energy_change(solution.impulse) <= 1e-8 * before
 
 
 # -- diagonals, b = 0, floor ---------------------------------------------------------------------------
