@@ -14,7 +14,6 @@ import click
 from lavender.base.errors import InputError
 from lavender.cli.options import (
     continue_after_closed_output,
-    convert_gigabytes_to_bytes,
     exit_after_interrupt,
     is_option_set,
     limit_to_one_thread,
@@ -116,7 +115,7 @@ def measure_files(
         try:
             report.run(
                 items, solvers, plan, store, watch=count_event, into=rows,
-                memory=convert_gigabytes_to_bytes(options["memory"]), reuse=not options["no_reuse"], **workers,
+                reuse=not options["no_reuse"], **workers,
             )  # fmt: skip
         except KeyboardInterrupt:
             if not rows:

@@ -197,14 +197,12 @@ def describe_solvers(solvers: Sequence[str] | None) -> dict[str, bool]:
     UnknownName
         A solver does not exist.
     """
-    from lavender.report.runner import is_third_party_solver
     from lavender.solvers import registry
 
     specs = [registry.get(name) for name in solvers or ()]
     return {
         "without_budgets": bool(specs) and not any(s.resumable and not s.exact for s in specs),
         "without_orders": bool(specs) and not any(s.order and not s.exact for s in specs),
-        "without_processes": bool(specs) and not any(map(is_third_party_solver, specs)),
     }
 
 
@@ -247,7 +245,6 @@ OPTIONS_WITHOUT_EFFECT: dict[str, tuple[str, tuple[str, ...]]] = {
     "without_record": ("without --record", ("replace",)),
     "without_budgets": ("on solvers that cannot stop after any iteration", ("budgets",)),
     "without_orders": ("on solvers that take no order", ("orders",)),
-    "without_processes": ("if no solver of another package runs", ("memory",)),
     "other_engine": ("with another --engine than mujoco", ("workers", "backend", "precision")),
 }  # fmt: skip
 
@@ -267,26 +264,8 @@ PLAN_OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
                       "help": "Limit of one solve; default: 1 s, or 0.25 s for the built-in suite."}),
     ("--sequence-time-limit", {"type": float, "default": None, "metavar": "S",
                       "help": "Time limit of a solver over all steps of a sequence with one setting; default: 5 s."}),
-    ("--memory", {"type": float, "default": None, "metavar": "GB",
-                  "help": "Memory limit of each process of another package's solver; default: half of the "
-                  "machine's memory, shared by the workers (--workers)."}),
 )  # fmt: skip
 plan_options = add_options([((name,), more) for name, more in PLAN_OPTIONS])
-
-
-def convert_gigabytes_to_bytes(gigabytes: float | None) -> int | None:
-    """Return the bytes of an option in GB.
-
-    Raises
-    ------
-    InputError
-        The number is not positive.
-    """
-    if gigabytes is None:
-        return None
-    if not 0.0 < gigabytes < 2**20:
-        raise InputError(f"memory is {gigabytes} GB; a positive number is needed")
-    return int(gigabytes * 2**30)
 
 
 def escape_markup(text: str) -> str:

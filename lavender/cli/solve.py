@@ -42,12 +42,12 @@ def solve(file: str, solver: str, tol: float, output: Path | None, as_json: bool
     """Solve one problem and print the judged result.
 
     FILE is a file or a case of the suite. Exit code 0: the judge accepts the result (within --tol or --velocity-tol, or
-    at the floor of float64; with --tol 0 always). 1: the judge rejects it, or the solver crashed. 3: the problem is
+    at the floor of float64; with --tol 0 always). 1: the judge rejects it. 3: the problem is
     infeasible, with a certificate that the judge confirms.
     """
     from lavender import report
     from lavender.judge.residuals import WRONG
-    from lavender.report.workers import TaskFailed, Worker, solve_isolated
+    from lavender.solving.solve import solve as solve_problem
 
     limit_to_one_thread()
     if output is not None:
@@ -58,12 +58,7 @@ def solve(file: str, solver: str, tol: float, output: Path | None, as_json: bool
     if output is not None and output.exists() and Path(item.source).exists() and output.samefile(item.source):
         raise InputError(f"--output {output} would overwrite the problem: give another file")
     options = {name: value for name, value in options.items() if value is not None}
-    try:
-        with Worker() as worker:
-            solution = solve_isolated(worker, item.problem, solver, tol=tol, **options)
-    except TaskFailed as error:  # The solver ended its process, or was ended after its time limit.
-        print_escaped(f"lavender: {solver}: {error}", err=True)
-        raise click.exceptions.Exit(EXIT_UNMET) from None
+    solution = solve_problem(item.problem, solver, tol=tol, **options)
     if output is not None:
         results = {name: getattr(solution, name) for name in SAVED_FIELDS}
         results |= {name: getattr(solution.residual, name) for name in SAVED_RESIDUAL_FIELDS}

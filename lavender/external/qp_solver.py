@@ -34,7 +34,8 @@ STEP_ERROR = 1e-12  # A point of a program with a larger error is improved by a 
 # With more variables and rows, the Newton step is done only if the error exceeds tol.
 MAX_FREE_STEP_SIZE = 500
 OPTION_HELP = {
-    "isolate": "with a time_limit, run the backend in another process, which is killed at the limit; default True",
+    "isolate": "with a time_limit, run the backend in another process, which is killed at the limit; default: if the "
+    "backend has no limit of its own",
     "form": "'program' (P, q and rows of from_qp), 'impulse', 'velocity' (bodies, J and M) or 'auto' (default)",
     "settings": "mapping of options of the backend, which override the options that are set from tol",
 }
@@ -142,14 +143,20 @@ class QPSolver(Solver):
     backend: Backend
     form: str = "auto"
     settings: Mapping[str, Any] = field(default_factory=dict)
-    isolate: bool = True
+    isolate: bool | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.settings, Mapping):
             raise InputError(
                 f"settings is a {type(self.settings).__name__}; a mapping of names to values is needed"
             )
-        check_bool("isolate", self.isolate)
+        if self.isolate is not None:
+            check_bool("isolate", self.isolate)
+
+    @property
+    def is_isolated(self) -> bool:
+        """Whether the backend runs in another process under a time limit."""
+        return not self.backend.stoppable if self.isolate is None else self.isolate
 
     @np.errstate(all="ignore")  # The judge finds overflows.
     def prepare(self, problem: Problem) -> Form:
@@ -194,7 +201,7 @@ class QPSolver(Solver):
     ) -> BackendResult:
         """Call the backend, in another process under a time limit, until the judge accepts its point."""
         b = self.backend
-        isolated = IsolatedBackend(b) if self.isolate and deadline.is_set else None
+        isolated = IsolatedBackend(b) if self.is_isolated and deadline.is_set else None
         result = call_backend_until_accepted(
             program, judge, isolated or b.run, max_iter=max_iter, tol=tol, deadline=deadline, settings=self.settings,
             start=start, needs_definite=b.needs_definite,
@@ -249,7 +256,7 @@ class QPSolver(Solver):
 
     def start_workers(self, state: Form | None, time_limit: float) -> None:
         """Import the backend's code, in the process that runs it, before the clock of a time limit starts."""
-        if self.isolate:
+        if self.is_isolated:
             start_process(self.backend)
         else:
             import_numerical_modules(*self.backend.modules)

@@ -18,23 +18,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lavender.base.arrays import check_sequence
 from lavender.base.errors import InputError, LavenderError, format_error
+from lavender.base.lazy_import import import_numerical_modules
 from lavender.external.backends import explain_contradicted_claim
 from lavender.judge.residuals import MAX_EXCUSED_RESIDUAL, WRONG
 from lavender.judge.solution import CONTRADICTED, NOT_PROVEN, Solution, Status, raise_if_interrupted
 from lavender.problem import Problem, check_problem
 from lavender.report.render import format_cells, render_table
 from lavender.report.text import format_residual, format_tolerance
-from lavender.report.workers import TaskFailed, Worker, solve_isolated
 from lavender.solvers.registry import available, get, known, specs
 from lavender.solving.limits import check_time_limit
 from lavender.solving.prepared import check_arguments
+from lavender.solving.solve import solve
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -212,7 +212,7 @@ def cross_check(
     max_iter : int, optional
         Largest number of iterations of each solver; default: the solver's own.
     time_limit : float, optional, s
-        Time limit of each solver; a solver that cannot be interrupted ignores it.
+        Time limit of each solver, as of `lavender.solve`.
 
     Returns
     -------
@@ -240,11 +240,13 @@ def cross_check(
     for name in (reference, *names):
         if not isinstance(name, str) or name not in reasons:
             get(name)  # Raises UnknownName with similar names.
-    with Worker() as worker:
-        run_solver = partial(solve_isolated, worker, problem, time_limit=time_limit)
-        optimum, reference_solver, note = solve_reference(problem, reference, reasons, run_solver)
-        run_solver = partial(run_solver, tol=tol, max_iter=max_iter)
-        rows = [_check_solver(problem, name, reasons[name], optimum, run_solver) for name in names]
+
+    def run_solver(name: str, tol: float = tol, max_iter: int | None = max_iter) -> Solution:
+        import_numerical_modules(*get(name).requires)  # The first solve's time does not include the import.
+        return solve(problem, name, tol=tol, max_iter=max_iter, time_limit=time_limit)
+
+    optimum, reference_solver, note = solve_reference(problem, reference, reasons, run_solver)
+    rows = [_check_solver(problem, name, reasons[name], optimum, run_solver) for name in names]
     if optimum is not None or any(row.verdict == AGREES_UNCOMPARED for row in rows):
         rows = [replace(r, verdict=INEXACT) if r.verdict in (PROVED, NEAR_NONE) else r for r in rows]
     return CrossCheck(problem, tol, reference_solver, note, tuple(rows))
@@ -265,8 +267,6 @@ def _check_solver(
     try:
         solution = raise_if_interrupted(run_solver(run))
     except Exception as error:
-        if isinstance(error, TaskFailed):
-            return CrossCheckRow(name, NOT_SOLVED, error.status, note=error.text)
         if isinstance(error, LavenderError) and not isinstance(error, InputError):
             # The solver rejected the numbers of the problem.
             return CrossCheckRow(name, REFUSED, note=str(error))

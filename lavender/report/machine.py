@@ -24,10 +24,6 @@ from lavender.base.errors import require_packages
 from lavender.solvers import registry
 from lavender_ext.sweep import serial
 
-# The processes of backends may use this fraction of the machine's memory together.
-BACKEND_MEMORY_FRACTION = 0.5
-MIN_BACKEND_MEMORY = 2 * 2**30  # [bytes] With less memory, packages of compiled code do not start.
-
 BASE_PACKAGES = ("numpy", "scipy", "qpsolvers", "osqp")
 
 
@@ -54,16 +50,6 @@ def get_total_memory() -> int:
         with contextlib.suppress(ValueError, OSError):
             found.append(int(Path(path).read_text()))
     return min((n for n in found if n > 0), default=0)
-
-
-def get_memory_per_process(processes: int = 1) -> int:
-    """Return the memory [bytes] that each of `processes` backend processes may use.
-
-    It is half of the memory of the machine or container divided among them, but at least 2 GiB; 0 if the memory of the
-    machine is unknown.
-    """
-    total = get_total_memory()
-    return max(MIN_BACKEND_MEMORY, int(BACKEND_MEMORY_FRACTION * total / max(1, processes))) if total else 0
 
 
 def get_versions(packages: Iterable[str] = (), base: Iterable[str] = BASE_PACKAGES) -> dict[str, str]:

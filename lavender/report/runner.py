@@ -13,11 +13,10 @@ import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cache
 from itertools import product
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from lavender.base.arrays import FloatArray, check_sequence
 from lavender.base.errors import InputError, LavenderError, require_packages
@@ -47,7 +46,7 @@ from lavender.report.timing import (
     list_passes,
     measure_task,
 )
-from lavender.report.workers import Worker, check_workers, connect_backend, map_unordered
+from lavender.report.workers import check_workers, connect_backend, map_unordered
 from lavender.solvers import registry
 from lavender.solvers.registry import SolverSpec
 
@@ -65,7 +64,6 @@ NEAR_TIME_RATIO = 1.6
 MAX_NEAR = 5  # Solvers that are timed again on a case, at most.
 # [s] Solvers are timed again on a case until this time has passed; every solver at least once.
 AGAIN_TIME = 1.0
-MAX_ATTEMPTS = 5  # If workers are lost, the remaining pairs are handed out at most this many times.
 
 Watch = Callable[["Event"], Any]
 
@@ -98,11 +96,6 @@ def remove_times(row: Row, time_limit: float) -> Row:
     return add_times({**row, **dict.fromkeys(names, math.nan), "time_limit": time_limit}, ())
 
 
-def is_third_party_solver(spec: SolverSpec) -> bool:
-    """Whether a solver is code of another package that a separate process can import by its name."""
-    return bool(spec.distribution) or (spec.builtin and (spec.external or bool(spec.requires)))
-
-
 def select_solver_names(names: str | Sequence[str] | None) -> list[str]:
     """Return the names of the solvers to run: the named ones, each of them installed, or every installed solver.
 
@@ -123,7 +116,7 @@ def select_solver_names(names: str | Sequence[str] | None) -> list[str]:
 def run(
     cases: Source | Iterable[Source] = (), solvers: str | Sequence[str] | None = None, plan: Plan | None = None,
     store: Store | str | Path | None = None, *, workers: int = 1, backend: str = "loky",
-    watch: Watch | None = None, memory: int | None = None, into: list[Row] | None = None, reuse: bool = True,
+    watch: Watch | None = None, into: list[Row] | None = None, reuse: bool = True,
 ) -> DataFrame:  # fmt: skip
     """Measure every solver on every case that it accepts.
 
@@ -145,9 +138,6 @@ def run(
         Backend of joblib: "loky" (processes here), "dask" (of the current dask.distributed client, or of
         DASK_SCHEDULER_ADDRESS); "dask=ADDRESS" connects to a cluster.
     watch : callable (Event), optional
-    memory : int, bytes, optional
-        Memory limit of the process in which third-party solvers run. Default: half of the machine's memory, shared by
-        the workers here or by the cores of a machine of a cluster.
     into : list, optional
         Receives each row when it is made, so that the rows are available if the run is interrupted.
     reuse : bool
@@ -163,7 +153,7 @@ def run(
     ------
     InputError
         joblib does not have the backend here, the number of workers is not -1 or 1 to 4096, several workers have a
-        plan that measures times, or workers were lost repeatedly.
+        plan that measures times, or a worker was lost; the rows that were stored stay.
     """
     require_packages("a measurement", "joblib", "threadpoolctl")
     check_workers(workers)
@@ -183,10 +173,10 @@ def run(
     this = machine.describe_run({**asdict(plan), "solvers": names}, packages)
     backend, cluster = connect_backend(backend) if spread else ("", contextlib.nullcontext())
     # The limit of threads covers the description of cases, which uses BLAS.
-    with cluster, open_store(store) as kept, Worker(memory) as worker, limit_to_one_thread():
-        runner = Runner(this, plan, names, worker, kept, watch, reuse)
+    with cluster, open_store(store) as kept, limit_to_one_thread():
+        runner = Runner(this, plan, names, kept, watch, reuse)
         runner.out = runner.out if into is None else into
-        runner.measure_items(items, workers, backend, memory)
+        runner.measure_items(items, workers, backend)
     return make_lines(runner.out, str(kept.path) if kept else "")
 
 
@@ -194,11 +184,11 @@ class Runner:
     """Measures pairs of case and solver. Stored measurements are reused, new ones stored as soon as they are made."""
 
     def __init__(
-        self, this: Row, plan: Plan, names: list[str], worker: Worker, store: Store | None = None,
+        self, this: Row, plan: Plan, names: list[str], store: Store | None = None,
         watch: Watch | None = None, reuse: bool = True,
     ) -> None:  # fmt: skip
         self.this, self.plan, self.names = this, plan, names
-        self.store, self.watch, self.worker = store, watch, worker
+        self.store, self.watch = store, watch
         self.specs = registry.specs()
         self.out: list[Row] = []
         self.done = self.total = 0
@@ -228,14 +218,12 @@ class Runner:
             event = Event(done=self.done, total=self.total, case=case, solver=solver, row=row, reused=reused)
             self.watch(replace(event, phase="measuring"))
 
-    def measure_items(
-        self, items: list[Item], workers: int = 1, backend: str = "", memory: int | None = None
-    ) -> None:
+    def measure_items(self, items: list[Item], workers: int = 1, backend: str = "") -> None:
         """Measure every case and sequence; by the workers of a joblib backend if one is named."""
         self.total = len(items) * len(self.names)
         self.add_row({**self.this, "whole": False})
         if backend:
-            self.distribute_pairs(items, workers, backend, memory)
+            self.distribute_pairs(items, workers, backend)
         else:
             for name, group in _group_sequences(items):
                 if name:
@@ -247,49 +235,40 @@ class Runner:
         self.add_row(self.this)
         self.report_progress("", "")
 
-    def distribute_pairs(self, items: list[Item], workers: int, backend: str, memory: int | None) -> None:
+    def distribute_pairs(self, items: list[Item], workers: int, backend: str) -> None:
         """Measure the pairs of a campaign with workers, and store the rows of each pair when a worker returns them.
 
         Raises
         ------
         InputError
-            Workers were lost `MAX_ATTEMPTS` times.
+            A worker was lost.
         """
-        import joblib
-
-        if backend == "loky" and memory is None:
-            memory = machine.get_memory_per_process(joblib.effective_n_jobs(workers))
         local = tuple(spec for n in self.names if not ((spec := self.specs[n]).builtin or spec.distribution))
         known: dict[tuple[str, str], list[Row]] = {}
         for row in self.known.values():
             known.setdefault((row["case"], row["solver"]), []).append(row)
-        calls: list[tuple[Any, ...]] = []
-        for item, name in product(items, self.names):
-            # Send a name or path, which the worker reads itself: machines of a cluster share files and suite.
-            source = item.source if item.in_memory is None else replace(item.in_memory, copy=False)
-            stored = known.get((item.name, name), [])
-            pair = Pair(number=len(calls), case=item.name, source=source, solver=name,
-                        described=self.described.get(item.name), known=stored)  # fmt: skip
-            calls.append((pair, self.this, self.plan, memory, local))
+        # A worker reads a name or path itself: machines of a cluster share files and suite.
+        calls = [
+            (number, item.name, item.source if item.in_memory is None else replace(item.in_memory, copy=False), name,
+             self.described.get(item.name), known.get((item.name, name), []), self.this, self.plan, local)
+            for number, (item, name) in enumerate(product(items, self.names))
+        ]  # fmt: skip
         rows: dict[int, list[Row]] = {}
         try:
-            for _ in range(MAX_ATTEMPTS):
-                remaining = [call for call in calls if call[0].number not in rows]
-                for index, new in (
-                    map_unordered(measure_in_worker, remaining, workers, backend) if remaining else ()
-                ):
-                    self.store_new(new)
-                    rows[index], pair = new, calls[index][0]
-                    self.done += 1
-                    for row in (row for row in new if row["kind"] == "run"):
-                        self.report_progress(pair.case, pair.solver, row, get_key(row) in self.known)
-                    self.report_progress(pair.case, pair.solver)
+            for number, new in map_unordered(measure_in_worker, calls, workers, backend) if calls else ():
+                self.store_new(new)
+                rows[number] = new
+                self.done += 1
+                _, case, _, name, *_ = calls[number]
+                for row in (row for row in new if row["kind"] == "run"):
+                    self.report_progress(case, name, row, get_key(row) in self.known)
+                self.report_progress(case, name)
         finally:
-            self.out.extend(row for index in sorted(rows) for row in rows[index])
+            self.out.extend(row for number in sorted(rows) for row in rows[number])
         if len(rows) < len(calls):
             raise InputError(
-                f"{len(calls) - len(rows)} of {len(calls)} pairs are not done: workers were lost {MAX_ATTEMPTS} "
-                "times; run the same command again, with fewer workers if memory is short"
+                f"a worker was lost, and {len(calls) - len(rows)} of {len(calls)} pairs are not done: run the same "
+                "command again, with fewer workers if memory is short"
             )
 
     def store_new(self, rows: list[Row]) -> None:
@@ -477,14 +456,10 @@ class Runner:
         return rows
 
     def measure_task(self, problem: Problem, task: Task, spec: SolverSpec, impulse: Any) -> tuple[Row, Any]:
-        """Solve a task, here or in the process for other packages; return its row and impulses (m,) [N s]."""
-        if self.plan.campaign and not is_third_party_solver(spec):
-            # In a campaign, a time limit may only end processes of third-party solvers.
+        """Solve a task; return its row and impulses (m,) [N s]."""
+        if self.plan.campaign and not (spec.external or spec.requires or spec.distribution):
             task = replace(task, time_limit=math.inf)
-        if is_third_party_solver(spec):
-            row, found = self.worker.measure_task(replace(problem, copy=False), task, impulse)
-        else:
-            row, found = measure_task(problem, task, impulse)
+        row, found = measure_task(problem, task, impulse)
         if found is not None:
             row["solution_hash"] = hashlib.sha256(found.tobytes()).hexdigest()[:16]
         return remove_times(row, self.plan.time_limit) if self.plan.campaign else row, found
@@ -518,21 +493,6 @@ def describe_load_error(source: str, error: Exception) -> str:
 # -- pairs of a campaign, in workers -----------------------------------------------------------------------
 
 
-class Pair(NamedTuple):
-    """One case and one solver, as they are sent to a worker."""
-
-    number: int
-    case: str
-    source: str | Problem  # A name or path that the worker resolves itself, or the problem.
-    solver: str
-    described: Row | None  # Stored description of the case.
-    known: list[Row]  # Stored rows of the pair.
-
-
-#: Return the process for third-party solvers with a memory limit; each worker has one, which all of its pairs use.
-_get_isolated_worker = cache(Worker)
-
-
 @contextlib.contextmanager
 def _register_solvers(specs: tuple[SolverSpec, ...]) -> Iterator[None]:
     """Register solvers of the parent for one pair: the worker may serve another run later."""
@@ -552,33 +512,39 @@ _last_case: tuple[Any, Item | None, Row | None] = None, None, None
 
 
 def measure_in_worker(
-    pair: Pair, this: Row, plan: Plan, memory: int | None, local: tuple[SolverSpec, ...]
-) -> tuple[int, list[Row]]:
-    """Measure a pair in a worker, on one thread as pairs run in parallel; return its number and its rows.
+    number: int, name: str, source: str | Problem, solver: str, described: Row | None, known: list[Row], this: Row,
+    plan: Plan, local: tuple[SolverSpec, ...],
+) -> tuple[int, list[Row]]:  # fmt: skip
+    """Measure a pair of case and solver in a worker, on one thread as pairs run in parallel.
 
     Parameters
     ----------
-    pair : Pair
+    number : int
+    name : name of the case
+    source : a name or path that the worker resolves itself, or the problem
+    solver : str
+    described, known : stored description of the case, or None, and stored rows of the pair
     this : row of the machine
     plan : Plan
-    memory : int, bytes, optional
-        Memory limit of each third-party solver's process. Default: a share of the machine's.
     local : solvers that are registered only in the parent
+
+    Returns
+    -------
+    number, and the rows of the pair
     """
     global _last_case
-    shared = machine.get_memory_per_process(os.cpu_count() or 1) if memory is None else memory
-    with _register_solvers(local), limit_to_one_thread(pair.solver):
-        runner = Runner(this, plan, [pair.solver], _get_isolated_worker(shared))
-        runner.known = {get_key(row): row for row in pair.known}
-        runner.described = {} if pair.described is None else {pair.case: pair.described}
+    with _register_solvers(local), limit_to_one_thread(solver):
+        runner = Runner(this, plan, [solver])
+        runner.known = {get_key(row): row for row in known}
+        runner.described = {} if described is None else {name: described}
         key, item, case = None, None, None
-        if not isinstance(pair.source, Problem):
-            changed = os.stat(pair.source).st_mtime_ns if os.path.exists(pair.source) else 0
-            key = this["run"], pair.case, pair.source, changed
+        if not isinstance(source, Problem):
+            changed = os.stat(source).st_mtime_ns if os.path.exists(source) else 0
+            key = this["run"], name, source, changed
             if _last_case[0] == key:
                 _, item, case = _last_case
-        item = item or resolve_item(pair.source, pair.case)
+        item = item or resolve_item(source, name)
         runner.measure_case(item, case)
     case = next((row for row in runner.out if row["kind"] == "case"), None)
     _last_case = key, item, case
-    return pair.number, runner.out
+    return number, runner.out

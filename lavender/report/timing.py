@@ -25,7 +25,7 @@ from lavender.base.arrays import FloatArray, check_bool, check_float, check_int,
 from lavender.base.errors import InputError, UnknownName, require_packages
 from lavender.base.lazy_import import import_numerical_modules
 from lavender.external.backends import explain_contradicted_claim
-from lavender.judge.solution import CONTRADICTED, Claim, Solution, Status, raise_if_interrupted
+from lavender.judge.solution import CONTRADICTED, Solution, Status, raise_if_interrupted
 from lavender.problem import Problem
 from lavender.problem.ordering import SWEEP_ORDERS
 from lavender.report import machine
@@ -33,18 +33,16 @@ from lavender.report.store import ERROR, RUN_COLUMNS, Row
 from lavender.report.text import format_tolerance
 from lavender.solvers import registry
 from lavender.solvers.registry import SolverSpec
-from lavender.solving.finish import FinishedRun, finish
 from lavender.solving.prepared import prepare
 from lavender.solving.solve import solve
 
 DEFAULT_SEQUENCE_TIME_LIMIT = 5.0  # [s] Time limit of one pass over a sequence.
 UNLIMITED_ITERATIONS = 10_000_000  # Iteration limit of a run to a tolerance; the time limit ends it first.
-# [s] After this time, a campaign kills the process of a third-party solver and records KILLED.
-HANG_LIMIT = 60.0
+HANG_LIMIT = 60.0  # [s] Time limit of a solver of another package in a campaign.
 LONG_TIME = 0.05  # [s] A call that took longer is not repeated: caches and the clock hardly affect its time.
 CLAIM_STATUSES = (Status.CONVERGED, Status.ROUNDOFF_LIMIT, Status.INFEASIBLE)
 # A run that missed its tolerance with one of these reaches no tighter tolerance either.
-HOPELESS_STATUSES = ("TIME_LIMIT", "KILLED", "ERROR", "INFEASIBLE", "CRASHED")
+HOPELESS_STATUSES = ("TIME_LIMIT", "ERROR", "INFEASIBLE")
 # Line that removes a guess from a problem.
 COLD_PROBLEM = "problem = dataclasses.replace(problem, guess=None)"
 CARRIED_START = (
@@ -198,15 +196,6 @@ def measure_task(problem: Problem, task: Task, impulse: Any = None) -> tuple[Row
     KeyboardInterrupt
         Ctrl-C was pressed; nothing is recorded.
     """
-    return judge_outcome(problem, task, run_task_or_return_error(problem, task, impulse))
-
-
-def run_task_or_return_error(problem: Problem, task: Task, impulse: Any = None) -> Row | str:
-    """Run the solver of a task in this process. Return an exception as text.
-
-    Otherwise, return the impulse, the status and the other attributes of the last solution by name, with `times` [s] of
-    the repetitions and `calibration_time` [s]. Nothing of it is judged.
-    """
     times: list[float] = []
     calibration_times: list[float] = []
     try:
@@ -222,16 +211,10 @@ def run_task_or_return_error(problem: Problem, task: Task, impulse: Any = None) 
                     break
     except Exception as error:
         # A backend may raise any exception; only its own record is lost.
-        return f"{type(error).__name__}: {error}".strip()
-    outcome = {name: getattr(solution, name) for name in _OF_SOLUTION}
-    return outcome | {
-        "status": solution.status.name, "form": solution.solver.form, "times": times,
-        "calibration_time": min(calibration_times), "status_conflict": solution.status_conflict[:500],
-    }  # fmt: skip
+        return task.make_row(status=ERROR, message=f"{type(error).__name__}: {error}".strip()[:500]), None
+    row = make_row(problem, task, solution, times, min(calibration_times))
+    return row, solution.impulse if np.isfinite(solution.impulse).all() else None
 
-
-#: Fields of an outcome that are attributes of a solution.
-_OF_SOLUTION = ("impulse", "certificate", "iterations", "work", "message", "setup_time", "solve_time")
 
 _LOOP_NUMBERS = np.arange(2.0**15)  # 256 KiB: more than a first-level cache holds
 
@@ -264,8 +247,6 @@ def _time_call(problem: Problem, task: Task, impulse: Any, limited: bool) -> tup
     spec, arguments = registry.get(task.solver), task.arguments
     if limited:
         arguments["time_limit"] = task.time_limit
-        # The runner has placed third-party solvers in a separate process already.
-        arguments |= {"isolate": False} if "isolate" in spec.accepts else {}
     if task.start == "carried":
         arguments["impulse"] = problem.start() if impulse is None else impulse
     limits = [None] if task.mode == "tol" and not spec.builtin and task.max_iter else []
@@ -279,58 +260,25 @@ def _time_call(problem: Problem, task: Task, impulse: Any, limited: bool) -> tup
     return solution, elapsed
 
 
-def judge_outcome(problem: Problem, task: Task, outcome: Row | str) -> tuple[Row, FloatArray | None]:
-    """Judge an outcome on `problem`; return its row, and its impulses (m,) [N s] if they are finite."""
-    if isinstance(outcome, str):
-        return task.make_row(status=ERROR, message=outcome[:500]), None
-    solution = make_solution(problem, task, outcome)
-    impulse = solution.impulse if np.isfinite(solution.impulse).all() else None
-    return make_row(problem, task, solution, outcome), impulse
-
-
-def make_solution(problem: Problem, task: Task, outcome: Row) -> Solution:
-    """Judge an outcome on `problem` and return its solution."""
-    claim = Claim(
-        Status[outcome["status"]], outcome["iterations"], outcome["work"], outcome["message"], outcome["form"],
-        certificate=outcome["certificate"],
-    )  # fmt: skip
-    run = FinishedRun(
-        problem, registry.get(task.solver), dict(task.options), np.array(outcome["impulse"]), claim, tol=task.tol,
-        setup_time=outcome["setup_time"], solve_time=outcome["solve_time"],
-        refutation=outcome["status_conflict"].removeprefix("says INFEASIBLE, "),
-    )  # fmt: skip
-    return finish(run)
-
-
-def make_row(problem: Problem, task: Task, s: Solution, outcome: Row) -> Row:
-    """Return the row of a measurement; its last repeat returned the solution `s`."""
+def make_row(
+    problem: Problem, task: Task, s: Solution, times: Sequence[float], calibration_time: float
+) -> Row:
+    """Return the row of a measurement. `times` [s] has its repeats, of which the last returned the solution `s`."""
     r = s.residual
     is_known = problem.matrix is None and bool(np.isfinite(s.impulse).all())
     is_false = s.claim_check == CONTRADICTED
     observed = explain_contradicted_claim(task.solver, problem, s.status) if is_false else ""
     return task.make_row(
-        outcome["times"],
-        status=s.status.name,
-        relative=float(r.relative),
-        error_energy=float(r.energy),
-        velocity=float(r.velocity),
-        roundoff_floor=float(r.roundoff_floor),
-        energy_change=problem.energy_change(s.impulse) if is_known else math.nan,
-        worst_row=int(r.worst_row),
-        worst_name=r.worst_name,
-        success=bool(s.success) and task.mode == "tol",
-        claim_check=s.claim_check,
+        times, status=s.status.name, relative=float(r.relative), error_energy=float(r.energy),
+        velocity=float(r.velocity), roundoff_floor=float(r.roundoff_floor),
+        energy_change=problem.energy_change(s.impulse) if is_known else math.nan, worst_row=int(r.worst_row),
+        worst_name=r.worst_name, success=bool(s.success) and task.mode == "tol", claim_check=s.claim_check,
         status_conflict="; ".join(filter(None, (s.status_conflict, observed))),
-        claims=s.status in CLAIM_STATUSES,
-        iterations=int(s.iterations),
-        work=json.dumps({k: int(v) for k, v in s.work.items()}),
-        form=s.solver.form,
-        message=s.message[:500],
-        setup_time=outcome["setup_time"],
-        solve_time=outcome["solve_time"],
-        calibration_time=outcome["calibration_time"],
+        claims=s.status in CLAIM_STATUSES, iterations=int(s.iterations),
+        work=json.dumps({k: int(v) for k, v in s.work.items()}), form=s.solver.form, message=s.message[:500],
+        setup_time=s.setup_time, solve_time=s.solve_time, calibration_time=calibration_time,
         load=machine.count_runnable_processes(),
-    )
+    )  # fmt: skip
 
 
 # -- plans -------------------------------------------------------------------------------------------------
@@ -452,7 +400,7 @@ class CampaignPlan(Plan):
 
     Its records do not depend on the machine's load or the number of workers.
 
-    After `time_limit` the process of a third-party solver is killed; only its own record depends on it.
+    `time_limit` applies to solvers of other packages; only their own records depend on it.
     """
 
     repeats: int = 1

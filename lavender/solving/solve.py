@@ -60,9 +60,8 @@ def solve(
         solver's spec.
     time_limit : float, optional, s
         Wall-clock limit of set-up and iterations; one pass of the judge may follow (`docs/choose.md`). Imports do not
-        count. Solvers of other packages run in a separate process, which is reused by later solves and killed at the
-        limit (at twice the limit if the package has a time limit of its own); `isolate=False` runs them in this
-        process.
+        count. Solvers of other packages get the limit as their own; those without one run in a separate process, which
+        is reused by later solves and killed at the limit. `isolate` of these solvers selects the process.
     history : bool
         Record iterations, time and residual at fixed numbers of iterations, in a `History`; with `auto`, of all stages.
     callback : callable (iterations, impulse, residual), optional

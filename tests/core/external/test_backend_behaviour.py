@@ -76,7 +76,6 @@ def test_note_of_a_contradicted_row_of_the_check_quotes_the_table():
     row = compare_with_reference(problem, "daqp", contradicted, None)
     assert "observed with daqp" in row.note and "x2 = 0.03" in row.note
     task = Task(run="", case="", sha="", solver="daqp", mode="tol", tol=1e-6, max_iter=0, time_limit=1.0)
-    times = {"times": [1.0], "setup_time": 0.0, "solve_time": 1.0, "calibration_time": 1e-3}
     for judged, is_quoted in ((contradicted, True), (solution, False)):
-        conflict = make_row(problem, task, judged, times)["status_conflict"]
+        conflict = make_row(problem, task, judged, [1.0], 1e-3)["status_conflict"]
         assert ("observed with daqp" in conflict and "x2 = 0.03" in conflict) == is_quoted

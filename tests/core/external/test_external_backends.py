@@ -172,15 +172,18 @@ APART = [b.name for b in backends.BACKENDS if not b.stoppable and b.name in BACK
 
 
 @pytest.mark.parametrize("name", BACKENDS)
-def test_backend_with_a_time_limit_runs_in_a_separate_process(name, monkeypatch):
+def test_backend_with_a_time_limit_runs_in_a_separate_process_if_it_has_none_of_its_own(name, monkeypatch):
     from lavender.external import isolated
 
     problem = lv.Problem.lcp(*spd(12, seed=3))
     plain = lv.solve(problem, name)
     calls, call = [], isolated.call_backend
     monkeypatch.setattr(isolated, "call_backend", lambda *a: calls.append(call(*a)) or calls[-1])
-    there = lv.solve(problem, name, time_limit=600.0)
+    there = lv.solve(problem, name, time_limit=600.0, isolate=True)
     assert calls and all(answer is not None for answer in calls)
+    calls.clear()
+    lv.solve(problem, name, time_limit=600.0)
+    assert bool(calls) == (name in APART)
     calls.clear()
     here = lv.solve(problem, name, time_limit=600.0, isolate=False)
     assert not calls
