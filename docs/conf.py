@@ -23,7 +23,7 @@ author = "The lavender developers"
 copyright = "The lavender developers, BSD 3-Clause licence"
 version = release = lavender.__version__
 
-extensions = ["sphinx.ext.autodoc", "numpydoc", "myst_parser"]
+extensions = ["sphinx.ext.autodoc", "numpydoc", "myst_parser", "sphinx_copybutton"]
 exclude_patterns = ["_build"]
 default_role = "code"
 
@@ -47,17 +47,20 @@ html_theme_options = {
     "light_css_variables": {"color-brand-primary": "#5b4b9a", "color-brand-content": "#5b4b9a"},
     "dark_css_variables": {"color-brand-primary": "#b3a4ee", "color-brand-content": "#b3a4ee"},
 }
-pygments_style = "friendly"
-pygments_dark_style = "github-dark"
+# Comments and numbers have a contrast of at least 4.5 : 1; accessible-pygments comes with furo.
+pygments_style = "a11y-high-contrast-light"
+pygments_dark_style = "a11y-high-contrast-dark"
+copybutton_prompt_text = r">>> |\.\.\. |\$ "
+copybutton_prompt_is_regexp = True
 
 # Caption -> pages, in the order of the contents.
 CONTENTS = {
-    "Start": "install quickstart concepts residual sweep",
+    "Start": "install quickstart concepts error sweep",
     "Solve": "choose solvers failures quadratic-programs",
     "Your data": "own-engine c formats derivatives",
     "Judge engines": "audit mujoco worlds engines report commands",
     "LavenderSim and the course": "engine chapter chapter-answers generated/examples",
-    "Background": "methods comparison guarantees generated/cases generated/measured generated/engine-arrays",
+    "Background": "residual methods comparison guarantees generated/cases generated/measured generated/engine-arrays",
     "Project": "plugin architecture generated/api",
 }
 

@@ -705,37 +705,76 @@ def write_figures(folder):
             module.main(str(folder / f"{name}.png"))
 
 
-def api_page(site):
-    """Public names by room: those of lavender itself, then those of its rooms."""
-    rooms = {}
+#: Public modules beside `lavender` itself that have a page of their own in the interface.
+API_MODULES = ("io", "suite", "report", "judge.certificates")
+#: Package that defines a name of `lavender` -> title of the page that documents it, in the order of the contents.
+API_TITLES = {
+    "solving": "Solve",
+    "problem": "Problems",
+    "judge": "Judge",
+    "batch": "Batches",
+    "external": "Quadratic programs",
+    "programs": "Quadratic programs",
+    "gradient": "Derivatives",
+    "diagnostics": "Diagnostics",
+    "solvers": "Registry of solvers",
+    "audit": "Audit",
+    "report": "Compare solvers",
+    "sim": "LavenderSim",
+    "io": "Files",
+    "base": "Errors",
+}
+#: Names with which a page begins; the others follow in alphabetical order.
+API_FIRST = ("solve", "prepare", "Problem", "Solution", "Residual", "residual")
+
+
+def list_public_names():
+    """Return (title, module, names) of each page of the interface: `lavender` by package, then other modules."""
+    by_title = {title: [] for title in dict.fromkeys(API_TITLES.values())}
     for name in sorted(lv.__all__):
         thing = getattr(lv, name)
-        if callable(thing):  # no constants, no rooms
-            rooms.setdefault(".".join(thing.__module__.split(".")[1:3]), []).append((lv, name))
-    for room in (
-        "io",
-        "suite",
-        "report",
-        "judge.certificates",
-    ):
-        held = importlib.import_module(f"lavender.{room}")
-        own = {n: getattr(held, n) for n in sorted(held.__all__) if n not in suite.FAMILIES}
-        rooms[f"lavender.{room}"] = [
-            (held, n) for n, thing in own.items() if callable(thing) and getattr(lv, n, None) is not thing
+        if callable(thing):  # no constants, no modules
+            package = thing.__module__.split(".")[1]
+            by_title[API_TITLES[package]].append(name)
+    for title, names in by_title.items():
+        if names:
+            first = [name for name in API_FIRST if name in names]
+            yield title, lv, [*first, *(name for name in names if name not in first)]
+    for module in API_MODULES:
+        held = importlib.import_module(f"lavender.{module}")
+        things = {name: getattr(held, name) for name in sorted(held.__all__) if name not in suite.FAMILIES}
+        names = [
+            name for name, thing in things.items() if callable(thing) and getattr(lv, name, None) is not thing
         ]
-    parts = [
-        "# Python interface",
-        "Arrays are float64 and C-contiguous, shapes and units as said. First what is in `lavender`, by room.",
-    ]
-    for room, names in rooms.items():
-        parts.append(f"## {room}")
-        for held, name in names:
+        yield f"lavender.{module}", held, names
+
+
+def api_pages(site):
+    """Write one page for each group of public names, and their contents."""
+    pages = []
+    for title, held, names in list_public_names():
+        parts = [f"# {title}"]
+        for name in names:
             thing = getattr(held, name)
             kind, members = "autofunction", ""
             if inspect.isclass(thing):
                 plain = issubclass(thing, (Exception, lv.Status))
                 kind, members = "autoclass", "" if plain else "\n   :members:"
             parts.append(f"```{{eval-rst}}\n.. {kind}:: {held.__name__}.{name}{members}\n```")
+        page = re.sub(r"\W+", "-", title.lower())
+        site.write(f"api/{page}.md", "\n\n".join(parts))
+        pages.append((title, f"api/{page}", names))
+    parts = [
+        "# Python interface",
+        "All arrays are float64 and C-contiguous. Begin with `solve`, `Problem` and `Solution`.",
+    ]
+    parts += [
+        "\n".join(
+            f"- [{title}]({page}.md): {', '.join(f'`{name}`' for name in names)}"
+            for title, page, names in pages
+        )
+    ]
+    parts += ["\n".join(["```{toctree}", ":hidden:", "", *(page for _, page, _ in pages), "```"])]
     site.write("api.md", "\n\n".join(parts))
 
 
@@ -751,7 +790,7 @@ def write(source, cache):
     example_page(site, cache)
     suite_page(site)
     engine_arrays_page(site)
-    api_page(site)
+    api_pages(site)
     site.forget_others()
 
 
