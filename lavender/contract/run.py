@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from lavender.base.errors import format_error
-from lavender.base.subprocesses import Answer, InvalidAnswer, ProcessBackend, ProcessEnded, RemoteError
+from lavender.base.subprocesses import ProcessBackend, ProcessEnded, RemoteError
 from lavender.contract.checks import CHECKS, Check, ContractError, list_checks
 from lavender.solvers import registry
 from lavender.solvers.registry import SolverSpec
@@ -36,7 +36,7 @@ def check_solver(name: str, timeout: float = 600.0) -> Iterator[tuple[Check, Fai
     raises UnknownName, a missing package SolverUnavailable.
     """
     spec = registry.get(name)
-    process = ProcessBackend(run_check, environment={"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"})
+    process = ProcessBackend({"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"})
     try:
         for check in list_checks(spec):
             remote = bool(spec.distribution)
@@ -48,20 +48,17 @@ def check_solver(name: str, timeout: float = 600.0) -> Iterator[tuple[Check, Fai
 def run_remotely(process: ProcessBackend, name: str, check: Check, timeout: float) -> Failure:
     """Run a check in another process, and return its result."""
     try:
-        process.start()
-        answer, _ = process.call_function(name, check.name, timeout=timeout, max_bytes=0)
-        text = str(answer.get("failure", "the process of the solver sent no answer"))
-        return Failure(text, str(answer.get("problem", "")))
+        failure: Failure = process.call_function(run_check, name, check.name, timeout=timeout)
+        return failure
     except TimeoutError:
         return Failure(f"the check did not end within {timeout:g} s; its process was killed")
-    except (ProcessEnded, RemoteError, InvalidAnswer) as error:
+    except (ProcessEnded, RemoteError) as error:
         return Failure(f"the code of the solver ended its process ({error}), or sent no answer")
 
 
-def run_check(name: str, check: str) -> Answer:
+def run_check(name: str, check: str) -> Failure:
     """Run a check by name, in the other process."""
-    failure = find_failure(registry.get(name), CHECKS[check])
-    return {"failure": failure.text, "problem": failure.problem}, ()
+    return find_failure(registry.get(name), CHECKS[check])
 
 
 def find_failure(spec: SolverSpec, check: Check) -> Failure:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from time import perf_counter
 from typing import Any
 
@@ -16,7 +17,7 @@ from lavender.base.lazy_import import import_numerical_modules
 from lavender.external.backend import Backend
 from lavender.external.convex import ConvexProgram
 from lavender.external.forms import Form, build_form, choose_program_form, get_program
-from lavender.external.isolated import IsolatedBackend, start_process
+from lavender.external.isolated import run_isolated, start_process
 from lavender.external.running import BackendResult, call_backend_until_accepted
 from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import compute_stopping_residual
@@ -34,8 +35,8 @@ STEP_ERROR = 1e-12  # A point of a program with a larger error is improved by a 
 # With more variables and rows, the Newton step is done only if the error exceeds tol.
 MAX_FREE_STEP_SIZE = 500
 OPTION_HELP = {
-    "isolate": "with a time_limit, run the backend in another process, which is killed at the limit; default: if the "
-    "backend has no limit of its own",
+    "isolate": "run the backend in another process, which is killed at the time limit: True always, False never, None "
+    "(default) under a limit if the backend has none of its own",
     "form": "'program' (P, q and rows of from_qp), 'impulse', 'velocity' (bodies, J and M) or 'auto' (default)",
     "settings": "mapping of options of the backend, which override the options that are set from tol",
 }
@@ -201,13 +202,14 @@ class QPSolver(Solver):
     ) -> BackendResult:
         """Call the backend, in another process under a time limit, until the judge accepts its point."""
         b = self.backend
-        isolated = IsolatedBackend(b) if self.is_isolated and deadline.is_set else None
+        is_isolated = bool(self.isolate) or (self.is_isolated and deadline.is_set)
+        call = partial(run_isolated, b) if is_isolated else b.run
         result = call_backend_until_accepted(
-            program, judge, isolated or b.run, max_iter=max_iter, tol=tol, deadline=deadline, settings=self.settings,
+            program, judge, call, max_iter=max_iter, tol=tol, deadline=deadline, settings=self.settings,
             start=start, needs_definite=b.needs_definite,
         )  # fmt: skip
         if deadline.is_set and not b.stoppable:
-            manner = "to its end" if isolated is None else isolated.manner
+            manner = "in a separate process" if is_isolated else "to its end"
             result.message = f"{result.message}; the backend accepts no time limit and ran {manner}"
         return result
 

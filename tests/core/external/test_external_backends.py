@@ -1,11 +1,15 @@
 """What every QP backend owes its user: its own name, its own words, silence, and never an exception."""
 
 import itertools
+import os
 import signal
+import subprocess
 import sys
+import time
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -177,13 +181,15 @@ def test_backend_with_a_time_limit_runs_in_a_separate_process_if_it_has_none_of_
 
     problem = lv.Problem.lcp(*spd(12, seed=3))
     plain = lv.solve(problem, name)
-    calls, call = [], isolated.call_backend
-    monkeypatch.setattr(isolated, "call_backend", lambda *a: calls.append(call(*a)) or calls[-1])
+    calls, run = [], isolated.run_isolated
+    monkeypatch.setattr(qp_solver, "run_isolated", lambda *a: calls.append(run(*a)) or calls[-1])
     there = lv.solve(problem, name, time_limit=600.0, isolate=True)
-    assert calls and all(answer is not None for answer in calls)
+    assert calls
     calls.clear()
     lv.solve(problem, name, time_limit=600.0)
     assert bool(calls) == (name in APART)
+    lv.solve(problem, name, isolate=True)
+    assert calls
     calls.clear()
     here = lv.solve(problem, name, time_limit=600.0, isolate=False)
     assert not calls
@@ -221,14 +227,50 @@ def test_isolated_process_is_reused_and_replaced_after_its_death():
 
     problem = lv.Problem.lcp(*spd(5))
     lv.solve(problem, APART[0], time_limit=600.0)
-    before = list(idle_processes)
-    assert len(before) == 1
+    (process,) = idle_processes
+    before = process.popen
     lv.solve(problem, APART[0], time_limit=600.0)
-    assert idle_processes == before
-    before[0].popen.kill()
-    before[0].popen.wait()
+    assert idle_processes == [process] and process.popen is before
+    before.kill()
+    before.wait()
     assert lv.solve(problem, APART[0], time_limit=600.0).success
-    assert idle_processes != before
+    assert idle_processes == [process] and process.popen is not before
+
+
+@pytest.mark.parametrize("name", installed("clarabel", "osqp"))
+def test_isolated_process_survives_a_limit_of_the_backend(name):
+    from lavender.external.isolated import idle_processes
+
+    problem = lv.Problem.lcp(*spd(300, seed=3))
+    lv.solve(lv.Problem.lcp(*spd(5)), name, isolate=True)
+    before = [process.popen for process in idle_processes]
+    late = lv.solve(problem, name, time_limit=1e-3, tol=1e-12, isolate=True)
+    assert late.status is lv.Status.TIME_LIMIT and "ended at the time limit" not in late.message
+    assert [process.popen for process in idle_processes] == before
+
+
+def is_running(pid):
+    """Return whether a process runs; one that ended and was not awaited by its parent does not run."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    stat = Path(f"/proc/{pid}/stat")
+    return not (stat.exists() and " Z " in stat.read_text())
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="a killed process of Windows leaves no orphan group")
+def test_isolated_process_ends_when_its_parent_is_killed():
+    code = """import os, signal, time
+from lavender.base.subprocesses import ProcessBackend
+process = ProcessBackend()
+print(process.call_function(os.getpid), flush=True)
+os.kill(os.getpid(), signal.SIGKILL)"""
+    parent = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    until = time.monotonic() + 600.0
+    while is_running(int(parent.stdout)):
+        assert time.monotonic() < until
+        time.sleep(0.05)
 
 
 @pytest.mark.skipif(not APART, reason="no backend without a time limit is installed")
