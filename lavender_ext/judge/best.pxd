@@ -9,7 +9,7 @@
     f = 1/2 lam.A lam - b.lam = 1/2 lam.(w - b)
 
 An island that one iterate has solved keeps it. Two kinds of iterates do not count: an iterate that is not finite, and an iterate
-so large that rounding of its slack may hide a thousandth of b.
+so large that rounding of its slack may hide a thousandth of b and of the zero impulse's error E0.
 
 E decides if rounding may explain the difference of two f. E also decides in a problem without a solution, because f then falls
 without end, and there the zero impulse counts. A problem counts as one without a solution if this is proven (`by_energy`), or
@@ -19,7 +19,7 @@ motor, still runs up to a bound.
 A start that does not meet tol is replaced by the zero impulse in two cases: if A is symmetric and the zero impulse has the lower
 f, or if the zero impulse solves the island. The zero impulse then counts.
 """
-from libc.math cimport INFINITY, fabs
+from libc.math cimport INFINITY, fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy
 
@@ -34,7 +34,7 @@ from lavender_ext.judge.tally cimport get_island_block, index_of_island_begin, i
 cdef struct objective_t:
     double value                # J, f of an impulse in one island
     double rounding             # J, what rounding may change in it
-    int32_t hides_b             # whether rounding of the slack may hide a thousandth of b
+    int32_t hides_zero          # whether rounding of the slack may hide a thousandth of b and of E0
 
 
 cdef struct best_t:
@@ -42,6 +42,7 @@ cdef struct best_t:
     int32_t seen                # number of impulses so far
     int32_t symmetric           # whether A is symmetric, -1 if not known
     int32_t by_energy           # E decides in each island
+    double reference_energy     # sqrt J, E0 of a problem without islands
     double* impulse             # (m) N s
     double* begin               # (m) N s, the impulse at which the run begins
     double* begin_energy        # (n) sqrt J, its energy error
@@ -65,7 +66,7 @@ cdef inline int64_t best_workspace_size(int64_t m, int64_t n) noexcept nogil:
 cdef inline void bind_best(best_t* s, const blocks_t* p, double* workspace) noexcept nogil:
     """Initialise s before the first impulse; workspace (`best_workspace_size`)."""
     cdef int32_t n = count_islands(p)
-    s.n, s.seen, s.symmetric, s.by_energy = n, 0, -1, 0
+    s.n, s.seen, s.symmetric, s.by_energy, s.reference_energy = n, 0, -1, 0, 0.0
     s.impulse, s.begin, s.begin_energy = workspace, workspace + p.n_rows, workspace + 2 * <ssize_t>p.n_rows
     s.relative = s.begin_energy + n
     s.energy, s.objective, s.now = s.relative + n, s.relative + 2 * n, s.relative + 3 * n
@@ -89,21 +90,29 @@ cdef inline void copy_island_impulse(const blocks_t* p, int32_t island, const do
 # -- objectives -------------------------------------------------------------------------------------------------------
 
 
-cdef inline objective_t measure_objective(const blocks_t* p, int32_t island, const double* lam, const double* w) noexcept nogil:
-    """Return the f of lam (m) with slack w (m) in an island, and what rounding may change in it.
+cdef inline objective_t measure_objective(const blocks_t* p, int32_t island, const double* lam, const double* w,
+                                          double energy_at_zero) noexcept nogil:
+    """Return the f of lam (m) with slack w (m) in an island with the reference E0, and what rounding may change in it.
 
     A slack and b are sums over dozens of terms. On a stack of six boxes the f of two solutions differ by 1.6e-15 J, four times
     as much as 8 roundings of each row's largest terms. In 60 steps of such stacks, 64 roundings were not enough in two.
     """
     cdef int32_t a, i, k
-    cdef double total = 0.0, size = 0.0, largest = 0.0, velocity = 0.0
+    cdef double total = 0.0, size = 0.0, largest = 0.0, velocity = 0.0, energy = 0.0
     for a in range(index_of_island_begin(p, island), index_of_island_end(p, island)):
         i = get_island_block(p, a)
         for k in range(p.ptr[i], p.ptr[i + 1]):
             total += 0.5 * lam[k] * (w[k] - p.b[k])
             size += fabs(lam[k]) * ((fabs(w[k]) + fabs(p.b[k])) + p.d[k] * fabs(lam[k]))
             largest, velocity = max(largest, fabs(p.b[k])), max(velocity, p.d[k] * fabs(lam[k]))
-    return objective_t(total, 1024.0 * unit_roundoff() * size, unit_roundoff() * velocity > 1e-3 * largest)
+            energy = max(energy, sqrt(p.d[k]) * fabs(lam[k]))
+    return objective_t(total, 1024.0 * unit_roundoff() * size, unit_roundoff() * velocity > 1e-3 * largest
+                       and unit_roundoff() * energy > 1e-3 * energy_at_zero)
+
+
+cdef inline double energy_error_at_zero(const blocks_t* p, int32_t island, double of_all) noexcept nogil:
+    """Return E0 of an island; of_all is that of a problem without islands."""
+    return p.islands.reference[2 * island] if p.islands != NULL else of_all
 
 
 cdef inline bint is_matrix_symmetric(best_t* s, const view_t* v) noexcept nogil:
@@ -141,7 +150,7 @@ cdef inline bint is_better_in_island(best_t* s, const view_t* v, int32_t island,
         return not s.relative[island] <= tol
     if better != (difference < 0.0) and fabs(difference) > f.rounding and minimises_objective(s, v, island):
         better = difference < 0.0
-    return better and not f.hides_b and s.now[2 * island] < INFINITY
+    return better and not f.hides_zero and s.now[2 * island] < INFINITY
 
 
 cdef inline bint store_better_islands(best_t* s, const view_t* v, const double* lam, const double* w, double tol) noexcept nogil:
@@ -150,7 +159,7 @@ cdef inline bint store_better_islands(best_t* s, const view_t* v, const double* 
     cdef objective_t f
     cdef bint changed = False
     for i in range(s.n):
-        f = measure_objective(&v.p, i, lam, w)
+        f = measure_objective(&v.p, i, lam, w, energy_error_at_zero(&v.p, i, s.reference_energy))
         if s.seen == 0 or is_better_in_island(s, v, i, &f, tol):
             s.relative[i], s.energy[i], s.objective[i] = s.now[2 * i], s.now[2 * i + 1], f.value
             copy_island_impulse(&v.p, i, lam, s.impulse)
@@ -227,7 +236,7 @@ cdef inline bint begin_at_better_point(const blocks_t* p, const double* now, dou
     cdef objective_t f
     cdef bint changed = False
     for island in range(count_islands(p)):
-        zero, f = relative_residual_at_zero(p, island, at_zero), measure_objective(p, island, lam, w)
+        zero, f = relative_residual_at_zero(p, island, at_zero), measure_objective(p, island, lam, w, 0.0)
         if now[2 * island] <= tol or now[2 * island] < INFINITY and not (zero < 0.5 and zero < now[2 * island]) and not (
                 symmetric and f.value > f.rounding and is_zero_impulse_of_island(p, island, NULL)):
             continue
@@ -240,11 +249,10 @@ cdef inline bint begin_at_better_point(const blocks_t* p, const double* now, dou
     return changed
 
 
-cdef inline bint store_start(best_t* s, const view_t* v, const double* w, double energy_at_zero, double at_zero, double tol,
-                             double* lam) noexcept nogil:
+cdef inline bint store_start(best_t* s, const view_t* v, const double* w, double at_zero, double tol, double* lam) noexcept nogil:
     """Store the start lam (m), scored in `now`, with slack w (m), and call `begin_at_better_point`; return its result.
 
-    energy_at_zero [sqrt J] and at_zero are E0 and the relative residual of the zero impulse over all rows.
+    at_zero is the relative residual of the zero impulse over all rows.
     """
     cdef int32_t i
     cdef double energy
@@ -260,7 +268,7 @@ cdef inline bint store_start(best_t* s, const view_t* v, const double* w, double
         if not is_zero_impulse_of_island(&v.p, i, lam):
             continue
         default = is_zero_impulse_of_island(&v.p, i, s.impulse)
-        energy = max(v.p.islands.reference[2 * i] if v.p.islands != NULL else energy_at_zero, 0.0)
+        energy = max(energy_error_at_zero(&v.p, i, s.reference_energy), 0.0)
         energy *= min(relative_residual_at_zero(&v.p, i, at_zero), 1.0)
         s.begin_energy[i] = energy
         if default or not energy > s.energy[i] or not s.relative[i] < INFINITY or minimises_objective(s, v, i):

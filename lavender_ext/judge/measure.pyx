@@ -410,7 +410,7 @@ def combine_best_islands(Data p, impulse, list impulses, double tol, bint by_ene
     if m == 0:
         return start, start
     bind_best(&best, &p.blocks, &x[0])
-    best.by_energy = by_energy
+    best.by_energy, best.reference_energy = by_energy, p.reference_energy
     project_on_bounds(&p.blocks, &begin[0])
     for iterate in [start, *impulses]:
         lam = as_double_pointer(iterate, m)
@@ -420,7 +420,7 @@ def combine_best_islands(Data p, impulse, list impulses, double tol, bint by_ene
         now = relative_residual_of_score(&s, w, <int32_t>m, p.reference_energy, p.reference_velocity)
         copy_score_without_islands(&best, &p.blocks, &s, now)
         if best.seen == 0:
-            store_start(&best, &v, w, p.reference_energy, p.relative_at_zero, tol, &begin[0])
+            store_start(&best, &v, w, p.relative_at_zero, tol, &begin[0])
         else:
             store_better_islands(&best, &v, lam, w, tol)
     return np.array(x[:m]), start

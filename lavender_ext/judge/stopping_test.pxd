@@ -88,6 +88,7 @@ cdef inline void begin_stopping_test(stopping_test_t* s, const blocks_t* p, doub
     s.reference_velocity = reference_velocity
     s.relative_at_zero = relative_at_zero
     bind_best(&s.best, p, workspace)
+    s.best.reference_energy = reference_energy
     s.marked = workspace + best_workspace_size(p.n_rows, s.best.n)
     begin_progress(&s.progress, s.marked + s.best.n, p.n_rows)
 

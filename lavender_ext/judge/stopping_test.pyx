@@ -112,7 +112,7 @@ cdef inline int32_t perform_residual_check(stopping_test_t* s, const view_t* v, 
     now = relative_residual_of_check(s, &x)
     if s.total == 0:                                    # Begin from the better of the start and the zero impulse.
         copy_score_without_islands(&s.best, p, &x, now)
-        if store_start(&s.best, v, s.w, s.reference_energy, s.relative_at_zero, tol, lam):
+        if store_start(&s.best, v, s.w, s.relative_at_zero, tol, lam):
             x = make_empty_score()
             x.by_island = s.best.now
             judge_view(v, lam, s.w, s.e, s.v, False, &x)

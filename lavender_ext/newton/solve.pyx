@@ -117,6 +117,7 @@ cdef inline int32_t begin(newton_t* n, const options_t* o, const double* lam) no
     """Start from lam (m). The workspace must be bound before."""
     n.tol, n.budget = o.tol, o.budget
     set_reference(&n.problem, o.e0, o.v0)
+    n.island_best.reference_energy = o.e0
     start_newton_solve(n, lam)
     return MORE
 

@@ -141,3 +141,53 @@ def test_combine_best_islands_takes_the_smallest_objective_of_each_island(seed):
     found = combine_best_islands(problem, points[0], list(points[1:4]), 1e-12)  # The last is always compared, too.
     best = np.argmin(values, axis=0)
     np.testing.assert_array_equal(found, np.concatenate([np.split(points[i], 3)[k] for k, i in enumerate(best)]))
+
+
+# -- bounds that exclude zero ------------------------------------------------------------------------------------------
+
+
+def preloaded_problem(seed, law, rhs_size):
+    """Rows under preload (a fixed force, a motor between two torques, belts under tension), and contacts or bounds."""
+    rng = np.random.default_rng(seed)
+    fixed = lv.Cones.bounded([1.0, 0.5, 2.0, 1.0], [1.0, 1.5, np.inf, np.inf])
+    rest = lv.Cones.bounded(np.zeros(9), np.full(9, np.inf)) if law == "lcp" else lv.Cones.contacts(np.full(3, 0.5))
+    cones = fixed + rest
+    jac, free = rng.standard_normal((len(cones.lower), 16)), rng.standard_normal(16)
+    matrix, b = jac @ jac.T + 0.1 * np.eye(len(jac)), rhs_size * -jac @ free
+    return lv.Problem(b, cones, matrix, friction="cone" if law == "cone" else "coulomb")
+
+
+DECADES = [*range(0, 20, 3), np.inf]
+
+
+@pytest.mark.parametrize("law", ["lcp", "cone", "coulomb"])
+@pytest.mark.parametrize("name", [*SWEEPS, "jacobi", "apgd", "admm"])
+def test_solve_bounds_exclude_zero_returns_no_iterate_worse_than_its_last_for_any_size_of_b(name, law):
+    for decade in DECADES:
+        problem = preloaded_problem(int(min(decade, 20.0)), law, 10.0**-decade)
+        if name not in lv.available(problem):
+            pytest.skip("the solver takes another law")
+        for sweeps in (3, 10, 200):
+            seen = []
+            found = lv.solve(
+                problem, name, tol=1e-17, max_iter=sweeps, callback=lambda n, x, r, seen=seen: seen.append(x.copy())
+            )
+            assert found.claim_check == "confirmed"
+            last, now = (lv.residual(problem, x) for x in (seen[-1], found.impulse))
+            if law == "coulomb":
+                assert now.energy <= last.energy + last.floor_energy
+                continue
+            # f is a sum of terms of this size; a thousand of their roundings are 1e-13.
+            size = float(np.abs(seen[-1]) @ (np.abs(problem.csr.toarray()) @ np.abs(seen[-1])))
+            assert objective(problem, found.impulse) <= objective(problem, seen[-1]) + 1e-12 * size
+
+
+@pytest.mark.parametrize("law", ["lcp", "cone", "coulomb"])
+@pytest.mark.parametrize("tol", [1e-17, 0.0])
+@pytest.mark.parametrize("name", ["newton", "auto"])
+def test_newton_bounds_exclude_zero_keeps_its_solution_for_any_size_of_b(name, tol, law):
+    for decade in DECADES:
+        problem = preloaded_problem(int(min(decade, 20.0)), law, 10.0**-decade)
+        found = lv.solve(problem, name, tol=tol)
+        assert found.claim_check == "confirmed"
+        assert found.residual.above_floor == 0.0
