@@ -87,6 +87,7 @@ def states_of(model, datas):
 def numbers(n=64, steps=50, iterations=None):
     """Return the number of worlds, times [s] of environments and judge, errors (steps, n) [m/s], rejected worlds."""
     envs, model, datas, name = make(n)
+    scratch = lv.io.MujocoScratch(model)
     rng, spent, errors = np.random.default_rng(0), np.zeros(2), np.empty((steps, n))
     envs.reset(seed=0)
     if iterations is not None:
@@ -97,7 +98,7 @@ def numbers(n=64, steps=50, iterations=None):
         begin = perf_counter()
         envs.step(actions)
         between = perf_counter()
-        batch, impulse = lv.io.from_mujoco_many(model, states_of(model, datas))
+        batch, impulse = lv.io.from_mujoco_many(model, states_of(model, datas), scratch=scratch)
         found = lv.residual_many(batch, impulse, threshold=ACCEPT)
         errors[step] = found.velocity_error
         spent += between - begin, perf_counter() - between

@@ -304,6 +304,7 @@ NOT_CALLED = [
     "Snapshot.load", "Snapshot.save", "Recorder.add", "Recorder.close", "Recorder.leave_out", "Recorder.write_step",
     "read_recorded_state", "load", "load_solution", "read", "record", "save", "from_drake", "from_genesis",
     "from_kamino", "from_mujoco", "from_mujoco_many", "from_newton_mujoco", "from_pinocchio",
+    "MujocoScratch", "MujocoScratch.keep_data",
 ]  # fmt: skip
 
 # -- what is wrong -----------------------------------------------------------------------------------------------------

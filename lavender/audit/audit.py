@@ -65,6 +65,8 @@ MAX_DEFAULT_WORLDS = 4096
 DEFAULT_JOINT_WORLDS = 8  # Default number of worlds of other engines, and of episodes of environments.
 # World 0 is first judged in this process for these numbers of steps, so that Ctrl-C soon after the start has a result.
 FIRST_STEPS = (1, 20)
+# [s] Steps that take less time are judged in this process: each worker process takes a second to start.
+MIN_DURATION_OF_WORKERS = 2.0
 MAX_CONTACT_STATES = 1000  # Up to about this many states before steps with contact are kept.
 SAVE_INTERVAL = 60.0  # [s] Results of complete worlds are written to `folder` after this time.
 # The states before a world diverges by less than this number of steps are not kept as states with contact: their speeds
@@ -274,6 +276,9 @@ def _audit_model(
         if stored == (worlds, runs.steps) and folder is not None:
             result.restore(folder)
         todo = np.flatnonzero((result.verdict < 0).any(axis=1)).tolist()
+        if stored is None and workers == -1 and backend == "loky":
+            is_short = duration / n_steps * len(todo) * runs.steps < MIN_DURATION_OF_WORKERS
+            workers = 1 if is_short else workers
         if len(todo) < worlds:
             n = worlds - len(todo)
             result.notes.append(f"{format_count(n, 'world')} of an earlier audit reused (--no-reuse).")

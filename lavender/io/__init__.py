@@ -22,7 +22,7 @@ from lavender.base.arrays import FloatArray, check_sequence
 from lavender.base.errors import InputError
 from lavender.io import drake, efc, fclib, mujoco
 from lavender.io.drake import from_drake
-from lavender.io.efc import from_efc, from_mujoco_many
+from lavender.io.efc import MujocoScratch, from_efc, from_mujoco_many
 from lavender.io.engine_step import Claims, EngineStep
 from lavender.io.genesis import from_genesis
 from lavender.io.kamino import from_kamino
@@ -38,6 +38,7 @@ from lavender.problem import Problem
 __all__ = [
     "Claims",
     "EngineStep",
+    "MujocoScratch",
     "Recorder",
     "Recording",
     "StepVerdict",

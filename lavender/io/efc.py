@@ -14,6 +14,7 @@ judge uses the round-off floor of float32. MJX and Warp pad worlds with rows of 
 
 from __future__ import annotations
 
+import operator
 import warnings
 from typing import Any, NamedTuple
 
@@ -35,7 +36,7 @@ from lavender.base.threads import run_on_threads
 from lavender.batch.data import ERRORS, Batch, check_row_counts, check_shared_lower_triangles
 from lavender.io import mujoco as single
 from lavender.io.mujoco_discrete import MASS_TOLERANCE, compute_discrete_matrix
-from lavender.io.mujoco_memory import CHANGED_ADVICE, read_step
+from lavender.io.mujoco_memory import CHANGED_ADVICE, import_mujoco, read_step
 from lavender.io.start_states import can_sleep
 from lavender.io.stiff_rows import judge_stiff_worlds
 from lavender.problem import FRICTION_LAWS
@@ -225,7 +226,55 @@ def from_efc(
     return Imported(batch, lam if convert is None else convert(lam))
 
 
-def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str = "raise") -> Imported:
+class MujocoScratch:
+    """An `MjData` that calls of `from_mujoco_many` on one model reuse: making one takes longer than a few worlds.
+
+    A call in another thread while a call uses the data makes its own. The data are made anew if sizes of the model
+    change, and are freed with this object.
+
+    Parameters
+    ----------
+    model : mujoco.MjModel
+
+    Raises
+    ------
+    InputError
+        `model` is not an MjModel, or MuJoCo is not installed or too old.
+    """
+
+    def __init__(self, model: Any) -> None:
+        mj = import_mujoco()
+        if not isinstance(model, mj.MjModel):
+            raise InputError(f"model is a {type(model).__name__}; a mujoco.MjModel is needed")
+        self.model = model
+        names = [
+            name for name in dir(model) if name.startswith("n") and isinstance(getattr(model, name), int)
+        ]
+        self._get_sizes = operator.attrgetter(*names)
+        self._sizes: Any = None
+        self._kept: list[Any] = []  # Not more than one MjData, which a call takes out while it uses it.
+
+    def take_data(self) -> Any:
+        """Return an MjData as after its creation, to be given back by `keep_data`."""
+        mj, sizes = import_mujoco(), self._get_sizes(self.model)
+        try:
+            data = self._kept.pop()
+        except IndexError:
+            data = None
+        if data is None or sizes != self._sizes:
+            self._sizes = sizes
+            return mj.MjData(self.model)
+        mj.mj_resetData(self.model, data)
+        return data
+
+    def keep_data(self, data: Any) -> None:
+        """Keep an MjData that `take_data` returned. An MjData in which MuJoCo raised an error must not be kept."""
+        self._kept[:] = [data]
+
+
+def from_mujoco_many(
+    model: Any, states: Any, *, threads: int = 1, errors: str = "raise", scratch: MujocoScratch | None = None
+) -> Imported:
     """Call `mj_forward` on many states of one MuJoCo model; return the problems and MuJoCo's own answers.
 
     A model with <flag sleep="enable"/> is rejected: a state does not contain which trees sleep, so that MuJoCo would
@@ -245,6 +294,9 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
         Treatment of a state that is not finite: raise an error, or convert it to a world without rows and with a
         v_free of NaN. A state whose acceleration is not finite raises an error, or has impulses of NaN. `solve_many`
         and `residual_many` reject such a world by its number, or accept it with errors="status".
+    scratch : MujocoScratch, optional
+        Made once for `model`, it saves each call the time to make an MjData, more than that of 30 worlds. It needs
+        threads=1. The results do not depend on it.
 
     Returns
     -------
@@ -256,7 +308,7 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
     ------
     InputError
         `model` is not an MjModel or has sleep enabled; states have the wrong size; a state or an acceleration is not
-        finite; or MuJoCo raises an error.
+        finite; `scratch` was made for another model or is given with several threads; or MuJoCo raises an error.
     CapabilityError
         MuJoCo does not store the stiffness of a flex, which the integrator adds to M; see `from_mujoco`.
     """
@@ -292,11 +344,21 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
     pending = iter(range(n))
     threads = min(check_int("threads", threads, 1, None), max(n, 1))
 
+    if scratch is not None and (
+        not isinstance(scratch, MujocoScratch) or scratch.model is not model or threads > 1
+    ):
+        given = (
+            f"of another model, with {threads} threads"
+            if isinstance(scratch, MujocoScratch)
+            else type(scratch)
+        )
+        raise InputError(f"scratch is {given}; MujocoScratch(model) of this model is needed, with threads=1")
+
     is_finite = np.isfinite(values).all(axis=1)
     has_moving_surfaces, kind = bool(getattr(model, "flg_surfacevel", 0)), int(kinds[size])
 
     def work(stop: bytearray) -> None:
-        data = mj.MjData(model)
+        data = mj.MjData(model) if scratch is None else scratch.take_data()
         step = read_step(model, data)
         for i in pending:
             if stop[0]:
@@ -326,6 +388,8 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
                 smooth[i] += 0.0 if matrix.change is None else matrix.change
             blocks = single.make_blocks(step, data, 1)
             rows_of_states[i] = *copy_rows(step, blocks), blocks
+        if scratch is not None:
+            scratch.keep_data(data)
 
     run_on_threads(work, threads)
     order = sorted(rows_of_states)

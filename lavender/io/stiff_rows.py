@@ -24,7 +24,6 @@ import contextlib
 from collections.abc import Callable
 
 import numpy as np
-from scipy.linalg import qr, solve_triangular
 
 from lavender.base.arrays import FloatArray, IntArray, mark_read_only
 from lavender.base.errors import InputError
@@ -212,6 +211,11 @@ def _compute_newton_step(
     weighted = np.vstack([jac[inside], *rows_of_combinations])
     weighted /= np.sqrt(np.append(compliance[inside], compliances))[:, None]
     mass = np.array([general.momentum_of(column) for column in np.eye(general.nv)])
+    from scipy.linalg import (
+        qr,
+        solve_triangular,
+    )  # Imported here: few answers need it, and every command would load it.
+
     stacked = np.vstack([weighted, np.linalg.cholesky(mass).T])
     # Householder's QR of rows in descending order keeps the digits of each row, whatever the weights are.
     order = np.argsort(-np.abs(stacked).max(axis=1), kind="stable")

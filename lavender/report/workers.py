@@ -43,7 +43,7 @@ def map_unordered(
         from joblib.externals.loky.process_executor import BrokenProcessPool
 
         lost = (*lost, BrokenProcessPool)
-    with contextlib.suppress(ImportError):
+    if backend == "dask":
         from distributed.client import FutureCancelledError
         from distributed.scheduler import KilledWorker
 

@@ -57,6 +57,55 @@ def test_from_mujoco_many_of_a_state_equals_from_mujoco(cone, condim, jacobian):
         assert found.velocity_error[i] == pytest.approx(one.velocity, rel=1e-3, abs=1e-9)
 
 
+def test_from_mujoco_many_with_scratch_has_the_bits_of_calls_without_it():
+    """Controls, warm starts and clamped numbers of an earlier call, and of one that failed, do not reach the next."""
+    model = mj.MjModel.from_xml_string(scene())
+    scratch, states = lv.io.MujocoScratch(model), states_of(model, 6)
+    whole = np.zeros((2, mj.mj_stateSize(model, mj.mjtState.mjSTATE_INTEGRATION)))
+    data = forwarded(model, states[0])
+    data.qfrc_applied[:], data.xfrc_applied[:], data.qacc_warmstart[:] = 3.0, 2.0, 7.0
+    for state in whole:
+        mj.mj_getState(model, data, state, mj.mjtState.mjSTATE_INTEGRATION)
+    kept = scratch.take_data()
+    scratch.keep_data(kept)
+    for some in (states[:1], whole, states, whole * np.nan, states[2:], states[:1]):
+        expected = lv.io.from_mujoco_many(model, some, errors="status")
+        batch, impulse = lv.io.from_mujoco_many(model, some, errors="status", scratch=scratch)
+        assert impulse.tobytes() == expected.impulse.tobytes()
+        assert all(batch[i] == expected.batch[i] for i in range(len(some)) if np.isfinite(some[i]).all())
+    assert scratch.take_data() is kept  # Every call used the same MjData.
+
+
+def test_from_mujoco_many_with_scratch_of_another_model_or_with_threads_raises():
+    model, other = (mj.MjModel.from_xml_string(scene()) for _ in range(2))
+    states = states_of(model, 2)
+    scratch = lv.io.MujocoScratch(other)
+    for more in ({"scratch": scratch}, {"scratch": mj.MjData(model)}):
+        with pytest.raises(lv.InputError, match="scratch"):
+            lv.io.from_mujoco_many(model, states, **more)
+    with pytest.raises(lv.InputError, match="threads=1"):
+        lv.io.from_mujoco_many(other, states, scratch=scratch, threads=2)
+    with pytest.raises(lv.InputError, match="MjModel is needed"):
+        lv.io.MujocoScratch(None)
+
+
+def test_scratch_of_a_call_that_raised_makes_other_data(monkeypatch):
+    """MuJoCo may have left its stack as it was when it raised an error."""
+    model = mj.MjModel.from_xml_string(scene())
+    scratch, states = lv.io.MujocoScratch(model), states_of(model, 1)
+    lv.io.from_mujoco_many(model, states, scratch=scratch)
+    used = scratch.take_data()
+    scratch.keep_data(used)
+
+    def fail(model, data):
+        raise mj.FatalError("stack overflow")
+
+    monkeypatch.setattr(mj, "mj_forward", fail)
+    with pytest.raises(lv.InputError, match="state 0: MuJoCo raised an error, stack overflow"):
+        lv.io.from_mujoco_many(model, states, scratch=scratch)
+    assert scratch.take_data() is not used
+
+
 def test_from_mujoco_many_with_a_state_that_is_not_finite_reads_the_others():
     model = mj.MjModel.from_xml_string(scene())
     states = states_of(model, 5)
