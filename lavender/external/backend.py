@@ -15,7 +15,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.external.convex import ScaledProgram
-from lavender.external.running import Answer, Call, Limits, classify_status, quiet
+from lavender.external.running import FIRST_TOLERANCE, Answer, Call, Limits, classify_status, quiet
 from lavender.judge.solution import Status
 
 # A backend with `prefers_dense` gets dense matrices of up to this many entries, or of MAX_DENSE_FILL times the number
@@ -49,7 +49,9 @@ class Backend:
     min_tolerance : float
         Smallest tolerance that the backend accepts.
     max_iter : int
-        Default limit of iterations.
+        Default limit of the iterations of a call.
+    first_tolerance : float
+        Tolerance of the first call, as a multiple of tol; above 1 if a Newton step is cheaper than the iterations.
     dense : bool
         Whether the backend accepts dense matrices only.
     prefers_dense : bool
@@ -81,6 +83,7 @@ class Backend:
     settings: Mapping[str, Any] | None = None
     min_tolerance: float = 0.0
     max_iter: int = 10_000
+    first_tolerance: float = FIRST_TOLERANCE
     dense: bool = False
     prefers_dense: bool = False
     starts: bool = False

@@ -39,14 +39,18 @@ MAX_SINGULAR_PIVOT = 1e-13
 # [-] Multiples of the largest diagonal entry that are added to a singular P for backends that need a definite one, in
 # the first and in the second call. The Newton step removes their effect.
 DEFINITE_SHIFTS = 1e-7, 1e-5
+MAX_CLAIM_ERROR = (
+    1e-3  # [-] A claim "infeasible" with a larger error of its proof is followed by a second call.
+)
 # A J of at most this many dense entries is converted before its rows are selected.
 MAX_CONVERTED_ENTRIES = 10**5
-# Variables and active rows up to which the matrix of the Newton step is dense, and up to which the step is done.
-MAX_DENSE_STEP_SIZE, MAX_STEP_SIZE = 1000, 20_000
-# [-] Shift of the diagonal of a sparse matrix of the step, which may be singular; each refinement reduces its effect.
-SPARSE_STEP_SHIFT, REFINEMENTS_OF_SPARSE_STEP = 1e-9, 4
-# [-] The Newton step solves a least-squares problem if a pivot is at most this multiple of the largest one.
-MAX_SINGULAR_STEP_PIVOT = 1e-13
+# The matrix of the Newton step is dense up to this many variables and active rows, and with this share of nonzeros.
+MAX_DENSE_STEP_SIZE, MIN_DENSE_FILL = 300, 0.2
+MAX_STEP_SIZE = 20_000  # No step is done with more variables and active rows.
+NEAR_SLACK = 1e-8  # [-] Rows with a smaller slack in scaled units may be active with a multiplier of 0.
+# [-] Shift of the diagonal of a singular or sparse matrix of the step; each refinement reduces its effect.
+STEP_SHIFT, REFINEMENTS_OF_SHIFTED_STEP = 1e-9, 4
+MAX_SINGULAR_STEP_PIVOT = 1e-13  # [-] A dense matrix counts as singular below this ratio of its pivots.
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +132,37 @@ class ConvexProgram:
 
     def judge(self, x: FloatArray, lam: FloatArray) -> tuple[Any, ...]:
         """Judge x and multipliers of a program without cones: `judge_program`."""
-        return judge_program(self.P, self.q, self.J, self.t, lam, x, self.free)
+        return judge_program(self.P, self.q, self.J, self.t, self.scales, lam, x, self.free)
+
+    def clip_to_bounds(self, x: FloatArray) -> FloatArray:
+        """Return x (n,) with each variable within its bounds."""
+        low, high = self._bounds
+        return np.minimum(np.maximum(x, low), high)
+
+    @cached_property
+    def _bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper bounds of the variables (n,); infinite without one."""
+        bound = np.flatnonzero(self.variable >= 0)
+        side = self.t[bound] * self.J[2][self.J[0][bound]]
+        is_low, is_fixed = self.J[2][self.J[0][bound]] > 0.0, bound < self.free
+        low, high = np.full(len(self.q), -np.inf), np.full(len(self.q), np.inf)
+        low[self.variable[bound[is_low]]] = side[is_low]
+        high[self.variable[bound[~is_low | is_fixed]]] = side[~is_low | is_fixed]
+        return low, high
+
+    def resize(self, x: FloatArray) -> ConvexProgram:
+        """Return the program with the size of x (n,) as the size of its variables; the same object if x is 0."""
+        d, e, _, _ = self.scales
+        largest = float(np.abs(x / d).max(initial=0.0))
+        if not 0.0 < largest < np.inf:
+            return self
+        sigma = float(np.exp2(np.round(np.log2(largest))))
+        terms = sigma * d * (np.abs(self.q) + abs(self.hessian) @ np.abs(x))
+        cost = float(terms.max())
+        new = replace(self)
+        c = float(np.exp2(-np.round(np.log2(cost)))) if 0.0 < cost < np.inf else 1.0
+        new.__dict__["scales"] = d, e, sigma, c
+        return new
 
     @np.errstate(all="ignore")  # The caller judges a step that overflows.
     def polish(
@@ -137,29 +171,46 @@ class ConvexProgram:
         """Do one Newton step with iterative refinement; None if the program has cones or is too large.
 
         It is computed in scaled units, in which all roundings are the same, because the scales are powers of two.
+        Variables at active bounds are eliminated.
         """
-        rows = active.nonzero()[0]
-        n, k, scaled = len(x), len(rows), self.scaled
-        if self.cones or not 0 < n + k <= MAX_STEP_SIZE:
+        n, scaled = len(x), self.scaled
+        rows, at_bound = (
+            np.flatnonzero(active & (self.variable < 0)),
+            np.flatnonzero(active & (self.variable >= 0)),
+        )
+        fixed, first = np.unique(self.variable[at_bound], return_index=True)
+        at_bound = at_bound[first]
+        is_free = np.ones(n, bool)
+        is_free[fixed] = False
+        free = np.flatnonzero(is_free)
+        size = len(free) + len(rows)
+        if self.cones or size > MAX_STEP_SIZE:
             return None
-        is_dense = n + k <= MAX_DENSE_STEP_SIZE
+        nonzeros = len(scaled.P[2]) + 2 * len(scaled.J[2])
+        is_dense = size <= MAX_DENSE_STEP_SIZE or nonzeros > MIN_DENSE_FILL * size * size
         P, J, t = scaled.get_hessian(is_dense), scaled.select_rows(rows, 1.0, is_dense), scaled.t[rows]
         largest = abs(P).max() if n else 0.0
         weight = 1.0 / float(largest) if 0.0 < largest < np.inf else 1.0
-        try:
-            solve = (_factor_dense if is_dense else _factor_sparse)(weight * P, J)
-        except RuntimeError:  # The sparse matrix is singular in spite of its shift.
-            return None
         x, lam = self.scale_point(x, lam)
+        sign = scaled.J[2][scaled.J[0][at_bound]]
+        x[fixed] = sign * scaled.t[at_bound]
         multipliers = lam[rows]
-        for _ in range(2 if is_dense else REFINEMENTS_OF_SPARSE_STEP):
-            gradient = P @ x + scaled.q - J.T @ multipliers
-            move = solve(np.concatenate([-weight * gradient, t - J @ x]))
-            x, multipliers = x + move[:n], multipliers + move[n:] / weight
-        bounds = rows[self.variable[rows] >= 0]
-        x[self.variable[bounds]] = scaled.J[2][scaled.J[0][bounds]] * scaled.t[bounds]  # Remove rounding.
+        if size:
+            part = P[np.ix_(free, free)] if is_dense else P[:, free][free]
+            try:
+                solve, refinements = (_factor_dense if is_dense else _factor_sparse)(
+                    weight * part, J[:, free]
+                )
+            except RuntimeError:  # The sparse matrix is singular in spite of its shift.
+                return None
+            for _ in range(refinements):
+                gradient = P @ x + scaled.q - J.T @ multipliers
+                move = solve(np.concatenate([-weight * gradient[free], t - J @ x]))
+                x[free] += move[: len(free)]
+                multipliers = multipliers + move[len(free) :] / weight
         lam = np.zeros(len(lam))
         lam[rows] = multipliers
+        lam[at_bound] = sign * (P @ x + scaled.q - J.T @ multipliers)[fixed]
         return self.restore_point(x, lam) if np.isfinite(x).all() else None
 
     def compare_multipliers_with_slacks(self, x: FloatArray, lam: FloatArray) -> npt.NDArray[np.bool_]:
@@ -172,6 +223,14 @@ class ConvexProgram:
         active: npt.NDArray[np.bool_] = lam > self.scaled.jacobian @ x - self.scaled.t
         active[: self.free] = True
         return active
+
+    def find_near_rows(self, x: FloatArray) -> npt.NDArray[np.bool_]:
+        """Return the equations, and the inequalities with a slack of almost 0 in scaled units."""
+        x = x / (self.scales[0] * self.scales[2])
+        size = np.abs(x).max(initial=1.0) + np.abs(self.scaled.t)
+        near: npt.NDArray[np.bool_] = self.scaled.jacobian @ x - self.scaled.t <= NEAR_SLACK * size
+        near[: self.free] = True
+        return near
 
     def update_active_rows(
         self, x: FloatArray, lam: FloatArray, active: npt.NDArray[np.bool_], tol: float
@@ -216,6 +275,22 @@ class ScaledProgram(ConvexProgram):
         side = self.t if self.is_kept is None else self.t[self.is_kept]
         numbers = (self.P[2], self.q, self.J[2], side)
         return all(bool(np.abs(x).max(initial=0.0) < MAX_BACKEND_NUMBER) for x in numbers)
+
+    def is_nearly_proven_unsolvable(self, x: FloatArray | None, lam: FloatArray | None) -> bool:
+        """Return whether lam nearly proves that no point satisfies the rows, or x that the objective is unbounded.
+
+        The test is only to recognise claims without foundation: a proof is checked by `proofs.py`.
+        """
+        if x is None or lam is None:
+            return False
+        jac, y = self.jacobian, np.append(lam[: self.free], np.maximum(lam[self.free :], 0.0))
+        forces = np.abs(jac.T @ y).max(initial=0.0)
+        if forces <= MAX_CLAIM_ERROR * np.abs(y).max(initial=0.0) and self.t @ y > 0.0:
+            return True
+        slope = jac @ x
+        size = MAX_CLAIM_ERROR * np.abs(x).max(initial=0.0)
+        errors = np.abs(self.hessian @ x), np.abs(slope[: self.free]), -slope[self.free :]
+        return bool(self.q @ x < 0.0 and max(part.max(initial=0.0) for part in errors) <= size)
 
     @cached_property
     def is_definite(self) -> bool:
@@ -309,24 +384,23 @@ class ScaledProgram(ConvexProgram):
         return -lam[a], lam[g], box
 
 
-def _factor_dense(hessian: FloatArray, jac: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """Return the solver of the step's equations; if they are singular, their least-squares solution."""
+def _factor_dense(hessian: FloatArray, jac: FloatArray) -> tuple[Callable[[FloatArray], FloatArray], int]:
+    """Return the solver of the step's equations and the number of its refinements; singular equations are shifted."""
     lapack, (k, n) = import_module_under_lock("scipy.linalg.lapack"), jac.shape
     matrix = np.zeros((n + k, n + k))
     matrix[:n, :n], matrix[:n, n:], matrix[n:, :n] = hessian, -jac.T, jac
-    lu, pivots, info = lapack.dgetrf(matrix, overwrite_a=False)
-    pivot = np.abs(lu.diagonal())
+    lu, pivots, info = lapack.dgetrf(matrix)
+    pivot, refinements = np.abs(lu.diagonal()), 2
     if info != 0 or not pivot.min() > MAX_SINGULAR_STEP_PIVOT * pivot.max():
-        return lambda rhs: np.asarray(np.linalg.lstsq(matrix, rhs, rcond=MAX_SINGULAR_STEP_PIVOT)[0], float)
-    return lambda rhs: lapack.dgetrs(lu, pivots, rhs)[0]
+        matrix[np.diag_indices(n + k)] += STEP_SHIFT
+        lu, pivots, _ = lapack.dgetrf(matrix)
+        refinements = REFINEMENTS_OF_SHIFTED_STEP
+    return lambda rhs: lapack.dgetrs(lu, pivots, rhs)[0], refinements
 
 
-def _factor_sparse(hessian: Any, jac: Any) -> Callable[[FloatArray], FloatArray]:
-    """Return the solver of the step's equations with a shifted diagonal."""
+def _factor_sparse(hessian: Any, jac: Any) -> tuple[Callable[[FloatArray], FloatArray], int]:
+    """Return the solver of the step's equations with a shifted diagonal, and the number of its refinements."""
     n, k = jac.shape[1], jac.shape[0]
-    shift = SPARSE_STEP_SHIFT * sp.eye_array(n + k)
+    shift = STEP_SHIFT * sp.eye_array(n + k)
     matrix = sp.csc_array(sp.block_array([[hessian, -jac.T], [jac, None]]) + shift)
-    solve: Callable[[FloatArray], FloatArray] = (
-        import_module_under_lock("scipy.sparse.linalg").splu(matrix).solve
-    )
-    return solve
+    return import_module_under_lock("scipy.sparse.linalg").splu(matrix).solve, REFINEMENTS_OF_SHIFTED_STEP

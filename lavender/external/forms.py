@@ -240,6 +240,7 @@ def get_program(qp: QuadraticProgram) -> ConvexProgram:
         program = ConvexProgram(
             P=qp.hessian, q=qp.q, J=qp.jacobian, t=qp.target, free=qp.free, variable=qp.variable_of_row
         )
+        program.__dict__["scales"] = qp.scales
         qp.__dict__["_convex_program"] = program
     return program
 

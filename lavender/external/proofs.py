@@ -19,6 +19,9 @@ from lavender.problem import Problem
 
 RAY_TOLERANCE = 1e-8  # [-] P d, J d and q.d count as 0 up to this multiple of their largest terms.
 FEASIBLE_TOLERANCE = 1e-6  # [-] Largest error of a row of the feasible point of an unbounded program.
+# [-] t.lambda of a proof is positive by more than this multiple of the sum of |lambda| in scaled units; the rest is
+# rounding of right-hand sides (2^10 unit roundoffs).
+PROOF_ROUNDING = 2.0**-43
 NEGLIGIBLE_SHARE = 1e-9  # [-] Entries of a proof below this fraction of the largest one are set to 0.
 
 
@@ -39,6 +42,9 @@ def find_infeasibility_proof(
     for attempt in range(2):
         for lam in candidates:
             y = _remove_small_entries(np.where(is_equation, lam, np.maximum(lam, 0.0)) / e) * e
+            scaled_y = y / e
+            if not rows.scaled.t @ scaled_y > PROOF_ROUNDING * np.abs(scaled_y).sum():
+                continue
             proof = prove_infeasibility(
                 problem, np.concatenate([np.zeros(problem.m - len(y)), y]), 0.0, deadline
             )

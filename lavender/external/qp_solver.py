@@ -54,43 +54,58 @@ class ProgramJudge:
     ----------
     x, lam : (n,), (m,)
         The best point, with complementary multipliers; None without a point.
-    error, raw : float
-        Its error, and the error without the allowance for rounding.
+    error, strict_error : float
+        Its errors; the strict one compares rows and columns with their right-hand side and q alone.
     """
 
-    def __init__(self, program: ConvexProgram, tol: float) -> None:
-        self.program, self.tol = program, tol
-        self.error = self.raw = np.inf
+    def __init__(self, program: ConvexProgram, tol: float, deadline: Deadline) -> None:
+        self.program, self.tol, self.deadline = program, tol, deadline
+        self.error = self.strict_error = np.inf
         self.x: FloatArray | None = None
         self.lam: FloatArray | None = None
         self.has_step = False
 
     def accepts(self, x: FloatArray, lam: FloatArray) -> bool:
-        """Judge a point and its Newton step; return whether the best point meets tol."""
+        """Judge a point and its Newton steps; return whether the best point meets tol."""
         error, active, complementary = self.keep(x, lam)
         size = len(x) + len(lam)
         if error > (STEP_ERROR if size <= MAX_FREE_STEP_SIZE else max(self.tol, STEP_ERROR)):
-            self._polish(x, complementary, active)
+            first = self._polish(x, lam, self.program.compare_multipliers_with_slacks(x, lam))
+            near = None
+            if self.error > self.tol:  # Rows of almost no slack may be active with a multiplier of 0.
+                near = self._take_step(x, lam, self.program.find_near_rows(x))
+            if near is not None:
+                for multipliers in (near[1], complementary, lam if first is None else first[1]):
+                    self.keep(near[0], multipliers, True)
             if self.error > self.tol:
-                self._polish(x, lam, self.program.compare_multipliers_with_slacks(x, lam))
+                self._polish(x, complementary, active)
         return self.error <= self.tol
 
-    def _polish(self, x: FloatArray, lam: FloatArray, active: Any) -> None:
-        """Judge the Newton steps from a point with these active rows (m,)."""
+    def _take_step(self, x: FloatArray, lam: FloatArray, active: Any) -> tuple[FloatArray, FloatArray] | None:
+        """Return the Newton step of a point; None if it is not possible, or after the deadline."""
+        return None if self.deadline.has_passed() else self.program.polish(x, lam, active)
+
+    def _polish(self, x: FloatArray, lam: FloatArray, active: Any) -> tuple[FloatArray, FloatArray] | None:
+        """Judge the Newton steps from a point with these active rows (m,); return the first one."""
+        first = None
         for _ in range(MAX_STEPS):
-            point = self.program.polish(x, lam, active)
+            point = self._take_step(x, lam, active)
             if point is None:
                 break
+            first = first or point
             _, _, lam = self.keep(*point, True)
             if self.error <= self.tol:
                 break
             x, active = point[0], self.program.update_active_rows(*point, active, self.tol)
+        return first
 
     def keep(self, x: FloatArray, lam: FloatArray, has_step: bool = False) -> tuple[float, Any, FloatArray]:
-        """Judge a point and store it if it is the best."""
-        error, raw, _, _, active, complementary, *_ = self.program.judge(x, lam)
+        """Judge a point, clipped to the bounds of the variables, and store it if it is the best."""
+        x = self.program.clip_to_bounds(x)
+        error, strict_error, _, _, active, complementary = self.program.judge(x, lam)
         if error < self.error or self.x is None:
-            self.x, self.lam, self.error, self.raw, self.has_step = x, complementary, error, raw, has_step
+            self.x, self.lam, self.has_step = x, complementary, has_step
+            self.error, self.strict_error = error, strict_error
         return error, active, complementary
 
 
@@ -120,7 +135,7 @@ class ContactJudge:
         self._keep(x, lam)
         program = self.form.program
         if self.above > self.tol and not program.cones:
-            _, _, _, _, active, complementary, *_ = program.judge(x, lam)
+            _, _, _, _, active, complementary = program.judge(x, lam)
             point = program.polish(x, complementary, active)
             if point is not None:
                 self._keep(*point)
@@ -183,7 +198,7 @@ class QPSolver(Solver):
         self,
         qp: QuadraticProgram,
         tol: float,
-        max_iter: int,
+        max_iter: int | None,
         deadline: Deadline,
         start: tuple[FloatArray, FloatArray] | None,
     ) -> tuple[ProgramJudge, BackendResult]:
@@ -194,8 +209,10 @@ class QPSolver(Solver):
             begin = perf_counter()
             self.start_workers(None, 0.0)
             deadline.extend(perf_counter() - begin)
-        judge = ProgramJudge(program, tol)
-        return judge, self._call(program, judge, max_iter, tol, deadline, start)
+        judge = ProgramJudge(program, tol, deadline)
+        # Without a limit of the user, a second call has as many iterations as the first one.
+        budget = 2 * self.backend.max_iter if max_iter is None else max_iter
+        return judge, self._call(program, judge, budget, tol, deadline, start)
 
     def _call(
         self, program: ConvexProgram, judge: Any, max_iter: int, tol: float, deadline: Deadline, start: Any
@@ -206,7 +223,8 @@ class QPSolver(Solver):
         call = partial(run_isolated, b) if is_isolated else b.run
         result = call_backend_until_accepted(
             program, judge, call, max_iter=max_iter, tol=tol, deadline=deadline, settings=self.settings,
-            start=start, needs_definite=b.needs_definite,
+            start=start, needs_definite=b.needs_definite, call_iterations=b.max_iter,
+            first_tolerance=b.first_tolerance,
         )  # fmt: skip
         if deadline.is_set and not b.stoppable:
             manner = "in a separate process" if is_isolated else "to its end"

@@ -19,13 +19,14 @@ from lavender.base.errors import InputError
 from lavender.external.convex import ConvexProgram, ScaledProgram
 from lavender.judge.solution import Status, sum_work_counts
 
-# [-] Tolerance of the first call, as a multiple of tol, and of the second call, as a multiple of the first.
-FIRST_TOLERANCE, SECOND_TOLERANCE = 1e-3, 1e-2
+FIRST_TOLERANCE, SECOND_TOLERANCE = 1e-3, 1e-5  # [-] Tolerances of the two calls, as multiples of tol.
 MIN_TOLERANCES = 1e-11, 1e-12  # Smallest tolerances of the two calls: rounding prevents smaller residuals.
 # Gap of the second call: an interior-point method leaves an error of the square root of the gap on a row on which
 # multiplier and slack vanish together.
 SECOND_GAP = 1e-16
 OUT_OF_BUDGET = (Status.MAX_ITERATIONS, Status.TIME_LIMIT, Status.INTERRUPTED)
+# No second call follows, except after a claim of infeasibility that its multipliers contradict.
+FINAL = (Status.TIME_LIMIT, Status.INTERRUPTED, Status.INFEASIBLE)
 
 
 @dataclass(frozen=True)
@@ -110,29 +111,37 @@ def call_backend_until_accepted(
     tol: float,
     deadline: Deadline,
     settings: Mapping[str, Any],
+    call_iterations: int = 2**31,
+    first_tolerance: float = FIRST_TOLERANCE,
     start: tuple[FloatArray, FloatArray] | None = None,
     needs_definite: bool = False,
 ) -> BackendResult:
     """Call the backend, and once more with a smaller tolerance and all rows unless the judge accepts its point.
 
-    `max_iter` limits the iterations of both calls; `settings` are additional options of the backend; `start` is (x,
-    lam); `needs_definite` states that the backend needs a positive definite P.
+    The second call has the size of the first call's x as unit. `max_iter` limits the iterations of both calls,
+    `call_iterations` those of the first one; `first_tolerance` is the tolerance of the first call as a multiple of tol;
+    `settings` are additional options of the backend; `start` is (x, lam); `needs_definite` states that the backend
+    needs a positive definite P.
     """
     best: BackendResult | None = None
     work: dict[str, int] = {"backend_calls": 0}
-    if start is not None:
-        start = program.scale_point(*start)
     for attempt, min_eps in enumerate(MIN_TOLERANCES):
+        if best is not None and best.point is not None:
+            program = program.resize(best.point[0])
         scaled = program.scaled if attempt else program.scaled.without_far_rows()
         if needs_definite:
             scaled = scaled.make_definite(attempt)
         if not scaled.is_representable:
             message = "the scaled program has numbers that overflow; the backend was not called"
             return best or BackendResult(Status.NUMERICAL_ERROR, message, work)
-        eps = min(max(FIRST_TOLERANCE * SECOND_TOLERANCE**attempt * tol, min_eps), 1e-2)
+        eps = min(max((SECOND_TOLERANCE if attempt else first_tolerance) * tol, min_eps), 1e-2)
         gap = SECOND_GAP if attempt else eps
-        limits = Limits(eps, gap, max_iter - work.get("iterations", 0), deadline.get_remaining_seconds())
-        answer = _call_backend_once(scaled, start, call, limits, dict(settings))
+        left = max_iter - work.get("iterations", 0)
+        limits = Limits(
+            eps, gap, left if attempt else min(left, call_iterations), deadline.get_remaining_seconds()
+        )
+        begin = None if start is None else program.scale_point(*start)
+        answer = _call_backend_once(scaled, begin, call, limits, dict(settings))
         work = sum_work_counts((work, {"backend_calls": 1}, answer.work))
         message = answer.message
         if scaled.shift:
@@ -140,18 +149,22 @@ def call_backend_until_accepted(
                 f"{message}; {scaled.shift:.1g} was added to the diagonal of the singular P, in scaled units"
             )
         result = BackendResult(answer.status, message, work, shift=scaled.shift)
-        accepted = False
+        accepted = is_unfounded = False
+        if answer.status is Status.INFEASIBLE:
+            is_unfounded = not attempt and not scaled.is_nearly_proven_unsolvable(answer.x, answer.lam)
         if answer.x is not None and answer.lam is not None:
             point = program.restore_point(answer.x, answer.lam)
             result.point = point
-            accepted = judge.accepts(*point)
+            accepted = not is_unfounded and judge.accepts(*point)
         is_better = best is None or accepted or best.status in (Status.NUMERICAL_ERROR, Status.TIME_LIMIT)
         if is_better or answer.status in OUT_OF_BUDGET:
             best = result
         assert best is not None
         best.work = work
-        out_of_budget = work.get("iterations", 0) >= max_iter or deadline.has_passed()
-        if accepted or out_of_budget or answer.status in (*OUT_OF_BUDGET, Status.INFEASIBLE):
+        used = work.get("iterations", 0)
+        is_last = used >= max_iter or deadline.has_passed() or (answer.status in FINAL and not is_unfounded)
+        # A limit of iterations in `settings` ends both calls.
+        if accepted or is_last or (answer.status is Status.MAX_ITERATIONS and used < call_iterations):
             break
     assert best is not None
     if best.iterations > max_iter:

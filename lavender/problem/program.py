@@ -56,7 +56,7 @@ from lavender.problem.generalized import (
 )
 from lavender_ext.core.assemble import dense_to_csr, mirror_lower_triangle, stack_csr_matrices
 from lavender_ext.judge.measure import all_finite
-from lavender_ext.judge.program import judge_program
+from lavender_ext.judge.program import equilibrate_program, judge_program
 
 IntArray = npt.NDArray[np.int32]
 IntpArray = npt.NDArray[np.intp]
@@ -121,11 +121,6 @@ class QPSolution:
         conflict = f"; CONTRADICTED: {conflict}" if conflict else ""
         return f"{verdict}: {status}error {self.error:.1e}, objective {self.objective:.6g}{conflict}"
 
-    @cached_property
-    def _judged(self) -> tuple[Any, ...]:
-        """Result of `judge_program` for x and the multipliers."""
-        return self.qp.judge(self.x, self.qp.select_row_multipliers(self.impulse))
-
     @property
     def objective(self) -> float:
         """Objective 1/2 x.P x + q.x."""
@@ -135,33 +130,39 @@ class QPSolution:
     @property
     def primal_residual(self) -> float:
         """Largest violation of a row: |A x - b|, G x - h, lb - x, x - ub."""
-        return float(self._judged[6])
+        qp = self.qp
+        slack = qp.generalized.jac @ self.x - qp.target
+        return float(np.append(np.abs(slack[: qp.free]), -slack[qp.free :]).max(initial=0.0))
 
     @property
     def dual_residual(self) -> float:
         """Maximum of |P x + q + A^T y + G^T z + z_box| and of -z."""
-        return float(self._judged[7])
+        qp, lam = self.qp, self.qp.select_row_multipliers(self.impulse)
+        residual = qp.generalized.momentum_of(self.x) + qp.q - qp.generalized.jac.T @ lam
+        return float(np.append(np.abs(residual), -lam[qp.free :]).max(initial=0.0))
 
     @property
     def duality_gap(self) -> float:
         """Duality gap |x.P x + q.x + b.y + h.z + bounds.z_box|."""
-        return float(self._judged[8])
+        qp, lam = self.qp, self.qp.select_row_multipliers(self.impulse)
+        return float(abs(self.x @ (qp.generalized.momentum_of(self.x) + qp.q) - qp.target @ lam))
 
-    @property
+    @cached_property
     def error(self) -> float:
-        """Largest error of a row or a column, each relative to its own terms; 0 for an exact solution.
+        """Error of x and the multipliers, relative to the terms of the program's rows and columns; 0 if exact.
 
-        - Row i, with right-hand side t_i: its violation divided by |t_i|. The rows of A and all active inequalities
-          count like equations.
-        - Column j: |P x + q + A^T y + G^T z + z_box|_j divided by |q_j|.
-        - An inequality is active if its multiplier, relative to its columns, exceeds its slack, relative to the row's
-          terms. Otherwise its multiplier counts as 0.
+        It is the largest of three numbers, for all constraints as rows J x = t or J x >= t with multipliers lambda:
 
-        If t_i or q_j is 0, the divisor is the largest term of the row or column, but at least 1e-3 of the size of its
-        variables or multipliers. Rounding errors of the sums count as 0. `lavender_ext/judge/program.pyx` has all
-        formulas.
+        - Row i, if it is an equation, active or violated: |J x - t|_i / (|J| |x| + |t|)_i.
+        - Column j: |P x + q - J^T lambda|_j / (|P| |x| + |q|)_j.
+        - Gap: the sum of |lambda_i (J x - t)_i| and |x_j (P x + q - J^T lambda)_j|, divided by
+          |x|.|P| |x| + |q|.|x|.
+
+        An inequality is active if its multiplier, relative to its columns, exceeds its slack, relative to its row;
+        otherwise its multiplier counts as 0. Rounding errors of the sums count as 0, and no divisor is a rounding
+        error: `lavender_ext/judge/program.pyx` has the formulas.
         """
-        return float(self._judged[0])
+        return float(self.qp.judge(self.x, self.qp.select_row_multipliers(self.impulse))[0])
 
     @property
     def found(self) -> bool:
@@ -256,7 +257,16 @@ class QuadraticProgram:
 
     def judge(self, x: FloatArray, multipliers: FloatArray) -> tuple[Any, ...]:
         """Judge x (n,) and the multipliers (m,) of the rows: `judge_program`."""
-        return judge_program(self.hessian, self.q, self.jacobian, self.target, multipliers, x, self.free)
+        return judge_program(
+            self.hessian, self.q, self.jacobian, self.target, self.scales, multipliers, x, self.free
+        )
+
+    @cached_property
+    def scales(self) -> tuple[FloatArray, FloatArray, float, float]:
+        """Scales D (n,), E (m,), sigma and c of `equilibrate_program`."""
+        return equilibrate_program(
+            self.hessian, self.q, self.jacobian, self.target, self.variable_of_row, self.free
+        )
 
     def with_vectors(self, q: Any = None, h: Any = None, b: Any = None) -> QuadraticProgram:
         """Return the program with another q (n,), h (mi,) or b (me,); its matrices are shared, and h stays infinite."""

@@ -183,7 +183,7 @@ class _Task:
         self.qp = problem.qp
         self.start = None if start is None else problem.impulse_array(start)
         self.program = get_program(self.qp)
-        self.judge = ProgramJudge(self.program, max(tol, MIN_TOL))
+        self.judge = ProgramJudge(self.program, max(tol, MIN_TOL), deadline)
         self.runs: list[Run] = []
         self.rays: list[FloatArray] = []  # Multipliers of claims of infeasibility.
         self.proof: Proof | None = None
@@ -201,8 +201,8 @@ class _Task:
         if self.judge.x is None:  # Without a point, x = 0 is judged.
             self.judge.keep(np.zeros(len(self.qp.q)), np.zeros(len(self.qp.target)))
         is_stopped = self.runs[-1].status is Status.INTERRUPTED
-        # A point that only the allowance for rounding accepts is no solution if no solution exists.
-        if not self.judge.raw <= self.judge.tol and not is_stopped and self._may_search():
+        # Large x makes the violations of rows that contradict each other small: a proof has precedence.
+        if not self.judge.strict_error <= self.judge.tol and not is_stopped and self._may_search():
             self._search_proofs()
         return self._make_answer(begun)
 
@@ -245,8 +245,7 @@ class _Task:
         if self.start is not None and solver.backend.starts:
             start = self.qp.recover_variables(self.start), self.qp.select_row_multipliers(self.start)
             start = start if np.isfinite(start[0]).all() else None
-        budget = spec.max_iter if self.max_iter is None else self.max_iter
-        judge, result = solver.solve_program(self.qp, self.judge.tol, budget, self.deadline, start)
+        judge, result = solver.solve_program(self.qp, self.judge.tol, self.max_iter, self.deadline, start)
         if judge.error < self.judge.error or self.judge.x is None:
             self.judge = judge
         if result.status is INFEASIBLE and result.point is not None:
@@ -297,7 +296,7 @@ class _Task:
         self.proof = self.proof or find_infeasibility_proof(
             self.problem, self.program, rays[-1] if rays else None, self.deadline
         )
-        if self.proof is None and self.qp.is_singular and not judge.error <= self.tol:
+        if self.proof is None and self.qp.is_singular:
             found = find_ray(self.program, judge.x, self.deadline)
             if found is not None:
                 self.ray, point = mark_read_only(found[0]), found[1]
