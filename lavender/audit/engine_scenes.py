@@ -20,7 +20,6 @@ from __future__ import annotations
 import os
 import runpy
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +32,7 @@ from lavender.io.genesis import from_genesis
 from lavender.io.kamino import from_kamino
 from lavender.io.newton_mujoco import NEWTON_ADVICE, from_newton_mujoco
 from lavender.io.start_states import check_array_names
-from lavender.io.stored import Archive, read_first_bytes
+from lavender.io.stored import read_arrays
 
 CLAIM_ENGINES = ("kamino", "newton-mujoco", "genesis")
 DEFAULT_TIME_STEP = 0.01  # [s] Scenes of newton do not define a time step.
@@ -122,10 +121,8 @@ def read_engine_states(source: Any, names: tuple[str, ...]) -> EngineState:
     """
     label = "states"
     if isinstance(source, (str, os.PathLike)):
-        read_first_bytes(source)  # Raises an error if `source` is not a regular file.
         label = f"states {os.fspath(source)}"
-        with closing(Archive(source)) as archive:
-            source = dict(archive)
+        source = read_arrays(source)
     if not isinstance(source, Mapping):
         raise InputError(
             f"states is a {type(source).__name__}; the path of an .npz, or a dict of arrays, is needed"

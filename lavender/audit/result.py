@@ -28,7 +28,7 @@ from lavender.base.arrays import FloatArray, check_choice
 from lavender.base.errors import InputError
 from lavender.io import read
 from lavender.io.npz import write_npz
-from lavender.io.stored import lock_step_folder, write_arrays
+from lavender.io.stored import prepare_step_folder, write_arrays
 from lavender.judge.residuals import AT_FLOOR, CLOSE, DEFAULT_THRESHOLD, UNCONVERGED, WRONG
 from lavender.report.figures import Curve, Figure
 from lavender.report.render import Section
@@ -497,9 +497,9 @@ class Audit:
         `state` is their mjSTATE_INTEGRATION.
         """
         folder = Path(folder)
-        with lock_step_folder(folder / "worst", replace=True) as worst:
-            for i, w in enumerate(self.worst, 1):
-                write_npz(w.problem, worst / f"worst_{i}.npz", impulse=w.impulse)
+        worst = prepare_step_folder(folder / "worst", replace=True)
+        for i, w in enumerate(self.worst, 1):
+            write_npz(w.problem, worst / f"worst_{i}.npz", impulse=w.impulse)
         self.save_states("worst", folder / "states.npz")
         records = dict(zip(WORST_ROW_ERRORS, self.numbers, strict=True))
         records |= {"verdict": self.verdict, "verdicts": np.array(AUDIT_VERDICTS)}

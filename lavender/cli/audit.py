@@ -20,7 +20,7 @@ from lavender.cli.options import (
     reject_options_without_effect,
     threshold_option,
 )
-from lavender.io.stored import lock_output
+from lavender.io.stored import check_writable
 
 
 @click.command()
@@ -82,7 +82,7 @@ def audit(
     if limit is not None and not limit >= 0.0:
         raise InputError(f"--max-velocity-error is {limit}; a velocity error in m/s is needed")
     reject_options_without_effect(context, other_engine=engine != "mujoco")
-    context.with_resource(lock_output(out, folder=True))
+    check_writable(out, folder=True)
     limit_to_one_thread()
     with explain_early_interrupt("the first step"), show_progress() as watch:
         result = run(

@@ -28,7 +28,7 @@ from lavender.cli.options import (
     reject_options_without_effect,
 )
 from lavender.io.start_states import MODEL_SUFFIXES
-from lavender.io.stored import lock_output, write_text
+from lavender.io.stored import check_writable, write_text
 
 
 @click.command(cls=MultiValueCommand)
@@ -95,7 +95,7 @@ def report(
         if not (math.isfinite(limit) and limit > 0.0):
             raise InputError(f"time budget {limit} is not positive; a positive number of seconds is needed")
     _reject_unused_options(context, files, options)
-    context.with_resource(lock_output(out, folder=True))
+    check_writable(out, folder=True)
     used_folders: set[Path] = set()
     recording = {name: options[name] for name in RECORDING_NAMES}
     files = tuple(_record_model(f, out, used_folders, not options["no_reuse"], recording) for f in files)

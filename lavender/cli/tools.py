@@ -24,7 +24,7 @@ from lavender.cli.options import (
     recording_options,
     reject_options_without_effect,
 )
-from lavender.io.stored import lock_output
+from lavender.io.stored import check_writable
 
 
 @click.command()
@@ -229,6 +229,6 @@ def export(context: click.Context, kind: str, folder: Path, replace: bool) -> No
     """
     from lavender.export import library
 
-    context.with_resource(lock_output(folder, folder=True))  # Lock the folder before the long computation.
+    check_writable(folder, folder=True)
     written = library.write(folder, replace=replace)
     print_escaped(f"{len(written)} files in {folder}: {', '.join(p.name for p in written)}")

@@ -10,7 +10,7 @@ import click
 from lavender.base.exits import EXIT_UNMET
 from lavender.cli.measuring import explain_early_interrupt, show_page, show_progress
 from lavender.cli.options import FILE, FOLDER, add_worlds_options, limit_to_one_thread, threshold_option
-from lavender.io.stored import lock_output
+from lavender.io.stored import check_writable
 
 
 @click.command()
@@ -44,7 +44,7 @@ def tune(context: click.Context, /, model: Path, out: Path, no_reuse: bool, **op
     """
     from lavender.audit.tune import tune as run
 
-    context.with_resource(lock_output(out, folder=True))
+    check_writable(out, folder=True)
     limit_to_one_thread()
     with explain_early_interrupt("the present setting on the first steps"), show_progress() as watch:
         tuning = run(model, watch=watch, folder=out, reuse=not no_reuse, **options)

@@ -32,7 +32,7 @@ from lavender.io.npz import Stored, read_npz, write_npz
 from lavender.io.pinocchio import from_pinocchio
 from lavender.io.recorder import Recorder, StepVerdict, read_recorded_state
 from lavender.io.recording import Recording, record
-from lavender.io.stored import HDF5, MAX_BYTES, as_path, read_first_bytes
+from lavender.io.stored import HDF5, as_path, read_first_bytes
 from lavender.problem import Problem
 
 __all__ = [
@@ -64,7 +64,7 @@ __all__ = [
 __dir__ = sorted(__all__).copy  # Completion shows public names only.
 
 
-def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
+def read(path: str | os.PathLike[str]) -> Stored:
     """Read everything that a file holds: the problem, its stored solution, guesses, and the quantities to compare.
 
     The format is determined from the content, not from the suffix.
@@ -72,10 +72,6 @@ def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
     Parameters
     ----------
     path : path
-    max_bytes : int, default 2^31
-        Limit of the total size of the arrays. A file that needs more is rejected before any array is allocated. The
-        size in memory counts, with numbers as float64 and a global FCLIB problem condensed. While an entry is
-        converted, two copies of it exist.
 
     Returns
     -------
@@ -88,9 +84,9 @@ def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
     """
     start = read_first_bytes(path)
     if start[:2] == b"PK":
-        return read_npz(path, max_bytes=max_bytes)
+        return read_npz(path)
     if start == b"\x89HDF\r\n\x1a\n":
-        return fclib.read(path, max_bytes=max_bytes)
+        return fclib.read(path)
     content = f"starts with {start!r}" if start else "is empty"
     needed = "an .npz archive or an HDF5 file is needed"
     if os.fspath(path).lower().endswith(".xml"):
@@ -98,14 +94,14 @@ def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
     raise InputError(f"{path} {content}; {needed}")
 
 
-def load(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Problem:
+def load(path: str | os.PathLike[str]) -> Problem:
     """Return the problem in a file; see `read`."""
-    return read(path, max_bytes=max_bytes).problem
+    return read(path).problem
 
 
-def load_solution(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> FloatArray | None:
+def load_solution(path: str | os.PathLike[str]) -> FloatArray | None:
     """Return the solution (m,) [N s] stored with a problem, or None; see `read`."""
-    return read(path, max_bytes=max_bytes).impulse
+    return read(path).impulse
 
 
 def save(

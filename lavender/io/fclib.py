@@ -25,7 +25,7 @@ from lavender.base.lazy_import import sparse as sp
 from lavender.base.lu import factor_sparse_lu
 from lavender.io.hdf5 import HDF5Reader, import_h5py, write_array, write_matrix
 from lavender.io.npz import Stored
-from lavender.io.stored import MAX_BYTES, NUMBER_BYTES, Budget, write_bytes
+from lavender.io.stored import write_bytes
 from lavender.problem import Problem
 from lavender.problem.cones import Cones
 from lavender.problem.generalized import Generalized
@@ -39,8 +39,8 @@ PARTS = {
     GLOBAL: {"H": "nm", "M": "nn", "G": "np", "f": "n", "w": "m", "b": "p", "mu": "c", "mu_r": "c"},
 }
 DENSE_CHUNK_NUMBERS = 2**23  # At most this many entries of M^-1 J^T or A are held densely at a time (64 MiB).
-SPARSE_ENTRY_BYTES = 16  # [bytes] One entry of a sparse matrix: value and index.
-BOUNDS_ROW_BYTES = 64  # [bytes] Memory that `Cones` and b need per row.
+# Factors of M with more entries than this (in dense storage) are not computed: 2 GiB of values and indices.
+MAX_MASS_FACTOR_ENTRIES = 2**27
 
 
 class Contents(NamedTuple):
@@ -69,7 +69,7 @@ class Contents(NamedTuple):
     info: Mapping[str, str] = MappingProxyType({})
     compare: str = ""
 
-    def build_problem(self, name: str = "", *, max_bytes: int = MAX_BYTES) -> Problem:
+    def build_problem(self, name: str = "") -> Problem:
         """Return the problem.
 
         A global problem is returned in generalised coordinates (J = H^T), or as A and b if M is not a mass matrix.
@@ -77,7 +77,7 @@ class Contents(NamedTuple):
         Raises
         ------
         InputError
-            M is singular, array sizes do not agree, or A may need more than `max_bytes`.
+            M is singular, array sizes do not agree, or the factors of M would be too large.
         """
         x, a, general = self.parts, None, None
         if self.group.startswith(LOCAL):
@@ -88,13 +88,13 @@ class Contents(NamedTuple):
             # The rows of J = [H G]^T are the contact rows and the equations.
             jt = sp.csr_array(sp.hstack([x["H"], x["G"]])) if "G" in x else x["H"]
             offset = np.append(x["w"], x["b"]) if "b" in x else x["w"]
-            general = _build_generalised_form(x["M"], jt, x["f"], max_bytes)
+            general = _build_generalised_form(x["M"], jt, x["f"])
             if general is not None:
                 b = general.bias(-offset)
             elif x["M"].shape[0] == 0:
                 a, b = sp.csr_array((len(offset), len(offset))), -offset
             else:
-                a, free_velocity = form_dense_a(x["M"], jt, x["f"], Budget(max_bytes))
+                a, free_velocity = form_dense_a(x["M"], jt, x["f"])
                 b = -(offset + free_velocity)
         mu, mu_r, d = x["mu"], x.get("mu_r"), self.spacedim
         cones = Cones.contacts(mu, d - 1 if mu_r is None else 2, rolling=mu_r) + Cones.free(
@@ -108,9 +108,7 @@ def _join_impulse(point: Mapping[str, FloatArray]) -> FloatArray:
     return np.concatenate([point["r"], point["l"]]) if "l" in point else point["r"]
 
 
-def _build_generalised_form(
-    mass: sp.csr_array, jt: sp.csr_array, f: FloatArray, max_bytes: int
-) -> Generalized | None:
+def _build_generalised_form(mass: sp.csr_array, jt: sp.csr_array, f: FloatArray) -> Generalized | None:
     """Return the generalised form, or None if M (n, n) is not a mass matrix of bodies.
 
     M does not count as a mass matrix if it is asymmetric or not positive definite, or if a connected component of it is
@@ -118,8 +116,7 @@ def _build_generalised_form(
     """
     if mass.shape[0] == 0:
         return None
-    size = np.bincount(sp.csgraph.connected_components(mass, directed=False)[1]).astype(float)
-    if 4 * SPARSE_ENTRY_BYTES * float(size @ size) > max_bytes:
+    if 4 * _bound_factor_entries(mass) > MAX_MASS_FACTOR_ENTRIES:
         return None
     try:
         general = Generalized(jt.T.tocsr(), mass, np.zeros(mass.shape[0]))
@@ -128,21 +125,25 @@ def _build_generalised_form(
         return None
 
 
-def form_dense_a(
-    mass: sp.csr_array, jt: sp.csr_array, f: FloatArray, budget: Budget
-) -> tuple[sp.csr_array, FloatArray]:
+def _bound_factor_entries(mass: sp.csr_array) -> float:
+    """Return the number of entries of the factors of M: up to n^2 of a connected component of n unknowns."""
+    size = np.bincount(sp.csgraph.connected_components(mass, directed=False)[1]).astype(float)
+    return float(size @ size)
+
+
+def form_dense_a(mass: sp.csr_array, jt: sp.csr_array, f: FloatArray) -> tuple[sp.csr_array, FloatArray]:
     """Return A = J M^-1 J^T (m, m) and J M^-1 f (m,) for M (n, n), J^T (n, m) and f (n,).
 
     Raises
     ------
     InputError
-        M is singular, or the matrices may need more memory than the budget allows.
+        M is singular, or its factors would be too large.
     """
-    label = sp.csgraph.connected_components(mass, directed=False)[1]
-    budget.reserve_bytes(SPARSE_ENTRY_BYTES * bound_condensed_entries(label, jt), "A = H^T M^-1 H")
-    size = np.bincount(label).astype(float)
-    # The factors of a connected component of n unknowns have up to n^2 entries.
-    budget.reserve_bytes(SPARSE_ENTRY_BYTES * int(size @ size), "the factors of M")
+    entries = _bound_factor_entries(mass)
+    if entries > MAX_MASS_FACTOR_ENTRIES:
+        raise InputError(
+            f"the factors of M may have {entries:.3g} entries; at most {MAX_MASS_FACTOR_ENTRIES} are computed"
+        )
     try:
         solve = factor_sparse_lu(mass).solve
     except RuntimeError as error:
@@ -159,23 +160,10 @@ def form_dense_a(
     return a, j @ solve(f)
 
 
-def bound_condensed_entries(label: np.ndarray, jt: sp.csr_array) -> int:
-    """Return an upper bound of the number of entries of J M^-1 J^T; `label` (n,) holds the connected component of M.
-
-    Two rows of J are coupled only if they touch the same component: a component that r rows touch contributes at
-    most r^2 entries.
-    """
-    m = jt.shape[1]
-    part = np.repeat(label.astype(np.int64), np.diff(jt.indptr))
-    touched = np.unique(part * m + jt.indices) // m if len(part) else part
-    rows = np.bincount(touched, minlength=1).astype(float)
-    return int(min(rows @ rows, float(m) ** 2))
-
-
 # -- reading --------------------------------------------------------------------------------------
 
 
-def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
+def read(path: str | os.PathLike[str]) -> Stored:
     """Read the problem, the solution and the guesses of an FCLIB file.
 
     A file with both forms is read in its local form. The first guess becomes `problem.guess`.
@@ -189,7 +177,7 @@ def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
     h5py = import_h5py()
     try:
         with h5py.File(path, "r") as stream:
-            file = _read_file(HDF5Reader(h5py, stream, max_bytes))
+            file = _read_file(HDF5Reader(h5py, stream))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except (OSError, KeyError, RuntimeError, ValueError, TypeError, OverflowError, MemoryError) as error:
@@ -197,7 +185,7 @@ def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
             f"{path} cannot be read as HDF5 ({error}); the file is damaged or not an HDF5 file: write it again"
         ) from None
     try:
-        problem = file.build_problem(Path(path).stem, max_bytes=max_bytes)
+        problem = file.build_problem(Path(path).stem)
         guesses = tuple(problem.impulse_array(_join_impulse(g), "guess") for g in file.guesses)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
@@ -214,7 +202,7 @@ def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
 
 
 def _read_file(r: HDF5Reader) -> Contents:
-    """Read an open file; check all lengths and the memory limit before reading numbers."""
+    """Read an open file; check all lengths before reading numbers."""
     present = [name for name in (LOCAL, GLOBAL, LOCAL + ROLLING, GLOBAL + ROLLING) if r.has_path(name)]
     if not present:
         found = ", ".join(list(r.file)[:8]) or "nothing"
@@ -252,16 +240,9 @@ def _read_file(r: HDF5Reader) -> Contents:
     parts = {name: shape for name, shape in PARTS[LOCAL if local else GLOBAL].items() if name not in absent}
     shapes: dict[str, Any] = {name: tuple(size[x] for x in shape) for name, shape in parts.items()}
     matrices, names = ([name for name in shapes if len(shapes[name]) == k] for k in (2, 1))
-    # Check lengths first, then the memory limit, then read the numbers.
     for name in names:
         r.find_dataset(f"{vectors}/{name}", "iuf", shapes[name][0])
-    r.budget.reserve_bytes(BOUNDS_ROW_BYTES * (m + p), f"{m + p} rows")
-    for name in matrices:
-        r.budget.reserve_bytes(NUMBER_BYTES * (shapes[name][0] + 1), f"{group}/{name}")
-        r.reserve_memory(f"{group}/{name}/{part}" for part in ("p", "i", "x"))
-    r.reserve_memory(f"{vectors}/{name}" for name in names)
     guesses = _list_guess_groups(r)
-    r.reserve_memory(f"{point}/{name}" for point in ("solution", *guesses) for name in "ruvl")
     values: dict[str, Any] = {name: r.read_matrix(f"{group}/{name}", shapes[name]) for name in matrices}
     values |= {name: r.read_vector(f"{vectors}/{name}", shapes[name][0]) for name in names}
     return Contents(

@@ -1,9 +1,7 @@
-"""Read and write datasets and sparse matrices of HDF5 files: memory is bounded before anything is read."""
+"""Read and write datasets and sparse matrices of HDF5 files."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -12,54 +10,29 @@ from lavender.base.arrays import FloatArray, as_array
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import sparse as sp
 from lavender.io.npz import build_checked_csr
-from lavender.io.stored import NUMBER_BYTES, Budget
-
-MAX_SCALAR_CHUNK_NUMBERS = 2**17  # A scalar stored in an HDF5 chunk of more numbers than this is rejected.
 
 
 class HDF5Reader:
-    """Reader of the datasets of one HDF5 file; it follows no links out of the file and respects the memory limit."""
+    """Reader of the datasets of one HDF5 file."""
 
-    def __init__(self, h5py: Any, file: Any, max_bytes: int) -> None:
-        self.h5py, self.file, self.budget = h5py, file, Budget(max_bytes)
+    def __init__(self, h5py: Any, file: Any) -> None:
+        self.h5py, self.file = h5py, file
 
     def find_node(self, path: str) -> Any:
         """Return the group or dataset at a path, or None."""
-        node = self.file
-        for part in path.split("/"):
-            if not isinstance(node, self.h5py.Group):
-                return None
-            link = node.get(part, getlink=True)
-            if link is None:
-                return None
-            if not isinstance(link, self.h5py.HardLink):
-                raise InputError(
-                    f"{path} is a {type(link).__name__} to another place, and links are not followed: store "
-                    "the data in the file itself"
-                )
-            node = node[part]
+        node = self.file.get(path)
+        # HDF5 would read beyond the end of a chunk that is shorter than its checksum of 4 bytes.
         if (
             isinstance(node, self.h5py.Dataset)
             and node.fletcher32
-            and node.id.chunk_iter(_stop_at_short_chunk)
+            and node.id.chunk_iter(lambda chunk: True if chunk.size < 4 else None)
         ):
-            raise InputError(
-                f"{path} has a chunk that is shorter than its checksum, so numbers are missing; the file is "
-                "damaged: write or copy it again"
-            )
+            raise InputError(f"{path} has an incomplete chunk; the file is damaged: write or copy it again")
         return node
 
     def has_path(self, path: str) -> bool:
         """Return whether the path exists."""
         return self.find_node(path) is not None
-
-    def reserve_memory(self, paths: Iterable[str]) -> None:
-        """Subtract the memory that these datasets need, if they exist, from the budget."""
-        for path in paths:
-            data = self.find_node(path)
-            if isinstance(data, self.h5py.Dataset) and data.shape is not None:
-                chunk = _get_chunk_length(data) * data.dtype.itemsize
-                self.budget.reserve_bytes(data.size * max(NUMBER_BYTES, data.dtype.itemsize) + chunk, path)
 
     def find_dataset(self, path: str, kinds: str, count: int | None = None) -> Any:
         """Return a dataset of `count` numbers (None: any number) without reading it."""
@@ -67,11 +40,6 @@ class HDF5Reader:
         if not isinstance(data, self.h5py.Dataset):
             raise InputError(
                 f"{path} {'is a group' if data is not None else 'is missing'}; a dataset is needed"
-            )
-        if data.is_virtual or data.external:
-            raise InputError(
-                f"{path} stores its numbers in other files, which are not read: store the numbers in the "
-                "file itself"
             )
         if data.dtype.kind not in kinds or data.shape is None:
             wanted = "whole numbers" if kinds == "iu" else "numbers"
@@ -86,13 +54,7 @@ class HDF5Reader:
 
     def read_integer(self, path: str) -> int:
         """Read a single 32-bit integer."""
-        data = self.find_dataset(path, "iu", 1)
-        if _get_chunk_length(data) > MAX_SCALAR_CHUNK_NUMBERS:
-            raise InputError(
-                f"{path} is one number stored in a chunk of {_get_chunk_length(data)}; up to "
-                f"{MAX_SCALAR_CHUNK_NUMBERS} are read: write it without chunks"
-            )
-        value = int(np.asarray(data[()]).reshape(-1)[0])
+        value = int(self.read_array(path, "iu", 1)[0])
         if not -(2**31) <= value < 2**31:
             raise InputError(f"{path} is {value}; a signed 32-bit integer is needed")
         return value
@@ -105,8 +67,6 @@ class HDF5Reader:
         """Read a text; return an empty one if the dataset does not exist or is not a short single text."""
         data = self.find_node(path)
         if not isinstance(data, self.h5py.Dataset) or data.size != 1 or data.nbytes > 2**20:
-            return ""
-        if _get_chunk_length(data) > MAX_SCALAR_CHUNK_NUMBERS:
             return ""
         value = data[()]
         value = value.flat[0] if isinstance(value, np.ndarray) else value
@@ -149,19 +109,6 @@ class HDF5Reader:
             raise InputError(f"{path}: {error}") from None
         as_array(f"{path}/x", a.data, (None,), copy=False)
         return a
-
-
-def _get_chunk_length(data: Any) -> int:
-    """Return the length of a dataset's chunks: HDF5 decompresses whole chunks, even if fewer numbers are read."""
-    return math.prod(data.chunks) if data.chunks else 0
-
-
-def _stop_at_short_chunk(chunk: Any) -> bool | None:
-    """Return True if a chunk is shorter than its checksum of 4 bytes, else None, which continues the iteration.
-
-    HDF5 would read beyond the end of such a chunk.
-    """
-    return True if chunk.size < 4 else None
 
 
 def _build_from_triplets(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -18,8 +18,8 @@ from lavender.base.arrays import FloatArray, as_array, check_int
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import issparse
 from lavender.base.lazy_import import sparse as sp
-from lavender.io.stored import MAX_BYTES, Archive, write_arrays
-from lavender.problem import PRECISIONS, Problem, check_problem
+from lavender.io.stored import Arrays, read_arrays, write_arrays
+from lavender.problem import Problem, check_problem
 from lavender.problem.cones import Cones, get_block_kinds
 from lavender.problem.generalized import Generalized
 from lavender.problem.program import recover_program
@@ -33,7 +33,7 @@ GENERALIZED = (
     "general_v_free",
 )
 CSR = ("A_data", "A_indices", "A_indptr", "A_shape")
-OPTIONAL = ("cones_rolling", "guess", "key", "impulse")
+FORMS = ("dense", "csr", "rows", "generalized")
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,25 +65,22 @@ class Stored:
     info: Mapping[str, str] = field(default_factory=dict)
 
 
-def read_npz(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
+def read_npz(path: str | os.PathLike[str]) -> Stored:
     """Read a problem from an .npz archive of any layout that `docs/formats.md` lists.
 
     Raises
     ------
     InputError
-        The archive is damaged, of another layout, or larger than `max_bytes` in memory.
+        The archive is damaged or of another layout.
     """
-    archive = Archive(path, max_bytes)
+    archive = read_arrays(path)
     try:
         if "lavender_format" in archive:
             return _read_own_format(archive)
         if {"b", "lo", "hi"} <= set(archive):
-            return _read_box_format(archive)
+            return _read_box_format(archive, Path(path).stem)
     except InputError as error:
-        text = str(error)
-        raise InputError(text if text.startswith(str(path)) else f"{path}: {text}") from None
-    finally:
-        archive.close()
+        raise InputError(f"{path}: {error}") from None
     has = ", ".join(archive) or "nothing"
     raise InputError(
         f"{path} holds the entries {has}; a problem has lavender_format (written by lavender.io.save), or "
@@ -140,7 +137,7 @@ def write_npz(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = 
     write_arrays(path, arrays)
 
 
-def _read_own_format(archive: Archive) -> Stored:
+def _read_own_format(archive: Arrays) -> Stored:
     """Read a problem in our own format."""
     version = archive.read_scalar("lavender_format")
     if version != FORMAT_VERSION or isinstance(version, bool):
@@ -148,31 +145,21 @@ def _read_own_format(archive: Archive) -> Stored:
             f"lavender_format is {version!r}; this lavender reads {FORMAT_VERSION}: update it, or save again"
         )
     meta = _read_meta(archive)
-    operator = {
-        "dense": ("A",),
-        "csr": CSR,
-        "rows": (*ROWS, "compliance"),
-        "generalized": (*GENERALIZED, "compliance"),
-    }[meta["operator"]]
-    needed = ("lavender_format", "meta", "b", *CONES, *operator)
-    _check_entries(archive, needed, OPTIONAL)
     for name in archive:
         if archive[name].dtype.kind not in "iuf":
             raise InputError(f"entry {name!r} has dtype {archive[name].dtype}; numbers are needed")
     b, ptr = archive["b"], archive["cones_ptr"]
-    if b.ndim != 1:
-        raise InputError(f"b has shape {b.shape}; one dimension is needed")
     # Check the number of rows before bounds of that length are allocated.
-    if ptr.ndim != 1 or len(ptr) == 0 or ptr[-1] != len(b):
+    if b.ndim != 1 or ptr.ndim != 1 or len(ptr) == 0 or ptr[-1] != len(b):
         raise InputError(f"b has shape {b.shape}; cones.ptr must end with the number of its rows")
-    parts: dict[str, Any] = {
-        name: archive[name] for name in ("guess", "key", "compliance") if name in archive
-    }
+    parts: dict[str, Any] = {name: archive[name] for name in ("guess", "key") if name in archive}
+    if meta["operator"] in ("rows", "generalized"):
+        parts["compliance"] = archive["compliance"]
     if meta["operator"] == "rows":
         fields_of_rows: dict[str, Any] = {name.removeprefix("rows_"): archive[name] for name in ROWS}
         parts["rows"] = Rows(**fields_of_rows)
     elif meta["operator"] == "generalized":
-        parts["generalized"] = _build_generalized(archive, meta["dof_names"])
+        parts["generalized"] = _build_generalized(archive, meta.get("dof_names"))
     else:
         parts["matrix"] = _read_matrix(archive)
     entries = [*CONES, *(["cones_rolling"] if "cones_rolling" in archive else [])]
@@ -185,7 +172,7 @@ def _read_own_format(archive: Archive) -> Stored:
     return Stored(problem, "lavender", impulse=_read_vector(archive, "impulse", problem))
 
 
-def _read_meta(archive: Archive) -> dict[str, Any]:
+def _read_meta(archive: Arrays) -> dict[str, Any]:
     """Read and check the entry 'meta', a JSON object."""
     try:
         meta = json.loads(archive["meta"].astype(np.uint8, casting="safe").tobytes())
@@ -197,30 +184,18 @@ def _read_meta(archive: Archive) -> dict[str, Any]:
     if not isinstance(meta, dict):
         raise InputError(f"entry 'meta' holds a {type(meta).__name__}; a JSON object is needed")
     needed = ("operator", "friction", "name", "names")
-    for name in needed:
-        if name not in meta:
-            raise InputError(f"entry 'meta' has no {name!r}; {', '.join(needed)} are needed")
-    if unknown := sorted(set(meta) - {*needed, "dof_names", "precision", "program"}):
-        raise InputError(f"entry 'meta' has the unknown names {', '.join(unknown)}: remove them")
-    operators = ("dense", "csr", "rows", "generalized")
-    for name, is_valid, requirement in (
-        ("operator", meta["operator"] in operators, " or ".join(operators)),
-        ("dof_names", ("dof_names" in meta) == (meta["operator"] == "generalized"),
-         "a list of names or null with the operator generalized, and nothing with other operators,"),
-        ("dof_names", _is_name_list(meta.get("dof_names")), "a list of names, or null,"),
-        ("name", isinstance(meta["name"], str), "a text"),
-        ("friction", isinstance(meta["friction"], str), "a text"),
-        ("names", _is_name_list(meta["names"]), "a list of names, or null,"),
-        ("precision", meta.get("precision", "float64") in PRECISIONS, " or ".join(PRECISIONS)),
-        ("program", type(meta.get("program", 0)) is int and ("program" not in meta or meta["operator"] == "csr"),
-         "a number of variables, with the operator csr,"),
-    ):  # fmt: skip
-        if not is_valid:
-            raise InputError(f"entry 'meta': {name} is {meta.get(name)!r:.60}; {requirement} is needed")
+    if missing := [name for name in needed if name not in meta]:
+        raise InputError(f"entry 'meta' has no {', '.join(missing)}; {', '.join(needed)} are needed")
+    is_valid = meta["operator"] in FORMS and ("program" not in meta or meta["operator"] == "csr")
+    if not is_valid:
+        raise InputError(
+            f"entry 'meta' has the operator {meta['operator']!r}; one of {', '.join(FORMS)} is needed, and csr "
+            "for a program"
+        )
     return meta
 
 
-def _build_generalized(archive: Archive, names: list[str] | None) -> Generalized:
+def _build_generalized(archive: Arrays, names: list[str] | None) -> Generalized:
     """Build the generalised form from its entries."""
     v_free = archive["general_v_free"]
     n, m = v_free.size, archive["b"].size
@@ -233,36 +208,16 @@ def _build_generalized(archive: Archive, names: list[str] | None) -> Generalized
     return Generalized(jac, mass, v_free, names)
 
 
-def _is_name_list(value: Any) -> bool:
-    return value is None or (isinstance(value, list) and all(isinstance(name, str) for name in value))
-
-
-def _check_entries(archive: Archive, needed: Collection[str], optional: Collection[str]) -> None:
-    """Raise InputError if entries are missing or unknown."""
-    missing = [name for name in needed if name not in archive]
-    if missing:
-        raise InputError(
-            f"the entries {', '.join(missing)} are missing; all entries of the format are needed: save the "
-            "problem again with lavender.io.save"
-        )
-    unknown = [name for name in archive if name not in needed and name not in optional]
-    if unknown:
-        raise InputError(
-            f"the entries {', '.join(unknown)} do not belong to format {FORMAT_VERSION} of this lavender: "
-            "remove them, or install the version that wrote the file"
-        )
-
-
 # -- plain box format --------------------------------------------------------------------------
 
 
-def _read_box_format(archive: Archive) -> Stored:
+def _read_box_format(archive: Arrays, name: str) -> Stored:
     """Read the box format: w = A l - b, lo <= l <= hi complementary to w; friction cones become contacts."""
     b = archive["b"]
     if b.ndim != 1:
         raise InputError(f"b has shape {b.shape}; one dimension is needed")
     cones = _build_box_cones(archive, len(b))
-    problem = Problem(b, cones, _read_matrix(archive), name=Path(archive.path).stem)
+    problem = Problem(b, cones, _read_matrix(archive), name=name)
     compare = archive.read_scalar("compare") if "compare" in archive else ""
     return Stored(
         problem,
@@ -273,7 +228,7 @@ def _read_box_format(archive: Archive) -> Stored:
     )
 
 
-def _build_box_cones(archive: Archive, m: int) -> Cones:
+def _build_box_cones(archive: Arrays, m: int) -> Cones:
     """Build the cones of the box format from bounds and, if given, contacts of 1 to 3 rows."""
     lower, upper = (as_array(f"entry {name!r}", archive[name], (m,), finite=False) for name in ("lo", "hi"))
     if "cone_start" not in archive or archive["cone_start"].size == 0:
@@ -311,11 +266,11 @@ def _build_box_cones(archive: Archive, m: int) -> Cones:
     )
 
 
-def _read_vector(archive: Archive, name: str, problem: Problem) -> FloatArray | None:
+def _read_vector(archive: Arrays, name: str, problem: Problem) -> FloatArray | None:
     return problem.impulse_array(archive[name], f"entry {name!r}") if name in archive else None
 
 
-def _read_matrix(archive: Archive) -> Any:
+def _read_matrix(archive: Arrays) -> Any:
     """Return the matrix A of an archive: the dense entry `A`, or a CSR matrix from entries with checked indices."""
     if "A" in archive:
         return archive["A"]

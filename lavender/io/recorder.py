@@ -12,7 +12,6 @@ of JSON for each (verdict, errors, the engine's claims), and `states` with the s
 
 from __future__ import annotations
 
-import contextlib
 import heapq
 import os
 import zipfile
@@ -23,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import check_bool, check_float, check_int, to_numpy
+from lavender.base.arrays import check_float, check_int, to_numpy
 from lavender.base.errors import InputError, LavenderError
 from lavender.batch.data import Batch
 from lavender.batch.residuals import residual_many
@@ -33,8 +32,8 @@ from lavender.io.stored import (
     ENGINE,
     STATES_FOLDER,
     format_json,
-    lock_step_folder,
     make_folder,
+    prepare_step_folder,
     write_arrays,
     write_text,
 )
@@ -88,7 +87,7 @@ class Recorder:
     Parameters
     ----------
     folder : path
-        Created if it does not exist. It is locked until `close`, or until the end of a `with` block.
+        Created if it does not exist.
     every : int, optional
         Record all worlds of every k-th step.
     keep_worst : int, default 0
@@ -131,8 +130,7 @@ class Recorder:
                 "or when="
             )
         self.when, self.solver, self.n_steps = when, solver, 0
-        self._stack = contextlib.ExitStack()
-        self.folder = self._stack.enter_context(lock_step_folder(folder, check_bool("replace", replace)))
+        self.folder = prepare_step_folder(folder, replace)
         self.lines: dict[str, dict[str, Any]] = {}  # Lines of `engine.jsonl` by file.
         # Heap of (velocity error, file) with the smallest error first.
         self._worst: list[tuple[float, str]] = []
@@ -150,9 +148,8 @@ class Recorder:
         self.close()
 
     def close(self) -> None:
-        """Release the folder's lock; the recording is complete after each `add`."""
+        """Reject further steps; the recording is complete after each `add`."""
         self._is_closed = True
-        self._stack.close()
 
     @property
     def files(self) -> tuple[str, ...]:

@@ -8,7 +8,6 @@ state is set. Quantities without an array have the values of a new MjData.
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import dataclasses
 import hashlib
@@ -24,7 +23,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray, as_array, check_int
 from lavender.base.errors import InputError
 from lavender.io.mujoco_memory import import_mujoco
-from lavender.io.stored import SUFFIXES, Archive, as_path, read_first_bytes
+from lavender.io.stored import SUFFIXES, as_path, read_arrays, read_first_bytes
 
 CONTROLS = ("zero", "random", "hold")
 Control = str | Callable[[Any, Any, int], Any] | Any
@@ -246,10 +245,8 @@ def read_states(mj: Any, model: Any, source: Any) -> StartStates:
         return _read_keyframes(mj, model)
     arrays, label = source if isinstance(source, Mapping) else {VECTOR: source}, "states"
     if isinstance(source, (str, os.PathLike)):
-        read_first_bytes(source)  # Raises an error if `source` is not a regular file.
         label = f"states {os.fspath(source)}"
-        with contextlib.closing(Archive(source)) as archive:
-            arrays = dict(archive)
+        arrays = read_arrays(source)
     states = _read_arrays(mj, model, arrays, label)
     return dataclasses.replace(states, misfit=_describe_misfit(mj, model, arrays, states))
 

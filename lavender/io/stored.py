@@ -1,8 +1,4 @@
-"""Files: paths, locks of outputs, atomic writing, and reading of NumPy archives (.npz).
-
-Nothing in an archive is executed or unpickled. The memory for all entries is computed from their headers before the
-first entry is read.
-"""
+"""Files: paths, atomic writing, and reading of NumPy archives (.npz) without pickle."""
 
 from __future__ import annotations
 
@@ -12,154 +8,60 @@ import json
 import math
 import os
 import stat
-import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from threading import get_native_id
 from tokenize import TokenError
-from typing import IO, Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.lib import format as npy
 
-from lavender.base.arrays import check_bool, check_int
-from lavender.base.errors import InputError, require_packages
+from lavender.base.arrays import check_bool
+from lavender.base.errors import InputError
 
 HDF5 = (".hdf5", ".h5", ".hdf")
 SUFFIXES = (".npz", *HDF5)  # Suffixes of problem files.
 ENGINE = "engine.jsonl"  # File of the engine's own results, in the folder of recorded problems.
 STATES_FOLDER = "states"  # Folder of the states before recorded steps, in the folder of recorded problems.
 
-# Default limit of the memory for the arrays of a file; a file of a megabyte can declare a terabyte.
-MAX_BYTES = 2**31
 # The name of a temporary file contains this many characters of the final name; names may have 255 bytes, and a
 # character up to four.
 TEMPORARY_NAME_CHARACTERS = 40
-# Name of the lock file of an output folder. The lock of an output file is FILE.lock.
-FOLDER_LOCK = ".lavender.lock"
-# Errors with which a file system without locks answers; an output on it is written without a lock.
-WITHOUT_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
-# [s] An output counts as locked if its lock is not obtained in this time, which allows several attempts.
-LOCK_TIMEOUT = 0.2
-NUMBER_BYTES = 8  # Bytes of a number in memory: float64, or an index before it is checked.
-
-MAX_NPY_HEADER_BYTES = 10_000  # [bytes] A longer .npy header is rejected; 100 bytes are usual.
-MAX_ARCHIVE_ENTRIES = 1000  # Largest accepted number of entries in an archive; a problem has up to 30.
-# Memory that Python objects need per byte of JSON text, at most; nested empty lists need 24.
-JSON_BYTES_PER_BYTE = 40
-# Compression methods that NumPy writes. Others are rejected: their memory use depends on parameters in the archive.
-ACCEPTED_COMPRESSION = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 #: Exceptions that zipfile and NumPy raise for damaged archives.
 READ_ERRORS = (
-    zipfile.BadZipFile,
-    zlib.error,
-    struct.error,
-    TokenError,
-    EOFError,
-    OSError,
-    RuntimeError,
-    NotImplementedError,
-    ValueError,
-    SyntaxError,
-    TypeError,
-    OverflowError,
-    MemoryError,
-    RecursionError,
-)
+    zipfile.BadZipFile, zlib.error, TokenError, EOFError, OSError, RuntimeError, ValueError, SyntaxError, TypeError,
+    OverflowError, MemoryError,
+)  # fmt: skip
 
 
-@contextlib.contextmanager
-def lock_step_folder(
-    path: str | os.PathLike[str], replace: bool = False, continued: bool = False
-) -> Iterator[Path]:
-    """Lock a folder for recorded problems, create it if necessary, and return its path until the block ends.
+def prepare_step_folder(path: str | os.PathLike[str], replace: bool = False, continued: bool = False) -> Path:
+    """Create a folder for recorded problems if necessary, and return its path.
 
     The folder must not hold problem files, because the steps of two recordings are not one sequence. `replace` removes
     the problem files and the engine's results. With `continued`, the files belong to the present recording and are
-    kept. Another recording to this folder raises an error until the block ends.
+    kept.
 
     Raises
     ------
     InputError
-        The folder holds problem files, is locked, or cannot be cleared or written.
+        The folder holds problem files, or cannot be cleared or written.
     """
     replace = check_bool("replace", replace)
-    with lock_output(path, folder=True) as folder:
-        try:
-            old = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file()]
-            if old and not replace and not continued:
-                raise InputError(
-                    f"{folder} holds {len(old)} problem files, and steps of two recordings would be read as one "
-                    "sequence: give another folder, or have them replaced (replace=True, --replace)"
-                )
-            for file in () if continued else (*old, folder / ENGINE):
-                file.unlink(missing_ok=True)
-        except OSError as error:
-            raise InputError(
-                f"the files in {str(folder)!r} cannot be removed ({error.strerror}); give another folder, "
-                "or permit writing to this one"
-            ) from None
-        yield folder
-
-
-@contextlib.contextmanager
-def lock_output(path: str | os.PathLike[str], folder: bool = False) -> Iterator[Path]:
-    """Hold the lock of an output, a file or a folder, until the block ends, and return its path.
-
-    The operating system releases the lock of a process that dies. A folder is created if it does not exist, and
-    removed at the end if it is still empty.
-
-    Raises
-    ------
-    InputError
-        Another command or another thread holds the lock, or the output cannot be written.
-    """
-    require_packages("an output folder", "filelock")
-    from filelock import FileLock, Timeout  # The import takes 30 ms; commands that write nothing skip it.
-
-    path = check_writable(path, folder)
-    # All names of an output share one lock.
-    target = _resolve_symlinks(path) if folder else resolve_destination(path)
-    is_new = folder and not target.exists()
-    if folder:
-        make_folder(target)
-    lock = FileLock(target / FOLDER_LOCK if folder else f"{target}.lock", thread_local=False)
+    folder = make_folder(check_writable(path, folder=True))
     try:
-        lock.acquire(timeout=LOCK_TIMEOUT)
-    except Timeout:
-        raise InputError(
-            f"{path} is being written by another command: wait for it, or give another {'folder' if folder else 'file'}"
-        ) from None
-    except NotImplementedError:
-        pass
+        old = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file()]
+        if old and not replace and not continued:
+            raise InputError(
+                f"{folder} holds {len(old)} problem files, and steps of two recordings would be read as one "
+                "sequence: give another folder, or have them replaced (replace=True, --replace)"
+            )
+        for file in () if continued else (*old, folder / ENGINE):
+            file.unlink(missing_ok=True)
     except OSError as error:
-        if error.errno not in WITHOUT_LOCKS:
-            raise InputError(
-                f"cannot write {path} ({lock.lock_file}: {error.strerror or error}): give a path that you may write to"
-            ) from None
-    try:
-        yield path
-    finally:
-        if lock.is_locked:
-            # Remove the lock file before releasing the lock; a process that waits for it detects that the file was
-            # removed. On Windows, where an open file cannot be removed, the file remains.
-            with contextlib.suppress(OSError):
-                os.unlink(lock.lock_file)
-            lock.release()
-        if is_new:
-            with contextlib.suppress(OSError):
-                target.rmdir()
-
-
-def _resolve_symlinks(path: Path) -> Path:
-    """Return the path without symbolic links; raise InputError if it cannot be resolved."""
-    try:
-        return Path(os.path.realpath(path))
-    except (OSError, ValueError) as error:
-        reason = "the working directory no longer exists" if isinstance(error, FileNotFoundError) else error
-        raise InputError(f"cannot write {path}: {reason}; give a path that can be written") from None
+        raise InputError(f"the files in {str(folder)!r} cannot be removed ({error.strerror})") from None
+    return folder
 
 
 def resolve_destination(path: str | os.PathLike[str]) -> Path:
@@ -168,24 +70,18 @@ def resolve_destination(path: str | os.PathLike[str]) -> Path:
     Raises
     ------
     InputError
-        The path is a folder, a pipe, a socket or a device, which are never replaced, or its links form a cycle.
+        The path is a folder, a pipe or a device, in the place of which `os.replace` would put a file.
     """
     path = as_path(path)
-    target = _resolve_symlinks(path)
     try:
-        status = os.stat(path)
+        target = Path(os.path.realpath(path))
+        if target.exists() and not target.is_file():
+            raise InputError(f"cannot write {path}: it is no regular file; give the name of a file")
     except (OSError, ValueError) as error:
-        if isinstance(error, FileNotFoundError):
-            return target
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"cannot write {path}: {reason}; give a path that can be written") from None
-    if not stat.S_ISREG(status.st_mode):
-        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a pipe, a socket or a device"
-    elif target.exists() and os.path.samestat(status, target.stat()):
-        return target
-    else:
-        kind = "a file that has lost its name"  # The path names an open file descriptor, as /dev/fd/3.
-    raise InputError(f"cannot write {path}: it is {kind}, which is not replaced; give the name of a file")
+        raise (
+            error if isinstance(error, InputError) else InputError(f"cannot write {path}: {error}")
+        ) from None
+    return target
 
 
 def check_writable(path: str | os.PathLike[str], folder: bool = False) -> Path:
@@ -197,18 +93,14 @@ def check_writable(path: str | os.PathLike[str], folder: bool = False) -> Path:
         The file or folder cannot be written.
     """
     path = as_path(path)
-    parent = _resolve_symlinks(path) if folder else resolve_destination(path).parent
-    try:
-        while folder and parent != parent.parent and not parent.exists():
-            parent = parent.parent
-        mode = parent.stat().st_mode
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {_explain_write_failure(error, parent)}") from None
-    if not stat.S_ISDIR(mode):
-        raise InputError(f"cannot write {path}: {parent} is not a folder; give a path in a folder")
+    parent = Path(os.path.realpath(path)) if folder else resolve_destination(path).parent
+    while folder and parent != parent.parent and not parent.exists():
+        parent = parent.parent
+    if not parent.is_dir():
+        raise InputError(f"cannot write {path}: {parent} is not a folder")
     existing = [path] if not folder and path.exists() else []
     if not all(os.access(x, os.W_OK) for x in (parent, *existing)):
-        raise InputError(f"cannot write {path}: you have no permission to write there; give another path")
+        raise InputError(f"cannot write {path}: you have no permission to write there")
     return path
 
 
@@ -218,20 +110,8 @@ def make_folder(path: str | os.PathLike[str]) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(
-            f"cannot create the folder {folder}: {error.strerror or error}; give another path"
-        ) from None
+        raise InputError(f"cannot create the folder {folder}: {error.strerror or error}") from None
     return folder
-
-
-def _explain_write_failure(error: OSError, folder: Path) -> str:
-    """Return the reason why a file could not be written, and advice."""
-    if isinstance(error, FileNotFoundError) and not folder.is_dir():
-        return f"the folder {folder} does not exist; create it first"
-    disk_full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-    return (
-        f"{error.strerror or error}; {'free disk space' if disk_full else 'give a path that can be written'}"
-    )
 
 
 def write_atomically(path: str | os.PathLike[str], write: Callable[[Path], Any]) -> None:
@@ -255,7 +135,12 @@ def write_atomically(path: str | os.PathLike[str], write: Callable[[Path], Any])
             temporary.chmod(stat.S_IMODE(target.stat().st_mode))
         os.replace(temporary, target)
     except OSError as error:
-        raise InputError(f"cannot write {path}: {_explain_write_failure(error, target.parent)}") from None
+        reason = error.strerror or error
+        if isinstance(error, FileNotFoundError) and not target.parent.is_dir():
+            reason = f"the folder {target.parent} does not exist"
+        elif error.errno in (errno.ENOSPC, errno.EDQUOT):
+            reason = f"{reason}; free disk space"
+        raise InputError(f"cannot write {path}: {reason}") from None
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -308,6 +193,43 @@ def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, Any]) -> Non
     write_atomically(path, write_to)
 
 
+class Arrays(dict[str, np.ndarray]):
+    """Arrays of an .npz by name."""
+
+    def __missing__(self, name: str) -> np.ndarray:
+        raise InputError(f"it has no entry {name!r}; it has {', '.join(self) or 'nothing'}")
+
+    def read_scalar(self, name: str) -> Any:
+        """Return the single value of an entry."""
+        if self[name].size != 1:
+            raise InputError(f"entry {name!r} has shape {self[name].shape}; one value is needed")
+        return self[name].reshape(()).item()
+
+
+def read_arrays(path: str | os.PathLike[str]) -> Arrays:
+    """Read all arrays of an archive (.npz); nothing is unpickled.
+
+    Raises
+    ------
+    InputError
+        The file is not a complete archive of arrays of numbers or texts.
+    """
+    name, arrays = "", Arrays()
+    try:
+        archive = np.load(as_path(path), allow_pickle=False)
+        if isinstance(archive, np.ndarray):
+            raise ValueError("it is a single array")
+        with archive:
+            for name in archive:
+                arrays[name] = archive[name]
+                if not isinstance(arrays[name], np.ndarray):
+                    raise ValueError("it is not an array")
+    except READ_ERRORS as error:
+        entry = f"entry {name!r} of {path}" if name else f"{path}"
+        raise InputError(f"{entry} cannot be read: {error}; an .npz archive of arrays is needed") from None
+    return arrays
+
+
 def check_figure_path(path: str | os.PathLike[str]) -> Path:
     """Return the path of a figure, with .png if it has no suffix; InputError if matplotlib cannot write the format."""
     path = as_path(path)
@@ -353,7 +275,7 @@ def as_path(path: str | os.PathLike[str]) -> Path:
 
 
 def read_first_bytes(path: str | os.PathLike[str], count: int = 8, role: str = "") -> bytes:
-    """Return the first `count` bytes of a regular file, or all bytes if `count` is -1.
+    """Return the first `count` bytes of a file, or all bytes if `count` is -1.
 
     Parameters
     ----------
@@ -365,27 +287,19 @@ def read_first_bytes(path: str | os.PathLike[str], count: int = 8, role: str = "
     Raises
     ------
     InputError
-        The file is not a regular file (reading a pipe would block), is larger than 2 GiB, or cannot be read.
+        The file cannot be read.
     """
     path = as_path(path)
-    named = f"{role} {str(path)!r}" if role else path
     try:
-        status = os.stat(path)
-        if not stat.S_ISREG(status.st_mode):
-            kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a pipe, a socket or a device"
-            raise InputError(f"cannot read {named}: it is {kind}; a regular file is needed")
-        if count < 0 and status.st_size > MAX_BYTES:
-            raise InputError(f"cannot read {named}: it holds {status.st_size} bytes, more than {MAX_BYTES}")
         with open(path, "rb") as stream:
             return stream.read(count)
     except (OSError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
+        named = f"{role} {str(path)!r}" if role else path
         raise InputError(f"cannot read {named}: {getattr(error, 'strerror', None) or error}") from None
 
 
 def read_whole_file(path: str | os.PathLike[str], role: str) -> bytes:
-    """Return all bytes of a regular file of up to 2 GiB; it raises the errors of `read_first_bytes`."""
+    """Return all bytes of a file; it raises the errors of `read_first_bytes`."""
     return read_first_bytes(path, -1, role)
 
 
@@ -408,142 +322,3 @@ def unpack_header(data: bytes, magic: bytes, max_bytes: int) -> tuple[Any, int]:
     if not data.startswith(magic) or not start < end <= min(len(data), start + max_bytes):
         raise ValueError("header")
     return json.loads(data[start:end]), end
-
-
-class Budget:
-    """Memory [bytes] that reading a file may still use; it is subtracted before anything is allocated."""
-
-    def __init__(self, max_bytes: int) -> None:
-        self.limit = self.remaining = check_int("max_bytes", max_bytes, high=None)
-
-    def reserve_bytes(self, count: int, name: str) -> None:
-        """Subtract `count` bytes for the object `name`; raise InputError if the limit is exceeded."""
-        self.remaining -= count
-        if self.remaining < 0:
-            raise InputError(
-                f"{name} and the entries before it need {self.limit - self.remaining} bytes of memory, more "
-                f"than the limit of {self.limit}; pass max_bytes= if the file is meant to be that large"
-            )
-
-
-# -- NumPy archives ------------------------------------------------------------------------------
-
-
-class _Header(NamedTuple):
-    """Header of a .npy entry, and the stream of its data."""
-
-    stream: IO[bytes]
-    dtype: np.dtype[Any]
-    shape: tuple[int, ...]
-    fortran: bool
-
-
-class Archive(Mapping[str, np.ndarray]):
-    """Arrays of an .npz by name; each is read once, at its first access."""
-
-    def __init__(self, path: str | os.PathLike[str], max_bytes: int = MAX_BYTES) -> None:
-        self.path = path
-        self._arrays: dict[str, np.ndarray] = {}
-        self._headers: dict[str, _Header] = {}
-        budget = Budget(max_bytes)
-        try:
-            self._zip = zipfile.ZipFile(path)
-        except READ_ERRORS as error:
-            raise InputError(f"{path} is not a complete .npz archive ({error}); save it again") from None
-        try:
-            self._open_entries(budget)
-        except BaseException:
-            self.close()
-            raise
-
-    def _open_entries(self, budget: Budget) -> None:
-        """Read the headers of all entries and subtract their sizes in memory from the budget."""
-        entries = self._zip.infolist()
-        if len(entries) > MAX_ARCHIVE_ENTRIES:
-            raise InputError(
-                f"{self.path} holds {len(entries)} entries; at most {MAX_ARCHIVE_ENTRIES} are accepted, and "
-                "a problem needs far fewer: give the file of one problem"
-            )
-        for entry in entries:
-            name = entry.filename.removesuffix(".npy")
-            if name == entry.filename or name in self._headers:
-                raise InputError(
-                    f"{self.path} holds {entry.filename!r}; an .npz must hold files NAME.npy with different "
-                    "names: save it again with lavender.io.save or numpy.savez"
-                )
-            try:
-                if entry.compress_type not in ACCEPTED_COMPRESSION:
-                    raise ValueError(
-                        f"the entry is compressed by method {entry.compress_type} of zip files; deflate (8) "
-                        "or no compression (0) is needed: use numpy.savez"
-                    )
-                self._headers[name] = _read_npy_header(self._zip.open(entry), entry.file_size)
-            except READ_ERRORS as error:
-                raise InputError(f"{self.path}: entry {name!r} cannot be read: {error}") from None
-        for name, header in self._headers.items():
-            width = header.dtype.itemsize
-            if header.dtype.kind in "buif":
-                width = JSON_BYTES_PER_BYTE if name == "meta" else max(width, NUMBER_BYTES)
-            budget.reserve_bytes(math.prod(header.shape) * width, f"{self.path}: entry {name!r}")
-
-    def __getitem__(self, name: str) -> np.ndarray:
-        if name not in self._headers:
-            has = ", ".join(self._headers) or "nothing"
-            raise InputError(f"{self.path} has no entry {name!r}; it has {has}")
-        if name not in self._arrays:
-            stream, dtype, shape, fortran = self._headers[name]
-            size = math.prod(shape) * dtype.itemsize
-            try:
-                with stream:
-                    raw = stream.read(size)
-                    if len(raw) != size or stream.read(1):
-                        raise EOFError(
-                            f"it holds {len(raw)} of {size} bytes: the file is damaged, save it again"
-                        )
-                self._arrays[name] = np.frombuffer(raw, dtype).reshape(shape, order="F" if fortran else "C")
-            except READ_ERRORS as error:
-                raise InputError(f"{self.path}: entry {name!r} cannot be read: {error}") from None
-        return self._arrays[name]
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._headers
-
-    def __iter__(self) -> Any:
-        return iter(self._headers)
-
-    def __len__(self) -> int:
-        return len(self._headers)
-
-    def close(self) -> None:
-        """Close the archive; no entry can be read afterwards."""
-        for header in self._headers.values():
-            header.stream.close()
-        self._zip.close()
-
-    def read_scalar(self, name: str) -> Any:
-        """Return the single value of an entry."""
-        value = self[name]
-        if value.size != 1:
-            raise InputError(f"{self.path}: entry {name!r} has shape {value.shape}; one value is needed")
-        return value.reshape(()).item()
-
-
-def _read_npy_header(stream: IO[bytes], size: int) -> _Header:
-    """Read the header of an array of numbers or text; `size` [bytes] is the declared size of header and data."""
-    if npy.read_magic(stream) != (1, 0):  # Later versions of the .npy format are only for long headers.
-        raise ValueError(
-            "the entry is not a plain array (.npy, version 1.0), but a record array or other data; a plain "
-            "array of numbers is needed"
-        )
-    shape, fortran, dtype = npy.read_array_header_1_0(stream, max_header_size=MAX_NPY_HEADER_BYTES)
-    if dtype.kind not in "buifUS":
-        raise ValueError(
-            f"the entry has dtype {dtype}; objects are never read from a file, and plain numbers are needed"
-        )
-    data = math.prod(shape) * dtype.itemsize
-    if min(shape, default=0) < 0 or data + stream.tell() != size:
-        raise ValueError(
-            f"its shape {shape} needs {data} bytes, but the archive declares {size} bytes with the header: "
-            "the file is damaged, save it again"
-        )
-    return _Header(stream, dtype, shape, fortran)

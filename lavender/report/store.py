@@ -4,8 +4,7 @@ A measurement makes a dictionary, the store appends it as a line, and `read` ret
 `select_runs`, `select_cases` and `select_skips` divide. docs/report.md lists the columns of runs with their units.
 
 Lines are appended and flushed as they are made. A measurement that was killed leaves at most one incomplete line, the
-last one, which is removed before the next line is written. One process writes a file, under the lock of
-`lavender.io.stored.lock_output`.
+last one, which is removed before the next line is written.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from lavender.base.errors import InputError, require_packages
-from lavender.io.stored import as_path, lock_output, make_folder, read_whole_file, resolve_destination
+from lavender.io.stored import as_path, make_folder, read_whole_file, resolve_destination
 from lavender.judge.solution import CLAIM_CHECKS, CONFIRMED
 from lavender.report.text import escape_unprintable, format_tolerance
 
@@ -120,32 +119,27 @@ def to_jsonable(value: Any) -> Any:
 
 
 class Store:
-    """Appends rows to a `.jsonl` file, which no other process can write while it is open.
+    """Appends rows to a `.jsonl` file.
 
     `lines` is the DataFrame of the lines that the file had when it was opened.
 
     Raises
     ------
     InputError
-        The file cannot be written, another process writes it, or it has other content.
+        The file cannot be written, or it has other content.
     """
 
     def __init__(self, path: str | Path) -> None:
         self.path, self._real = as_path(path), resolve_destination(path)
         make_folder(self.path.parent)
-        with contextlib.ExitStack() as held:
-            held.enter_context(lock_output(self.path))
-            try:
-                self.lines = read(self.path) if self.path.exists() else make_lines([])
-                if self.lines.attrs.get("dropped"):
-                    with self.path.open("rb+") as f:
-                        f.truncate(f.read().rfind(b"\n") + 1)
-                self.file = self.path.open("a", encoding="utf-8")
-            except OSError as error:
-                raise InputError(
-                    f"cannot write {self.path} ({error.strerror or error}): give a folder that you may write to"
-                ) from None
-            self._lock = held.pop_all()
+        try:
+            self.lines = read(self.path) if self.path.exists() else make_lines([])
+            if self.lines.attrs.get("dropped"):
+                with self.path.open("rb+") as f:
+                    f.truncate(f.read().rfind(b"\n") + 1)
+            self.file = self.path.open("a", encoding="utf-8")
+        except OSError as error:
+            raise InputError(f"cannot write {self.path}: {error.strerror or error}") from None
         self._synced = time.monotonic()
 
     def add(self, row: Row) -> None:
@@ -176,10 +170,9 @@ class Store:
             ) from None
 
     def close(self) -> None:
-        """Close the file and release its lock. Errors of the disk are ignored here: `add` has raised them."""
+        """Close the file. Errors of the disk are ignored here: `add` has raised them."""
         with contextlib.suppress(OSError):
             self.file.close()
-        self._lock.close()
 
     def __enter__(self) -> Store:
         return self

@@ -250,7 +250,7 @@ def test_command_with_an_unwritable_output_ends_with_2_before_work(lavender, mon
     for place in ("file",) if "/sub" in words else ("file", "absent"):  # a folder is made, with its parents
         code, out, err = lavender(*words.format(tmp_path / place).split())
         assert (code, out) == (cli.EXIT_BAD_INPUT, "")
-        assert re.search(r"^lavender: cannot (write|create) .*; (create|give) ", err)
+        assert re.search(r"^lavender: cannot (write|create) .*", err)
         assert str(tmp_path / place) in err
 
 
@@ -315,7 +315,7 @@ def test_check_of_a_stored_answer_ends_with_1_only_if_its_error_exceeds_the_thre
     ],
 )
 def test_call_without_an_optional_package_names_the_command_to_install_it(call, message):
-    names = ["click", "rich", "joblib", "matplotlib", "filelock"]
+    names = ["click", "rich", "joblib", "matplotlib"]
     code = f"import sys\nfor name in {names}: sys.modules[name] = None\nimport lavender as lv\n"
     code += f"lcp = lv.Problem.lcp([[2.0]], [1.0])\n{call}"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
@@ -355,15 +355,3 @@ def test_command_in_a_narrow_terminal_prints_whole_names(lavender, monkeypatch, 
     assert code == 0
     names = re.findall(r"^\w+", wide, re.MULTILINE)
     assert names and set(names) <= set(re.findall(r"^\w+", narrow, re.MULTILINE))
-
-
-@pytest.mark.skipif(sys.version_info[:3] == (3, 13, 0), reason="CPython 3.13.0 imports nothing in such a folder")
-@pytest.mark.parametrize("words", ["--workers 2", "--workers 1", "--solvers pgs --budgets 2 --no-figures"])
-def test_command_in_a_deleted_directory_names_it(lavender, path, tmp_path, words):
-    os.rmdir(os.getcwd())
-    words = words if "--solvers" in words else f"--solvers pgs --no-figures {words}"
-    code, _, err = lavender("report", path, *words.split(), "--out", tmp_path / "out")
-    assert code == 0 or (code == cli.EXIT_BAD_INPUT and "the working directory no longer exists" in err)
-    for words in ("run stack --steps 2 --record r", "export c c", "solve toy_stack --output x.npz", "report toy_stack"):
-        code, _, err = lavender(*words.split())
-        assert code == cli.EXIT_BAD_INPUT and "the working directory no longer exists" in err

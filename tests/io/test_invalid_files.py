@@ -1,4 +1,4 @@
-"""Invalid files and invalid data of other simulators: rejected by name, within a limit of memory."""
+"""Invalid and damaged files: rejected by path and name of the entry, or read as a valid problem."""
 
 import contextlib
 import functools
@@ -7,7 +7,6 @@ import json
 import re
 import warnings
 import zipfile
-from pathlib import Path
 
 import hypothesis.strategies as st
 import numpy as np
@@ -22,66 +21,22 @@ from lavender import io
 from lavender.io import fclib
 
 h5py = pytest.importorskip("h5py")
-resource = pytest.importorskip("resource")
-
-HUGE = 2**31 - 1
-ALLOWED_MEMORY = 100_000_000  # Rejecting a file may need so many bytes.
-
-# -- small files that would make large arrays ---------------------------------------------------------------------
-
-
-@contextlib.contextmanager
-def limited_memory():
-    """Let the address space of this process grow by ALLOWED_MEMORY bytes."""
-    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    limits = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(resource.RLIMIT_AS, (used + ALLOWED_MEMORY, limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_AS, limits)
-
-
-def npy_header(kind, shape):
-    text = repr({"descr": kind, "fortran_order": False, "shape": shape}).encode()
-    text += b" " * (63 - (10 + len(text)) % 64) + b"\n"
-    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text
 
 
 def write_npz(path, method=zipfile.ZIP_DEFLATED, **entries):
-    """Write arrays; a tuple (kind, shape, bytes) is an array of these bytes, repeated."""
+    """Write arrays into an archive."""
     with zipfile.ZipFile(path, "w", method) as out:
         for name, entry in entries.items():
             with out.open(f"{name}.npy", "w", force_zip64=True) as stream:
-                if isinstance(entry, tuple):
-                    kind, shape, text = entry
-                    stream.write(npy_header(kind, shape))
-                    left = int(np.prod(shape)) * np.dtype(kind).itemsize
-                    block = text * (2**20 // len(text))
-                    while left > 0:
-                        stream.write(block[:left])
-                        left -= len(block)
-                else:
-                    np.lib.format.write_array(stream, np.asarray(entry), allow_pickle=False)
+                np.lib.format.write_array(stream, np.asarray(entry), allow_pickle=False)
     return path
 
 
-META = {"operator": "dense", "friction": "coulomb", "name": "", "names": None}
-OWN = {
-    "lavender_format": np.int64(1), "meta": np.frombuffer(json.dumps(META).encode(), np.uint8), "b": np.zeros(2),
-    "cones_ptr": [0, 1, 2], "cones_kind": [0, 0], "cones_lower": np.zeros(2), "cones_upper": np.ones(2),
-    "cones_mu": np.zeros(2), "cones_patch_radius": np.zeros(2), "A": np.eye(2),
-}  # fmt: skip
-
-
 def hdf5(path, parts):
-    """Write datasets by path; a tuple (shape, kind) is a dataset whose chunks were never written."""
+    """Write datasets by path."""
     with h5py.File(path, "w") as out:
         for name, value in parts.items():
-            if isinstance(value, tuple):
-                out.create_dataset(name, value[0], value[1], chunks=(2**16,))
-            else:
-                out[name] = np.asarray(value)
+            out[name] = np.asarray(value)
     return path
 
 
@@ -92,130 +47,7 @@ def matrix(name, m, n, nz, p, i, x):
     }
 
 
-NO_NUMBERS = np.zeros(0)
-NO_INDICES = np.zeros(0, np.int32)
-LOCAL = {"fclib_local/spacedim": np.array([3], np.int32)}
 GLOBAL = {"fclib_global/spacedim": np.array([3], np.int32)}
-
-
-def one_wide_body(path):
-    m = 36_000
-    h = sp.csr_array(np.ones((2, m)))  # M is no mass matrix, so A is formed
-    return hdf5(
-        path,
-        GLOBAL
-        | matrix("fclib_global/H", 2, m, -2, h.indptr, h.indices, h.data)
-        | matrix("fclib_global/M", 2, 2, -2, np.array([0, 2, 3]), np.array([0, 1, 1]), np.ones(3))
-        | {"fclib_global/vectors/f": np.zeros(2), "fclib_global/vectors/w": np.zeros(m)}
-        | {"fclib_global/vectors/mu": np.full(m // 3, 0.5)},
-    )
-
-
-def large_chunk(path):
-    with h5py.File(path, "w") as out:
-        out.create_dataset(
-            "fclib_local/spacedim", (1,), "i4", maxshape=(None,), chunks=(2**27,), compression="gzip", fillvalue=3
-        )
-    return path
-
-
-BOMBS = {
-    "pointers that announce rows, bounds that one number fills": (
-        lambda path: write_npz(
-            path, **OWN | {"cones_ptr": [0, HUGE], "cones_kind": [0], "cones_lower": 0.0, "cones_upper": 1.0}
-        ),
-        "must end with the number of its rows",
-    ),
-    "one number for every b": (lambda path: write_npz(path, **OWN | {"b": 0.0}), "one dimension"),
-    "a dense matrix of bytes": (
-        lambda path: write_npz(path, **OWN | {"A": ("|b1", (17_000, 17_000), b"\0")}),
-        "max_bytes=",
-    ),
-    "an entry before the one that is too much": (
-        lambda path: write_npz(
-            path, **OWN | {"A": ("|i1", (11_500, 11_500), b"\0"), "guess": ("|i1", (200_000_000,), b"\0")}
-        ),
-        "max_bytes=",
-    ),
-    "text that makes many objects": (
-        lambda path: write_npz(path, **OWN | {"meta": ("|u1", (60_000_000,), b"[{},{}],")}),
-        "max_bytes=",
-    ),
-    "a packing that chooses its memory": (
-        lambda path: write_npz(path, zipfile.ZIP_LZMA, **OWN),
-        "compressed by method",
-    ),
-    "one body under many contacts": (one_wide_body, "max_bytes="),
-    "triplets of a huge matrix": (
-        lambda path: hdf5(
-            path,
-            LOCAL
-            | matrix("fclib_local/W", HUGE, HUGE, 0, NO_INDICES, NO_INDICES, NO_NUMBERS)
-            | {"fclib_local/vectors/q": NO_NUMBERS, "fclib_local/vectors/mu": NO_NUMBERS},
-        ),
-        "are needed|not a multiple",
-    ),
-    "triplets of a huge matrix, with vectors that nobody wrote": (
-        lambda path: hdf5(
-            path,
-            LOCAL
-            | matrix("fclib_local/W", HUGE // 3 * 3, HUGE // 3 * 3, 0, NO_INDICES, NO_INDICES, NO_NUMBERS)
-            | {"fclib_local/vectors/q": ((HUGE // 3 * 3,), "f8"), "fclib_local/vectors/mu": ((HUGE // 3,), "f8")},
-        ),
-        "max_bytes=",
-    ),
-    "numbers that nobody wrote, one byte each": (
-        lambda path: hdf5(
-            path,
-            LOCAL
-            | matrix("fclib_local/W", 3, 3, -2, [0, 0, 0, 0], ((2**28,), "i1"), ((2**28,), "i1"))
-            | {"fclib_local/vectors/q": np.zeros(3), "fclib_local/vectors/mu": [0.5]},
-        ),
-        "max_bytes=",
-    ),
-    "compressed columns of a huge number of rows": (
-        lambda path: hdf5(
-            path,
-            GLOBAL
-            | matrix("fclib_global/H", HUGE, 3, -1, [0, 0, 0, 0], NO_INDICES, NO_NUMBERS)
-            | matrix("fclib_global/M", HUGE, HUGE, 0, NO_INDICES, NO_INDICES, NO_NUMBERS)
-            | {"fclib_global/vectors/f": ((HUGE,), "i1"), "fclib_global/vectors/w": np.zeros(3)}
-            | {"fclib_global/vectors/mu": [0.5]},
-        ),
-        "max_bytes=",
-    ),
-    "one number in a large chunk": (large_chunk, "in a chunk of"),
-}  # fmt: skip
-
-
-@pytest.mark.slow  # the sanitizers reserve the whole address space
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="/proc is Linux's")
-@pytest.mark.parametrize("kind", BOMBS)
-def test_a_small_file_of_large_arrays_is_rejected_before_they_are_allocated(kind, tmp_path):
-    make, sign = BOMBS[kind]
-    good = tmp_path / "good.hdf5"
-    io.save(lv.Problem.contact(np.eye(3), np.ones(3), [0.5]), good)
-    io.load(good)  # what a first load imports
-    path = make(tmp_path / "bomb")
-    assert path.stat().st_size < 2_000_000
-    with limited_memory(), pytest.raises(lv.InputError, match=sign) as error:
-        io.load(path)
-    assert str(path) in str(error.value)
-
-
-def test_max_bytes_limits_the_size_of_the_arrays(tmp_path):
-    # A as bytes, 300 x 300: 90 kB to be read, 720 kB to be made.
-    m = 300
-    path = write_npz(
-        tmp_path / "p.npz", b=np.zeros(m), lo=np.zeros(m), hi=np.ones(m), A=np.eye(m, dtype=np.int8)
-    )  # fmt: skip
-    needed = 8 * (m * m + 3 * m)
-    assert io.load(path, max_bytes=needed).m == m
-    with pytest.raises(lv.InputError, match=f"need {needed} bytes .* limit of {needed - 1}"):
-        io.load(path, max_bytes=needed - 1)
-    for wrong in (-1, 1e9, "2G", None, True):
-        with pytest.raises(lv.InputError, match="max_bytes is"):
-            io.load(path, max_bytes=wrong)
 
 
 def contents(mass, h):
@@ -224,7 +56,7 @@ def contents(mass, h):
     return fclib.Contents("fclib_global", 3, parts | {"mu": np.full(m // 3, 0.5)})
 
 
-def test_load_of_fclib_with_a_mass_factor_beyond_memory_raises():
+def test_load_of_fclib_with_a_mass_factor_beyond_memory_raises(monkeypatch):
     n = 1200
     rng = np.random.default_rng(2)
     h = np.zeros((n, 3))
@@ -232,11 +64,13 @@ def test_load_of_fclib_with_a_mass_factor_beyond_memory_raises():
     chain = sp.diags_array([np.full(n - 1, -1.0), np.full(n, 2.5), np.full(n - 1, -1.0)], offsets=[-1, 0, 1])
     shuffled = rng.permutation(n)
     chain = sp.csr_array(chain)[shuffled][:, shuffled]
-    got = contents(chain, h).build_problem(max_bytes=24 * 10**6).csr.toarray()  # 1200^2 entries: 23 MB
+    monkeypatch.setattr(fclib, "MAX_MASS_FACTOR_ENTRIES", n * n)
+    got = contents(chain, h).build_problem().csr.toarray()
     expected = np.linalg.inv(chain.toarray())[:3, :3]
     np.testing.assert_allclose(got, expected, rtol=1e-12)
+    monkeypatch.setattr(fclib, "MAX_MASS_FACTOR_ENTRIES", n * n - 1)
     with pytest.raises(lv.InputError, match="factors of M"):
-        contents(chain, h).build_problem(max_bytes=22 * 10**6)
+        contents(chain, h).build_problem()
 
 
 # -- damaged files -----------------------------------------------------------------------------------------------
@@ -400,7 +234,7 @@ def read_replaced(path, suffix, arrays, name, x):
     """Read a file in which one array is replaced; return the error's message, or an empty string."""
     path.write_bytes(file_of(suffix, {k: v for k, v in (arrays | {name: x}).items() if v is not None}, False))
     try:
-        io.read(path, max_bytes=10**7)
+        io.read(path)
     except lv.LavenderError as error:
         return str(error)
     return ""
@@ -441,10 +275,10 @@ def test_a_damaged_file_is_rejected_by_its_path_or_holds_a_valid_problem(data, t
     path = folder / f"damaged{suffix}"
     path.write_bytes(content)
     try:
-        stored = io.read(path, max_bytes=10**7)
+        stored = io.read(path)
     except lv.LavenderError:
         with pytest.raises(lv.LavenderError, match=str(path)):
-            io.read(path, max_bytes=10**7)
+            io.read(path)
         return
     problem = stored.problem
     assert all(np.isfinite(x).all() for x in (problem.b, problem.cones.mu, *stored.guesses))

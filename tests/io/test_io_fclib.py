@@ -298,29 +298,6 @@ def test_load_of_fclib_with_a_flipped_bit_raises(tmp_path):
                     lavender.io.read(path)
 
 
-def test_load_of_fclib_with_links_reads_no_other_file(tmp_path):
-    secret = tmp_path / "secret.bin"
-    np.arange(3.0).tofile(secret)
-    with h5py.File(tmp_path / "other.h5", "w") as file:
-        file["q"] = np.arange(3.0)
-    for kind in ("external link", "soft link", "external storage", "virtual"):
-        path = make(tmp_path / "p.h5", W=GOOD, mu=[0.5])
-        with h5py.File(path, "a") as file:
-            vectors = file["fclib_local/vectors"]
-            if kind == "external link":
-                vectors["q"] = h5py.ExternalLink("other.h5", "/q")
-            elif kind == "soft link":
-                vectors["q"] = h5py.SoftLink("/fclib_local/vectors/mu")
-            elif kind == "external storage":
-                vectors.create_dataset("q", (3,), "f8", external=[(str(secret), 0, 24)])
-            else:
-                layout = h5py.VirtualLayout((3,), "f8")
-                layout[:] = h5py.VirtualSource(str(tmp_path / "other.h5"), "q", (3,))
-                vectors.create_virtual_dataset("q", layout)
-        with pytest.raises(lv.InputError, match=r"not followed|not read"):
-            lavender.io.load(path)
-
-
 @pytest.mark.parametrize(
     ("changes", "sign"),
     [

@@ -248,17 +248,15 @@ META = {"operator": "dense", "friction": "coulomb", "name": "", "names": None}
     ("changes", "sign"),
     [
         ({"lavender_format": np.int64(2)}, "this lavender reads 1"),
-        ({"lavender_format": np.array([1, 1])}, "one value"),
-        ({"A": None, "cones_mu": None}, "entries cones_mu, A are missing"), ({"extra": np.zeros(1)}, "do not belong"),
+        ({"lavender_format": np.array([1, 1])}, "one value"), ({"A": None}, "no entry 'A_shape'"),
+        ({"cones_mu": None}, "no entry 'cones_mu'"),
         *(({"meta": np.frombuffer(text, np.uint8)}, "JSON") for text in (b"{", b"[]", b"\xff\xfe", b"[" * 100_000)),
-        ({"meta": {k: x for k, x in META.items() if k != "names"}}, "entry 'meta' has no 'names'"),
+        ({"meta": {k: x for k, x in META.items() if k != "names"}}, "entry 'meta' has no names"),
         *(({"meta": META | change}, words) for change, words in (
-            ({"operator": "magic"}, "operator is 'magic'"), ({"names": "abc"}, "names is 'abc'"),
-            ({"names": [1]}, "a list of names, or null"), ({"more": 1}, "unknown names more"),
-            ({"friction": "glue"}, "'coulomb' or 'cone'"), ({"names": ["one"]}, "entries for 12 blocks"),
-            ({"precision": "float16"}, "precision is 'float16'; float64 or float32"),
-            ({"program": 2}, "program is 2; a number of variables, with the operator csr"),
-            ({"operator": "csr", "program": True}, "program is True; a number of variables"))),
+            ({"operator": "magic"}, "operator 'magic'"), ({"names": "abc"}, "names of blocks is 'abc'"),
+            ({"friction": "glue"}, "'coulomb' or 'cone'"),
+            ({"names": ["one"]}, "entries for 12 blocks"), ({"precision": "float16"}, "precision"),
+            ({"program": 2}, "csr for a program"))),
     ],
 )  # fmt: skip
 def test_load_of_npz_with_other_entries_or_metadata_names_them(tmp_path, changes, sign):
@@ -270,21 +268,16 @@ def test_load_of_npz_with_other_entries_or_metadata_names_them(tmp_path, changes
 
 
 @pytest.mark.parametrize(
-    ("entry", "sign"),
+    "entry",
     [
-        (npy("<f8", (2**60,)), "declares"), (npy("<f8", (2**40, 2**40)), "declares"),
-        (npy("<f8", (12,), bytes(95)), "declares"), (npy("<f8", (12,), bytes(97)), "declares"),
-        (npy("<f8", (-12,), b""), "shape"), (npy("<f8", (True, 12), bytes(96)), "integer|shape"),
-        (npy("<f8", 12, bytes(96)), "shape"), (npy([("x", "<f8")], (12,), bytes(96)), "plain numbers are needed"),
-        (npy("<c16", (6,), bytes(96)), "numbers are needed"), (npy("<M8[s]", (12,), bytes(96)), "numbers are needed"),
-        (npy("nonsense", (12,), bytes(96)), "cannot be read"), (npy("<f8", (12,), bytes(96), version=4), "version 1.0"),
-        (b"\x93NUMPY\x01\x00\xff\xff" + b" " * 65535, "header"),
-        (b"\x93NUMPY\x01\x00\x10\x00" + b"(" * 16, "cannot be read"),
-        (b"\x93NUMPY\x02\x00\xff\xff\xff\xff", "version 1.0"), (b"", "magic"), (b"\x93NUM", "magic"),
+        npy("<f8", (2**60,)), npy("<f8", (2**40, 2**40)), npy("<f8", (12,), bytes(95)), npy("<f8", (-12,), b""),
+        npy("<f8", 12, bytes(96)), npy([("x", "<f8")], (12,), bytes(96)), npy("<c16", (6,), bytes(96)),
+        npy("nonsense", (12,), bytes(96)), npy("<f8", (12,), bytes(96), version=4), b"", b"\x93NUM",
+        b"\x93NUMPY\x01\x00\xff\xff" + b" " * 65535, b"\x93NUMPY\x01\x00\x10\x00" + b"(" * 16,
     ],
 )  # fmt: skip
-def test_load_of_npz_entries_with_false_headers_raises(tmp_path, entry, sign):
-    with pytest.raises(lv.InputError, match=sign):
+def test_load_of_npz_entries_with_false_headers_names_the_entry(tmp_path, entry):
+    with pytest.raises(lv.InputError, match=r"entry 'b'|\bb has shape"):
         lavender.io.load(own(tmp_path, b=entry))
 
 

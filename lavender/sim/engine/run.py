@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextlib import nullcontext
 from dataclasses import dataclass
 from os import PathLike
 from time import perf_counter
@@ -13,7 +12,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, check_int
 from lavender.base.errors import require_packages
-from lavender.io.stored import lock_step_folder, write_figure, write_text
+from lavender.io.stored import prepare_step_folder, write_figure, write_text
 from lavender.sim.engine.simulation import Simulation
 from lavender.sim.engine.stepping import get_sweep_order
 from lavender.sim.engine.values import SOLVER_FIELDS
@@ -129,25 +128,25 @@ def run(
     recorded = 0
     solver, depth, cost, time = np.zeros((steps, 8)), np.zeros(steps), np.zeros(steps), np.zeros(steps)
     lost, done, stopped = "", 0, False
-    with nullcontext() if record is None else lock_step_folder(record, replace) as folder:
-        try:
-            while done < steps and not lost:
-                if folder is not None:
-                    recorded += simulation.write_problem(folder, 6) is not None
-                start = perf_counter()
-                observation, _, _, _, info = simulation.step()
-                cost[done] = perf_counter() - start
-                solver[done] = observation["solver"]
-                depth[done] = observation["contacts"]["depth"].max(initial=0.0)
-                time[done] = info["time"]
-                lost = info.get("lost_body", "")
-                done += 1
-                if watch is not None:
-                    watch(done, observation, info)
-        except KeyboardInterrupt:
-            if not done:
-                raise
-            stopped = True
+    folder = None if record is None else prepare_step_folder(record, replace)
+    try:
+        while done < steps and not lost:
+            if folder is not None:
+                recorded += simulation.write_problem(folder, 6) is not None
+            start = perf_counter()
+            observation, _, _, _, info = simulation.step()
+            cost[done] = perf_counter() - start
+            solver[done] = observation["solver"]
+            depth[done] = observation["contacts"]["depth"].max(initial=0.0)
+            time[done] = info["time"]
+            lost = info.get("lost_body", "")
+            done += 1
+            if watch is not None:
+                watch(done, observation, info)
+    except KeyboardInterrupt:
+        if not done:
+            raise
+        stopped = True
     scene = simulation.scene
     spec = get(scene.parameters.solver)
     order = get_sweep_order(scene.parameters) or scene.parameters.order

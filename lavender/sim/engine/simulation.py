@@ -9,7 +9,7 @@ from typing import Any
 from lavender import io
 from lavender.base.arrays import check_int, mark_read_only
 from lavender.base.errors import InputError, LavenderError, check_name
-from lavender.io.stored import lock_step_folder
+from lavender.io.stored import prepare_step_folder
 from lavender.problem import Problem
 from lavender.sim.engine.check import check_snapshot_fields, check_state, check_state_sizes, require_intact
 from lavender.sim.engine.layout import HEAD
@@ -149,12 +149,12 @@ class Simulation(Stepping):
         steps = check_int("steps", steps, 1)
         folder = Path(folder)
         digits, written = len(str(self._steps + steps)), []
-        with lock_step_folder(folder, continued=folder.resolve() == self._recorded):
-            self._recorded = folder.resolve()
-            for _ in range(steps):
-                written.append(self.write_problem(folder, digits, form))
-                if self.step()[2]:
-                    break
+        prepare_step_folder(folder, continued=folder.resolve() == self._recorded)
+        self._recorded = folder.resolve()
+        for _ in range(steps):
+            written.append(self.write_problem(folder, digits, form))
+            if self.step()[2]:
+                break
         return [path for path in written if path is not None]
 
     def write_problem(self, folder: Path, digits: int, form: str = "npz") -> Path | None:

@@ -70,10 +70,8 @@ def build(out: Path, part: str) -> None:
 @click.argument("folder", type=click.Path(file_okay=False, path_type=Path))
 def page(folder: Path) -> None:
     """Write the page into FOLDER, for any file server; nothing in it needs Python or a network."""
-    from lavender.io.stored import lock_output
     from lavender.sim.web import pages
 
-    click.get_current_context().with_resource(lock_output(folder, folder=True))
     click.echo(str(pages.write_page(folder, _print_message)))
 
 

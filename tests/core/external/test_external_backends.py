@@ -276,7 +276,7 @@ os.kill(os.getpid(), signal.SIGKILL)"""
 
 
 @pytest.mark.skipif(not APART, reason="no backend without a time limit is installed")
-def test_isolated_process_errors_equal_those_of_a_direct_call():
+def test_isolated_process_errors_equal_errors_of_a_direct_call():
     problem = lv.Problem.lcp(*spd(5))
     with pytest.raises(lv.InputError, match="isolate"):
         lv.solve(problem, APART[0], isolate="yes")

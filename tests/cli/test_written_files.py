@@ -1,0 +1,225 @@
+"""Files that the package writes: no failure loses what was written, and nothing but a regular file is replaced."""
+
+import contextlib
+import errno
+import json
+import os
+import re
+import signal
+from ast import literal_eval
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+from stacks import stack
+from worked import python
+
+import lavender as lv
+from lavender import io, report
+from lavender.io.stored import write_text
+from lavender.report.store import Store, to_jsonable
+from lavender.report.text import make_file_name
+from lavender.sim.engine import run
+from lavender.sim.engine.picture import Film
+
+TEMPORARY_NAME = re.compile(r"\..*\.\d+\.\d+\.part(\.\w+)?")  # Names of files that are not complete yet.
+
+resource = pytest.importorskip("resource", reason="limits of files are of POSIX")
+needs_hdf5 = pytest.mark.skipif(find_spec("h5py") is None, reason="FCLIB's files need h5py (extra: fclib)")
+BEFORE = b"the content before"
+
+
+@pytest.fixture(scope="module")
+def results():
+    """What is written: a problem, a film, a trace and a snapshot."""
+    simulation = lv.Simulation("stack")
+    return {
+        "problem": lv.Problem.contact(np.eye(3), [1.0, 0.0, 0.0], 0.5),
+        "film": Film(lv.Simulation(lv.Scene("stack", n=1))),
+        "trace": run(simulation, 3),
+        "state": simulation.snapshot(),
+    }
+
+
+WRITERS = {
+    "npz": (".npz", lambda results, path: io.save(results["problem"], path)),
+    "hdf5": (".hdf5", lambda results, path: io.save(results["problem"], path)),
+    "film": (".gif", lambda results, path: results["film"].save(path)),
+    "trace": (".csv", lambda results, path: results["trace"].save(path)),
+    "figure": (".svg", lambda results, path: results["trace"].plot(path)),
+    "snapshot": (".snap", lambda results, path: results["state"].save(path)),
+    "text": (".txt", lambda results, path: write_text(path, "abc")),
+}
+each_writer = pytest.mark.parametrize(
+    ("suffix", "call"),
+    [pytest.param(*case, marks=[needs_hdf5] * (name == "hdf5")) for name, case in WRITERS.items()],
+    ids=WRITERS,
+)
+
+
+@contextlib.contextmanager
+def file_size_limit(size):
+    """Limit the files of this process to so many bytes."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+@each_writer
+def test_write_over_a_pipe_or_a_folder_is_an_error_and_through_a_link_replaces_its_target(
+    suffix, call, results, tmp_path
+):
+    pipe, folder, target, link = (tmp_path / f"{name}{suffix}" for name in ("pipe", "folder", "target", "link"))
+    os.mkfifo(pipe)
+    folder.mkdir()
+    target.write_bytes(BEFORE)
+    link.symlink_to(target.name)
+    for path in (pipe, folder):
+        with pytest.raises(lv.InputError, match=f"{path}: it is no regular file"):
+            call(results, path)
+    call(results, link)
+    assert pipe.is_fifo() and link.is_symlink() and target.read_bytes() != BEFORE
+    assert len(list(tmp_path.iterdir())) == 4
+
+
+@each_writer
+@pytest.mark.parametrize("is_renamed", [False, True], ids=["writing", "renaming"])
+def test_write_on_a_full_disk_keeps_the_old_file(is_renamed, suffix, call, results, tmp_path, monkeypatch):
+    path = tmp_path / f"there{suffix}"
+    path.write_bytes(BEFORE)
+
+    def raise_full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    if is_renamed:
+        monkeypatch.setattr(os, "replace", raise_full)
+    limit = contextlib.nullcontext() if is_renamed else file_size_limit(1)
+    with limit, pytest.raises(lv.InputError, match=r"No space left|cannot write"):
+        call(results, path)
+    assert path.read_bytes() == BEFORE
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+@needs_hdf5
+@pytest.mark.parametrize("size", [4096, 24576])
+def test_a_full_disk_while_fclib_writes_is_an_error(tmp_path, size):
+    """HDF5 itself ends the process by a signal if a write fails that is not its first."""
+    path = tmp_path / "p.hdf5"
+    a = np.random.default_rng(0).normal(size=(60, 60))
+    with file_size_limit(size), pytest.raises(lv.InputError, match="cannot write"):
+        lv.Problem.contact(a @ a.T, np.ones(60), np.full(20, 0.5)).save(path)
+    assert not os.listdir(tmp_path)
+
+
+def test_store_on_a_full_disk_raises_and_keeps_the_earlier_rows(tmp_path):
+    path = tmp_path / "records.jsonl"
+    row = {"kind": "skip", "run": "run", "case": "case", "solver": "pgs", "reason": "reason"}
+    with Store(path) as store:
+        store.add(row)
+        size = path.stat().st_size
+        with file_size_limit(size), pytest.raises(lv.InputError, match=r"cannot write .* free disk space"):
+            store.add(row)
+    assert len(report.read(path)) >= 1  # The second line may be flushed when the file is closed.
+
+
+WRITE_AND_DIE = """if True:
+    import os, signal, sys
+    from pathlib import Path
+    from lavender.io.stored import write_atomically
+    from lavender.sim.web import compile
+
+    def write(part):
+        Path(part).write_bytes(b"half")
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    if sys.argv[1] == "module":
+        Path.replace = lambda part, target: os.kill(os.getpid(), signal.SIGKILL)
+        compile.write_atomically(Path("a.txt"), b"half")
+    write_atomically("a.txt", write)"""
+
+
+@pytest.mark.parametrize("kind", ["file", "module"])
+def test_killed_writer_leaves_the_old_file_and_a_temporary_one(kind, tmp_path):
+    (tmp_path / "a.txt").write_bytes(BEFORE)
+    python("-c", WRITE_AND_DIE, kind, cwd=tmp_path, status=-signal.SIGKILL)
+    assert (tmp_path / "a.txt").read_bytes() == BEFORE
+    (part,) = (p for p in tmp_path.iterdir() if p.name != "a.txt")
+    assert TEMPORARY_NAME.fullmatch(part.name)
+
+
+def test_folder_of_steps_is_continued_by_its_recording_alone(tmp_path):
+    simulation = lv.Simulation("stack")
+    assert len(simulation.record(tmp_path, 2)) == 2
+    assert len(simulation.record(tmp_path, 2)) == 2  # the next two steps
+    with pytest.raises(lv.InputError, match="holds 4 problem files"):
+        lv.Simulation("stack").record(tmp_path, 2)
+
+
+COMMANDS = [
+    ("report", "stack(n=2)", "--solvers", "sequential_impulses", "--tolerances", "1e-3", "--budgets", "4",
+     "--repeats", "1", "--out", "report"),
+    ("run", "stack", "--steps", "3", "--record", "steps", "--trace", "t.csv", "--plot", "t.svg", "--film", "t.gif"),
+    ("solve", "stack(n=2)", "--output", "solution.npz"),
+    ("export", "c", "c"),
+    ("web", "page", "page"),
+]  # fmt: skip
+
+
+def test_every_command_writes_files_under_temporary_names_first(tmp_path):
+    """A reader, a full disk or a signal finds the old file or the new one; records are added to their file."""
+    pytest.importorskip("Cython", reason="the export translates the kernels (extra: test)")
+    script = """if True:
+        import os, sys
+        from lavender import cli
+        from lavender.sim.web import pages
+        pages.get_or_build_module = lambda say, name: b"a module"
+        here, opened = os.getcwd(), set()
+
+        def watch(event, given):
+            if event == "open" and isinstance(given[0], (str, os.PathLike)) and given[2] & (os.O_WRONLY | os.O_RDWR):
+                path = os.path.abspath(given[0])
+                temporary = os.path.isdir(path) or ".part" in os.path.basename(path)
+                if path.startswith(here) and not temporary:
+                    opened.add(os.path.relpath(path, here))
+
+        sys.addaudithook(watch)
+        for words in COMMANDS:
+            try:
+                cli.main(list(words))
+            except SystemExit as end:
+                assert not end.code, (words, end.code)
+        print("OPENED", sorted(opened))"""
+    done = python("-c", script.replace("COMMANDS", repr(COMMANDS)), cwd=tmp_path)
+    files = {p.relative_to(tmp_path).parts[0] for p in tmp_path.rglob("*") if p.is_file()}
+    assert files >= {"report", "steps", "t.csv", "t.gif", "c", "page"}
+    opened = literal_eval(done.stdout.splitlines()[-1].removeprefix("OPENED "))
+    assert opened == ["report/records.jsonl"]
+
+
+# -- records ------------------------------------------------------------------------------------------------------
+
+
+def test_read_records_of_a_malformed_line_names_its_number(tmp_path):
+    for text in ("[" * 100_000, "1" * 5000, '{"kind": ["run"]}', "null", "\x00\x00"):
+        (tmp_path / "records.jsonl").write_text(f"{text}\n")
+        with pytest.raises(lv.InputError, match="line 1"):
+            report.read(tmp_path)
+
+
+def test_a_record_of_an_undescribed_case_is_rejected(tmp_path):
+    plan, rows = report.Plan(tolerances=(1e-3,), budgets=(), repeats=1), []
+    report.run([stack(name="one")], ["pgs"], plan, into=rows)
+    lines = [json.dumps(to_jsonable(row)) for row in rows if row["kind"] != "case"]
+    (tmp_path / "records.jsonl").write_text("\n".join(lines) + "\n")
+    with pytest.raises(lv.InputError, match="a record belongs to a case that no line describes"):
+        report.read(tmp_path)
+
+
+def test_file_names_of_long_names_differ():
+    names = ["n" * 300 + str(i) for i in range(3)]
+    assert len({make_file_name(name) for name in names}) == 3
+    items = report.resolve_sources([stack(name=n) for n in [*names, names[0], "x", "x", "x #2"]])
+    assert len({make_file_name(item.name).lower() for item in items}) == len(items)
