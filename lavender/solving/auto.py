@@ -5,7 +5,8 @@
                      is estimated to cost no more than the first sweeps (`small.py`); attempted once
     large problems   under Coulomb's law, from `relaxed_rows` rows on (of J and M, if the velocities belong to free
                      bodies). The convex relaxation has the same solution if no contact slips, so it comes first, and
-                     every iterate is judged under Coulomb's law. Islands that a stage has solved do not continue
+                     every iterate is judged under Coulomb's law. Islands that a stage has solved do not continue. If
+                     bodies touch at several points and Newton's method costs few sweeps, 1 to 3 do not run
                      1. `anderson` under the cone law, while the sweeps that it predicts cost less than Newton's method
                      2. the same after an analysis of Newton's matrix, for at least `sweep_fraction` of its cost
                      3. `admm` from zero, up to 0.4 times that cost, if this pays for 150 iterations

@@ -89,6 +89,21 @@ class DecisionTree:
             return None
         return state
 
+    @cached_property
+    def has_cheap_newton(self) -> bool:
+        """Whether Newton's method over bodies that touch at several points costs so little that no sweeps precede it.
+
+        Bodies with one contact for each pair, as in piles of balls, fill the factor, so their sweeps need no analysis.
+        """
+        rows = self.problem.rows
+        if rows is None:
+            return False
+        body = rows.contact_body.astype(np.int64)
+        if len(body) < DECISIONS.face_contacts * len(np.unique(body[:, 0] * (1 << 32) + body[:, 1])):
+            return False
+        state = self.newton_state
+        return state is not None and state.cost < DECISIONS.cheap_newton * self.relaxed_sweep
+
     @property
     def solver_costs(self) -> dict[str, float]:
         """Estimated costs [ns] of the factorising solvers, the cheapest first; a failed `newton` comes last."""
@@ -223,7 +238,7 @@ class DecisionTree:
 
     def iterate_relaxed_stages(self) -> Iterator[Stage]:
         """Yield the first stages of a large problem with friction, unless they have run on a larger problem."""
-        if self.first_stage <= 1:
+        if self.first_stage <= 1 and not self.has_cheap_newton:
             cost = self.min_newton_cost
             least = cost / self.relaxed_sweep
             yield Stage("anderson", inf, cost, "before any analysis", least=least, position=1)
@@ -232,8 +247,8 @@ class DecisionTree:
             return
         cost = ADMM_FRACTION * state.cost
         iterations = min(cost / (SWEEPS_PER_ADMM_ITERATION * self.relaxed_sweep), MAX_ADMM_ITERATIONS)
-        runs_admm = iterations >= MIN_ADMM_ITERATIONS
-        if self.first_stage <= 2:
+        runs_admm = iterations >= MIN_ADMM_ITERATIONS and not self.has_cheap_newton
+        if self.first_stage <= 2 and not self.has_cheap_newton:
             why = f"up to {format_seconds(1e-9 * state.cost)}, as much as newton costs"
             least = state.cost / self.relaxed_sweep
             if runs_admm:

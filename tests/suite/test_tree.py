@@ -55,6 +55,7 @@ FIRST = {
     "a loose pile, J and M": (lambda: general(suite.case("granularF(n=6, seed=2)").problem), RELAXED),
     "a pile that rolls": (lambda: drawn(seed=98103, part="rolling").problem, RELAXED),
     "a pile that rolls, a matrix": (lambda: as_matrix(drawn(seed=98103, part="rolling").problem), RELAXED),
+    "a wall of bricks": (lambda: suite.case("wall(n=6)").problem, RELAXED[2:]),
     "a tight pile": (lambda: suite.pyramid(k=6, friction="coulomb").problem, [*SWEPT, "newton"]),
 }  # fmt: skip
 
