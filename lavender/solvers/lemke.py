@@ -27,7 +27,7 @@ from lavender.solvers.pivoting import PivotState
 from lavender.solvers.polyhedral import bound_converted_row_count
 from lavender.solvers.registry import Solver, SolverSpec
 from lavender_ext.pivot import lemke
-from lavender_ext.pivot.lemke import DONE, LATE, RAY
+from lavender_ext.pivot.lemke import DONE, EXCHANGES, LATE, RAY
 
 RAY_MESSAGE = (
     "ended on a secondary ray: this method cannot continue, but a solution may exist (auto tries others)"
@@ -81,7 +81,7 @@ class Lemke(Solver):
     def _follow_paths(
         self, state: PivotState, paths: lemke.Lemke, max_iter: int, tol: float, deadline: Deadline, chunk: int
     ) -> Claim:
-        """Do up to `max_iter` pivots and return the claim; Ctrl-C is checked after each `chunk` pivots."""
+        """Do up to `max_iter` pivots and return the claim; Ctrl-C is checked after each `chunk` pivots or exchanges."""
         rows, message = state.rows, ""
         certificate: FloatArray | None = None
         while True:
@@ -100,7 +100,7 @@ class Lemke(Solver):
                 status = Status.ROUNDOFF_LIMIT if rows.above_floor <= tol else Status.STALLED
             elif code == LATE or deadline.has_passed():
                 status = Status.TIME_LIMIT
-            elif paths.pivots >= max_iter:
+            elif code != EXCHANGES and paths.pivots >= max_iter:
                 status = Status.MAX_ITERATIONS
             else:
                 continue

@@ -63,6 +63,7 @@ cdef struct direct_t:
     double larger_shift         # If this is positive, it is the next shift.
     int32_t passes              # number of passes begun
     int32_t waited              # number of passes since the best residual was last halved
+    int32_t descent_steps       # number of steps of descent in this pass
     int32_t is_pass_over        # The next step begins a pass.
     double halved_from          # residual that the next pass has to halve
 

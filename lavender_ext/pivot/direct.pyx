@@ -39,7 +39,8 @@ from lavender_ext.judge.score cimport is_at_floor, make_empty_score, score_t
 from lavender_ext.pivot.direct cimport CYCLING, DESCENT, EXCHANGE, GUESS, PASS, PASS_ENDED, PASS_HALVED, PASSES_USED, direct_t
 from lavender_ext.pivot.principal cimport (INDEFINITE, ROUNDS_USED, SMALL_PIVOT, SOLVED, STUCK, bind_pivoting_arrays,
                                            compute_slack_and_rounding, correct_free_row_solution, exchange_infeasible_rows,
-                                           factor_all_rows, factor_free_rows, guess_free_rows_by_sweeps, pivoting_t,
+                                           factor_all_rows, factor_free_rows, guess_free_rows_by_sweeps,
+                                           has_passed_after_product, pivoting_t,
                                            reset_exchange_patience, reset_pivoting, run_exchange_rounds, set_diagonal_shift,
                                            solve_with_all_rows_free)
 
@@ -50,6 +51,8 @@ cdef enum:
     MAX_WAITED_PASSES = 6       # Passes end after this many in a row that do not halve the best residual.
     N_SHIFTS = 5                # Number of shifts that a descent uses.
     MAX_STEP_LENGTHS = 41       # Largest number of step lengths in a line search: 1, 1/2, ... 2^-40.
+    DESCENT_STEPS_PER_ROW = 4   # A descent ends after DESCENT_STEPS_PER_ROW n + EXTRA_DESCENT_STEPS steps.
+    EXTRA_DESCENT_STEPS = 200
 
 
 # -- arrays and begin --------------------------------------------------------------------------------------------
@@ -127,7 +130,7 @@ cdef inline int32_t refine_free_rows(direct_t* t) noexcept nogil:
     cdef double previous = INFINITY
     cdef int32_t _
     for _ in range(MAX_CORRECTIONS):
-        if is_best_impulse_accurate(t) or not t.now < 0.5 * previous:
+        if is_best_impulse_accurate(t) or not t.now < 0.5 * previous or has_passed_after_product(&t.s):
             break
         previous = t.now
         correct_free_row_solution(&t.s)
@@ -217,7 +220,7 @@ cdef inline void recenter_proximal_term(direct_t* t) noexcept nogil:
 
 
 cdef inline void begin_proximal_pass(direct_t* t) noexcept nogil:
-    t.is_pass_over = 0
+    t.is_pass_over = t.descent_steps = 0
     t.passes += 1
     recenter_proximal_term(t)
     if t.larger_shift > 0.0 or t.next_shift < N_SHIFTS:
@@ -233,7 +236,7 @@ cdef inline void repeat_proximal_pass(direct_t* t) noexcept nogil:
     cdef double previous = INFINITY
     cdef int32_t _
     for _ in range(MAX_CORRECTIONS):
-        if is_best_impulse_accurate(t) or not t.now < 0.5 * previous:
+        if is_best_impulse_accurate(t) or not t.now < 0.5 * previous or has_passed_after_product(&t.s):
             break
         previous = t.now
         recenter_proximal_term(t)
@@ -308,7 +311,7 @@ cdef inline bint choose_free_rows(direct_t* t) noexcept nogil:
 cdef inline double search_step_length(direct_t* t) noexcept nogil:
     """Find the step length (4), and compute x and w at its end.
 
-    phi(y) - phi(x) = 1/2 (w(x) + w(y)).(y - x) has no cancellation.
+    phi(y) - phi(x) = 1/2 (w(x) + w(y)).(y - x) has no cancellation. Return 0 if no step length meets (4): phi is at its rounding.
     """
     cdef pivoting_t* s = &t.s
     cdef int32_t i, _
@@ -323,10 +326,10 @@ cdef inline double search_step_length(direct_t* t) noexcept nogil:
             move = s.x[i] - t.origin[i]
             promised += t.slope[i] * move
             gained += (t.slope[i] + s.w[i]) * move
-        if 0.5 * gained <= 1e-4 * promised:
-            break
+        if 0.5 * gained <= 1e-4 * promised or has_passed_after_product(s):
+            return length
         length *= 0.5
-    return length
+    return 0.0
 
 
 cdef inline bint is_descent_minimum(const direct_t* t) noexcept nogil:
@@ -366,8 +369,12 @@ cdef inline int32_t run_descent_steps(direct_t* t, int32_t max_steps) noexcept n
         for i in range(s.n):
             t.step[i] = s.x[i] - t.origin[i]
         length = search_step_length(t)
-        if length == 1.0 and is_descent_minimum(t):
+        t.descent_steps += 1
+        if (length == 0.0 or t.descent_steps >= DESCENT_STEPS_PER_ROW * s.n + EXTRA_DESCENT_STEPS
+                or (length == 1.0 and is_descent_minimum(t))):
             code = SOLVED
+            break
+        if s.late:
             break
     judge_iterate(t)
     return code

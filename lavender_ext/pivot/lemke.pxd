@@ -13,6 +13,7 @@ cpdef enum:                     # results of `follow_lemke_paths`
     PIVOTS = 1                  # the pivots of the call are used up
     RAY = 2                     # no variable leaves: `get_ray_direction` may be a certificate
     LATE = 3                    # the deadline has passed
+    EXCHANGES = 4               # the exchanges at the end of a path need another call, which does not count as pivots
 
 
 cdef struct dictionary_t:

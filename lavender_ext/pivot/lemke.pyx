@@ -27,7 +27,8 @@ States of a solve, and the events that change them:
     START  -> WALK     a dictionary is built; z is basic unless s = 0 is the solution
     WALK   -> WALK     the pivots of the call are used up: returns PIVOTS
     WALK   -> FINISH   z has left, or the path is too long, or no row leaves: then returns RAY, whose direction the host checks
-    WALK -> WALK, FINISH -> FINISH   the deadline has passed: returns LATE
+    FINISH -> FINISH   the exchanges are not over: returns EXCHANGES after FINISH_ROUNDS rounds
+    START -> START, WALK -> WALK, FINISH -> FINISH   the deadline has passed: returns LATE
     FINISH -> START    the residual is above rounding: another path, with another covering vector c
     FINISH -> OVER     the residual is at rounding, or there were MAX_PATHS paths: returns DONE
 
@@ -47,7 +48,7 @@ from lavender_ext.core.order cimport next_random
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.pivot.direct cimport (Pivoting, begin_direct_solve, begin_bound_exchanges, direct_t, is_solved_to_rounding,
                                         judge_iterate, step_direct_solve)
-from lavender_ext.pivot.lemke cimport DONE, LATE, PIVOTS, RAY, dictionary_t, lemke_t
+from lavender_ext.pivot.lemke cimport DONE, EXCHANGES, LATE, PIVOTS, RAY, dictionary_t, lemke_t
 from lavender_ext.pivot.principal cimport AT_LOWER, AT_UPPER, FREE
 
 
@@ -326,14 +327,22 @@ cdef inline int32_t find_pivot_pair_of_free_rows(lemke_t* l, int32_t* r, int32_t
     return found
 
 
-cdef inline void pivot_out_free_rows(lemke_t* l) noexcept nogil:
+cdef inline bint has_passed_after_pivot(const lemke_t* l) noexcept nogil:
+    """Count the work of a pivot, 1 ns per entry ("dictionary pivot" of the rates); return whether the deadline has passed."""
+    return has_passed(l.t.s.deadline, <double>l.d.width * l.d.n_pairs)
+
+
+cdef inline bint pivot_out_free_rows(lemke_t* l) noexcept nogil:
     """Make s of every free row basic and w nonbasic, and retire both: move them behind the others.
 
-    Retired rows still follow the pivots of the path; retired columns do not, because their variables stay 0.
+    Retired rows still follow the pivots of the path; retired columns do not, because their variables stay 0. Return whether all
+    rows are retired; the deadline ends it before.
     """
     cdef dictionary_t* d = &l.d
     cdef int32_t r, c, bounded
     while d.n > first_free_pair(l):
+        if has_passed_after_pivot(l):
+            return False
         r, c = d.n - 1, d.n - 1 + FIRST                 # Without a pivot the row depends on others, and s stays 0.
         if find_free_pivot(l, &r, &c):
             pivot_dictionary(d, r, c)
@@ -347,18 +356,23 @@ cdef inline void pivot_out_free_rows(lemke_t* l) noexcept nogil:
         swap_dictionary_rows(d, r, d.n - 1)
         swap_dictionary_columns(d, c, d.n - 1 + FIRST)
         d.n -= 1
+    return True
 
 
 # -- a path ------------------------------------------------------------------------------------------------------
 
-cdef inline void begin_lemke_path(lemke_t* l) noexcept nogil:
-    """Build the dictionary, retire free rows, draw c unless this is the first path, and make z basic if a value is negative."""
+cdef inline bint begin_lemke_path(lemke_t* l) noexcept nogil:
+    """Build the dictionary, retire free rows, draw c unless this is the first path, and make z basic if a value is negative.
+
+    Return whether the path has begun; the deadline ends it before.
+    """
     cdef dictionary_t* d = &l.d
     cdef int32_t i, entering, r = 0
     cdef double* row
     cdef double* first_row
     build_dictionary_without_cover(l)
-    pivot_out_free_rows(l)
+    if not pivot_out_free_rows(l):
+        return False
     # covering vector
     for i in range(d.n_pairs):
         row = d.t + i * d.width
@@ -381,6 +395,7 @@ cdef inline void begin_lemke_path(lemke_t* l) noexcept nogil:
         pivot_dictionary(d, r, COVER)
         d.entering = column_of_nonbasic_variable(d, entering)
         l.n_pivots += 1
+    return True
 
 
 cdef inline int32_t follow_lemke_path(lemke_t* l, int32_t max_pivots) noexcept nogil:
@@ -399,7 +414,7 @@ cdef inline int32_t follow_lemke_path(lemke_t* l, int32_t max_pivots) noexcept n
         if leaving == 2 * d.n_pairs:
             return DONE
         d.entering = column_of_nonbasic_variable(d, complementary_variable(d, leaving))
-        if has_passed(l.t.s.deadline, <double>d.width * d.n_pairs):     # 1 ns per entry: "dictionary pivot" of the rates
+        if has_passed_after_pivot(l):
             return LATE
     return PIVOTS
 
@@ -477,7 +492,7 @@ cdef void begin_lemke_solve(lemke_t* l) noexcept nogil:
 
 
 cdef int32_t follow_lemke_paths(lemke_t* l, int32_t pivots) noexcept nogil:
-    """Do up to `pivots` further pivots; return DONE, PIVOTS, RAY or LATE. The best judged impulse is in t.best.
+    """Do up to `pivots` further pivots; return DONE, PIVOTS, EXCHANGES, RAY or LATE. The best judged impulse is in t.best.
 
     Several short calls give the same bits as one long call.
     """
@@ -486,7 +501,8 @@ cdef int32_t follow_lemke_paths(lemke_t* l, int32_t pivots) noexcept nogil:
         if l.state == START:
             if l.n_pivots >= max_pivots:
                 return PIVOTS
-            begin_lemke_path(l)
+            if not begin_lemke_path(l):
+                return LATE
         if l.state == WALK:
             code = follow_lemke_path(l, min(max_pivots, l.max_pivots))
             if code == PIVOTS and l.n_pivots < l.max_pivots or code == LATE:
@@ -497,10 +513,11 @@ cdef int32_t follow_lemke_paths(lemke_t* l, int32_t pivots) noexcept nogil:
             if code == RAY and not is_solved_to_rounding(l.t):
                 return RAY
         if l.state == FINISH:
-            while not l.t.is_over:
-                code = step_direct_solve(l.t, FINISH_ROUNDS)
-                if l.t.s.late:
-                    return LATE
+            step_direct_solve(l.t, FINISH_ROUNDS)
+            if l.t.s.late:
+                return LATE
+            if not l.t.is_over:
+                return EXCHANGES
             l.state = OVER if is_solved_to_rounding(l.t) or l.n_paths == MAX_PATHS else START
     return DONE
 
@@ -540,7 +557,7 @@ cdef class Lemke:
         begin_lemke_solve(&self.l)
 
     def run(self, int pivots):
-        """Do up to `pivots` further pivots; return DONE, PIVOTS, RAY or LATE."""
+        """Do up to `pivots` further pivots; return DONE, PIVOTS, EXCHANGES, RAY or LATE."""
         cdef int32_t code
         with nogil:
             code = follow_lemke_paths(&self.l, pivots)

@@ -56,6 +56,7 @@ cdef struct pivoting_t:
     outside_solve_t solve_outside       # y (n_free) <- solution
 
 
+cdef bint has_passed_after_product(pivoting_t* s) noexcept nogil
 cdef void bind_pivoting_arrays(pivoting_t* s, arena_t* a) noexcept nogil
 cdef void reset_pivoting(pivoting_t* s) noexcept nogil
 cdef void set_diagonal_shift(pivoting_t* s, double shift) noexcept nogil

@@ -236,6 +236,13 @@ cdef inline void predict_active_bounds(pivoting_t* s) noexcept nogil:
     s.is_factored = 0
 
 
+cdef bint has_passed_after_product(pivoting_t* s) noexcept nogil:
+    """Count the work of a symmetric sweep, or of a round without its factor; return and store whether the deadline has passed."""
+    cdef double cost = 4.0 * s.a.indptr[s.n]            # 4 ns per entry of A
+    s.late = s.late or has_passed(s.deadline, cost)
+    return s.late
+
+
 cdef inline void run_symmetric_sweeps(pivoting_t* s, int32_t n) noexcept nogil:
     """Do n symmetric sweeps x_i <- clip(x_i - omega w_i / d_i), with omega = 1.7 in the first sweep and 1 in the others.
 
@@ -246,6 +253,8 @@ cdef inline void run_symmetric_sweeps(pivoting_t* s, int32_t n) noexcept nogil:
     cdef double* x = s.x
     cdef double omega, w
     for k in range(n):
+        if has_passed_after_product(s):
+            return
         omega = 1.7 if k == 0 else 1.0
         for i in range(s.n):
             w = csr_row_dot(s.a, i, x) - s.p.b[i]
@@ -288,18 +297,11 @@ cdef inline bint is_solved_with_all_rows_free(pivoting_t* s) noexcept nogil:
     return True
 
 
-cdef inline double symmetric_sweep_cost() noexcept nogil:
-    """Return the time [ns] of a symmetric sweep, or of a round without its factor, per entry of A."""
-    return 4.0
-
-
 cdef int32_t run_exchange_rounds(pivoting_t* s, int32_t max_rounds) noexcept nogil:
     """Factor, solve and exchange, at most `max_rounds` times, until no row is infeasible or the deadline has passed."""
     cdef int32_t _, n_infeasible
-    cdef double cost = symmetric_sweep_cost() * s.a.indptr[s.n]
     for _ in range(max_rounds):
-        if has_passed(s.deadline, cost):
-            s.late = 1
+        if has_passed_after_product(s):
             return ROUNDS_USED
         s.n_rounds += 1
         set_bound_rows_to_bounds(s)

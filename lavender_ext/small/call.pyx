@@ -43,7 +43,7 @@ from lavender_ext.judge.score cimport make_empty_score
 from lavender_ext.local.gauss_seidel cimport prepare_exact_blocks, index_prepared_numbers
 from lavender_ext.pivot.direct cimport (PASS, PASS_HALVED, begin_direct_solve, bind_direct_arrays, direct_t,
                                         is_solved_to_rounding, step_direct_solve)
-from lavender_ext.pivot.lemke cimport RAY, begin_lemke_solve, bind_lemke_arrays, follow_lemke_paths, lemke_t
+from lavender_ext.pivot.lemke cimport EXCHANGES, RAY, begin_lemke_solve, bind_lemke_arrays, follow_lemke_paths, lemke_t
 from lavender_ext.pivot.principal cimport SMALL_PIVOT
 
 cdef object new = np.empty
@@ -186,15 +186,15 @@ cdef inline int32_t run_lemke_paths(direct_t* t, double tol, workspace_t* worksp
     """
     cdef lemke_t l
     cdef arena_t arena = make_arena(workspace.real, workspace.index)
-    cdef int32_t limit = LEMKE_PIVOTS_PER_ROW * t.s.n
+    cdef int32_t limit = LEMKE_PIVOTS_PER_ROW * t.s.n, code = RAY
     bind_lemke_arrays(&l, t, &arena)
     if not fits_workspace(workspace, &arena):
         if not grow_workspace_to_arena(workspace, &arena):
             return -1
         bind_lemke_arrays(&l, t, &arena)
     begin_lemke_solve(&l)
-    while follow_lemke_paths(&l, limit - l.n_pivots) == RAY:
-        pass
+    while code == RAY or code == EXCHANGES:
+        code = follow_lemke_paths(&l, limit - l.n_pivots)
     return l.n_pivots if t.relative <= tol else -1
 
 

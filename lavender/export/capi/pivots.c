@@ -68,7 +68,7 @@ static int32_t follow_paths(lav_solver *s, const lav_budget *budget) {
     left = budget->iterations - l->n_pivots;
     code = pivot_lemke_follow_lemke_paths(l, is_timed(budget) && left > BATCH ? BATCH : left);
     if (code == pivot_lemke_DONE) return LAV_STALLED;
-  } while (l->n_pivots < budget->iterations && !is_late(s, budget));
+  } while ((code == pivot_lemke_EXCHANGES || l->n_pivots < budget->iterations) && !is_late(s, budget));
   pivot_lemke_judge_unfinished_path(l);
   return l->n_pivots < budget->iterations ? LAV_TIME_LIMIT : LAV_MAX_ITERATIONS;
 }

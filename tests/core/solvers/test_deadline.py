@@ -17,7 +17,9 @@ from lavender.base.deadline import Deadline
 from lavender.base.rates import RATES
 from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import make_system, run_newton_method
+from lavender.solvers.pivoting import PivotState
 from lavender_ext.factor.linear import LinearSystem
+from lavender_ext.pivot import lemke
 
 MAX_WORK = 2e6  # ns of counted work between two readings, as docs/choose.md promises
 OWN = [name for name, spec in registry.specs().items() if spec.builtin and not spec.external]
@@ -75,6 +77,23 @@ def test_newton_reads_the_clock_within_two_milliseconds_of_counted_work(form):
     total, longest = deadline.counted
     assert total >= 0.3 * n * RATES["velocity contact row" if form == "velocities" else "row"] * problem.m
     assert longest <= MAX_WORK
+
+
+def test_lemke_reads_the_clock_within_two_milliseconds_of_counted_work():
+    """Three quarters of the rows are free and are retired before the path, whose pivots and exchanges follow."""
+    rng, m, deadline = np.random.default_rng(1), 300, counted_deadline()
+    half = rng.normal(size=(m, m))
+    lower = np.where(np.arange(m) % 4 == 0, 0.0, -np.inf)
+    problem = lv.Problem.lcp(half @ half.T / m + 0.1 * np.eye(m), rng.normal(size=m), lower)
+    state = PivotState(problem)
+    state.set_deadline(deadline)
+    paths, code = lemke.Lemke(state.rows), lemke.EXCHANGES
+    paths.set_start(problem.start())
+    while code == lemke.EXCHANGES:
+        code = paths.run(10**6)
+    total, longest = deadline.counted
+    assert code == lemke.DONE and state.rows.relative <= 1e-9
+    assert total >= RATES["dictionary pivot"] * 0.75 * m * m**2 and longest <= MAX_WORK
 
 
 class Readings:
