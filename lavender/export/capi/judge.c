@@ -41,7 +41,7 @@ static double see(lav_solver *s, double *impulse, double tol) {
   judge_measure_judge_view(&s->read, impulse, s->stopping_test.w, s->stopping_test.e, s->stopping_test.v, 0, &t);
   relative = judge_measure_relative_residual_of_score(&t, s->stopping_test.w, s->p.n_rows, s->start[0], s->start[1]);
   judge_best_copy_score_without_islands(best, &s->p, &t, relative);
-  if (tol < 0.0) return judge_best_store_start(best, &s->read, s->stopping_test.w, s->start[0], s->start[2], -tol, impulse);
+  if (tol < 0.0) return judge_best_store_start(best, &s->read, s->stopping_test.w, s->start[2], -tol, impulse);
   judge_best_store_better_islands(best, &s->read, impulse, s->stopping_test.w, tol);
   return relative;
 }
