@@ -20,6 +20,7 @@ import itertools
 import os
 import re
 import sys
+import tempfile
 import warnings
 from pathlib import Path
 
@@ -40,8 +41,7 @@ from lavender import registry, suite
 from lavender.base.deadline import format_seconds
 from lavender.problem import LAWS
 from lavender.report import Plan, Report, run, tables
-from lavender.report.figures import assign_styles, build_overall_figure, render_svg
-from lavender.report.findings import render_report
+from lavender.report.figures import draw_profile
 from lavender.report.text import format_residual, format_tolerance
 from lavender.sim.scene.gallery import SCENES
 
@@ -175,12 +175,16 @@ def fingerprint():
 
 
 def law_figures(report):
-    """Law -> SVG text: error against time over the cases of a law, lines with the solver's name as id."""
-    out = {}
+    """Law -> SVG text: performance profile over the cases of a law, lines with the solver's name as id."""
+    out, times = {}, report.get_times(report.tolerance)
     for law in LAWS:
-        figure = build_overall_figure(report, f"law-{law}", law)
-        if figure.curves:
-            out[law] = render_svg(figure, assign_styles(c.solver for c in figure.curves))
+        cases = [case for case in times if report.cases.at[case, "law"] == law]
+        own = times.loc[report.accepted[cases].any(axis=1), cases] if cases else times.iloc[:0]
+        if len(own):
+            with tempfile.TemporaryDirectory() as folder:
+                names = list(tables.rank_solvers(report, report.tolerance, cases).index)
+                draw_profile(own, names, Path(folder), f"law-{law}")
+                out[law] = (Path(folder) / f"law-{law}.svg").read_text(encoding="utf-8")
     return out
 
 
@@ -188,12 +192,9 @@ def highlighted(svg, solver):
     """Draw the figure with the curve of one solver in colour and the others in grey."""
     style = (
         '<style type="text/css">'
-        '[id*="--"] path, [id*="--"] use {stroke: #d0d0d0 !important}'
-        '[id*="--"] use {fill: #d0d0d0 !important}'
-        f'[id^="{solver}--"] path, [id^="{solver}--"] use {{stroke: #5b2a9d !important; stroke-width: 2 !important; '
-        "stroke-dasharray: none !important}"
-        f'[id^="{solver}--"] use {{fill: #5b2a9d !important}}'
-        "#legend_1 {display: none}</style>"
+        '[id*="--"] path {stroke: #d0d0d0 !important}'
+        f'[id^="{solver}--"] path {{stroke: #5b2a9d !important; stroke-width: 2 !important; '
+        "stroke-dasharray: none !important}</style>"
     )
     return svg.replace("</metadata>", "</metadata>" + style, 1)
 
@@ -309,8 +310,8 @@ def solver_page(site, spec, report, figures):
     parts += [
         "## When to use it",
         standing(report, spec.name),
-        "## Error against time",
-        "Its curve in colour, all other solvers of the same cases in grey; the dotted line is the floor of float64.",
+        "## Performance profile",
+        "The share of the cases solved within a factor of the fastest solver: its line in colour, all others in grey.",
     ]
     for name in LAWS:
         if name in spec.laws and name in figures and f'id="{spec.name}--' in figures[name]:
@@ -318,7 +319,7 @@ def solver_page(site, spec, report, figures):
             site.write(file, highlighted(figures[name], spec.name))
             parts += [
                 f"**{LAW_NAMES[name].capitalize()}**",
-                image("../" + file, f"{spec.name} on {LAW_NAMES[name]}"),
+                image("../" + file, f"performance profile of {spec.name} on {LAW_NAMES[name]}"),
             ]
     site.write(f"solvers/{spec.name}.md", "\n\n".join(p for p in parts if p))
 
@@ -506,31 +507,32 @@ def by_structure(report):
     """Return the report's table of the fastest solvers for each structure as markdown."""
 
     def cells(row):
-        pairs = list(row)[2:]
+        pairs = list(row)[3 : 3 + 2 * len(report.tolerances)]
         for names, number in zip(pairs[::2], pairs[1::2], strict=True):
             first, _, ties = names.partition(" ≈ ")
             number = "" if number != number else f" {format_seconds(number)}"
             yield f"**{first}**{number}" + (f"<br>≈ {ties.replace(' ≈ ', ', ')}" if ties else "")
 
-    frame = tables.tabulate_fastest(report)
+    frame = tables.tabulate_structures(report)
     rows = [
         (f"{row[0].replace(' / ', '<br>')}<br>{row[1]} cases", *cells(row))
         for row in frame.itertuples(index=False)
     ]
-    return f"{ADVICE}\n\n{wide(table(('structure', *list(frame)[2::2]), rows))}"
+    heads = [f"to {format_tolerance(x)}" for x in report.tolerances]
+    return f"{ADVICE}\n\n{wide(table(('structure', *heads), rows))}"
 
 
 def measured_page(site, report, figures):
     """Advice by structure and law from the records of this build, the curves behind it, and their report."""
     run = report.machine
     structures = f"{by_structure(report)}\n\n[A report's page](report.html) shows the same records."
-    site.write("report.html", render_report(report))
+    site.write("report.html", report.make_page().render())
     shown = ", ".join(f"{n} {v}" for n, v in run["versions"].items())
     drawn = []
     for law in LAWS:
         if law in figures:
             site.write(f"figures/all-{law}.svg", figures[law])
-            shot = image(f"figures/all-{law}.svg", f"error against time on {LAW_NAMES[law]}")
+            shot = image(f"figures/all-{law}.svg", f"performance profile on {LAW_NAMES[law]}")
             drawn += [f"## {LAW_NAMES[law].capitalize()}", shot]
     parts = [
         "# Measured in this build",
@@ -552,14 +554,15 @@ def measured_page(site, report, figures):
 
 def by_law(report):
     """Return the table of the three fastest solvers for each law, to each tolerance."""
-    rows, times = [], tables.tabulate_times(report)
-    for law in dict.fromkeys(times["law"]):
-        own, cells = times[times["law"] == law], []
-        for target in (f"to {format_tolerance(x)}" for x in TOLERANCES):
-            solved = own[f"solved {target}"]
-            first = own[(solved == solved.max()) & (solved > 0)].sort_values(f"time {target} [s]").head(3)
-            names = zip(first["solver"], first[f"time {target} [s]"], strict=True)
-            cells.append("<br>".join(f"**{name}** {format_seconds(t)}" for name, t in names) or "none")
+    rows = []
+    for law in dict.fromkeys(report.frame["law"].astype(str)):
+        cases, cells = list(report.cases.index[report.cases["law"] == law]), []
+        for tolerance in TOLERANCES:
+            ranking = tables.rank_solvers(report, tolerance, cases)
+            first = ranking[(ranking["solved"] == ranking["solved"].max()) & (ranking["solved"] > 0)].head(3)
+            cells.append(
+                "<br>".join(f"**{name}** {format_seconds(t)}" for name, t in first["mean"].items()) or "none"
+            )
         rows.append((LAW_NAMES[law], *cells))
     return wide(table(("", *(f"to {format_tolerance(x)}" for x in TOLERANCES)), rows))
 

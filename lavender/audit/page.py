@@ -6,17 +6,31 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from lavender.io.stored import format_json
-from lavender.report.render import Section, Statement, print_page, render_page, write_files
+from lavender.report.page import Page, tabulate_frame
+from lavender.report.render import print_table, write_files
 from lavender.report.text import format_count, format_percent
 
 if TYPE_CHECKING:
     import pandas as pd
     from rich.console import Console
+
+
+class Section(NamedTuple):
+    """A heading with tables, functions that draw figures into a folder, lines to copy, and rows for a terminal."""
+
+    title: str
+    frames: Sequence[pd.DataFrame] = ()
+    note: str = ""
+    figures: Sequence[Any] = ()
+    code: Sequence[str] = ()
+    short: int = 0
+    short_frame: pd.DataFrame | None = None
+
 
 STOPPED_NOTE = "Stopped before the end: the numbers contain only the completed part."
 
@@ -47,18 +61,36 @@ class ResultPage:
     is_stopped: bool = False
 
     def write(self, folder: str | os.PathLike[str]) -> Path:
-        """Write `index.html`, `numbers.json` and `figures/*.svg`; return the path of the page."""
+        """Write `index.html`, `numbers.json` and `figures/*`; return the path of the page."""
+        from markupsafe import Markup
+
+        blocks: list[Any] = []
+        for section in self.sections:
+            drawn = [Markup(draw(Path(folder) / "figures")) for draw in section.figures]
+            code = [{"code": "\n".join(section.code)}] if section.code else []
+            frames = [tabulate_frame(frame, note=section.note) for frame in section.frames if len(frame)]
+            if drawn or code or frames:
+                blocks.append({"folded": [*code, *frames, *drawn], "title": section.title, "open": True})
         notes = [*self.notes, *([STOPPED_NOTE] if self.is_stopped else [])]
-        statements = list(map(Statement, self.headline))
-        page = render_page(
-            self.title, statements, self.sections, warnings=notes, folder=Path(folder) / "figures"
-        )
+        page = Page(self.title, "", self.headline[0], self.headline[1:], warnings=notes, blocks=blocks)
         numbers = format_json(self.numbers, indent=1) + "\n"
-        return write_files(Path(folder), {"index.html": page, "numbers.json": numbers}) / "index.html"
+        return (
+            write_files(Path(folder), {"index.html": page.render(), "numbers.json": numbers}) / "index.html"
+        )
 
     def print_short(self, console: Console) -> None:
         """Print the headline, the first rows of each section's first table, and the notes."""
-        print_page(console, list(map(Statement, self.headline)), self.sections)
+        Page("", "", self.headline[0], self.headline[1:]).print_head(console)
+        for section in self.sections:
+            for line in section.code:
+                console.print(f"    {line}", highlight=False, markup=False, soft_wrap=True)
+            if section.code and section.note:
+                console.print(section.note, highlight=False, markup=False)
+            rows = section.frames[0].head(section.short) if section.frames else None
+            frame = rows if section.short_frame is None else section.short_frame
+            if frame is not None and len(frame):
+                console.print()
+                print_table(console, frame)
         for i, note in enumerate(self.notes):
             console.print(f"{'' if i else chr(10)}{note}", style="yellow", highlight=False, markup=False)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import warnings
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lavender.audit.page import ResultPage, StepSizes, describe_exceedance
+from lavender.audit.page import ResultPage, Section, StepSizes, describe_exceedance
 from lavender.audit.pieces import (
     AUDIT_VERDICTS,
     N_WORST_WORLDS,
@@ -30,8 +31,6 @@ from lavender.io import read
 from lavender.io.npz import write_npz
 from lavender.io.stored import prepare_step_folder, write_arrays
 from lavender.judge.residuals import AT_FLOOR, CLOSE, DEFAULT_THRESHOLD, UNCONVERGED, WRONG
-from lavender.report.figures import Curve, Figure
-from lavender.report.render import Section
 from lavender.report.text import format_count, format_percent, format_size
 
 if TYPE_CHECKING:
@@ -469,20 +468,20 @@ class Audit:
                 columns[f"{prefix}{one.runs.name} [m/s]"] = np.quantile(errors, QUANTILES, method="higher")
         return _make_frame(columns if both.any() else {})
 
-    @property
-    def figure(self) -> Figure:
-        """Errors over time."""
-        width = -(-self.runs.steps // MAX_CURVE_POINTS)
-        parts = [self.numbers[0][:, k : k + width] for k in range(0, self.runs.steps, width)]
-        known = [(k * width, p[np.isfinite(p)]) for k, p in enumerate(parts) if np.isfinite(p).any()]
-        places = [k for k, _ in known]
-        curves = [
-            Curve(name, name, places, [float(np.quantile(p, q, method="higher")) or np.nan for _, p in known])
-            for name, q in (("median", 0.5), ("99 %", 0.99), ("worst", 1.0))
-            if known
-        ]
-        y_title = "velocity error [m/s]"
-        return Figure("over-time", "Errors of all worlds", "step", y_title, curves, x_log=False)
+    def draw_errors(self, folder: Path) -> str:
+        """Draw the errors over time."""
+        from lavender.report.drawing import BLUE, draw_figure, mark_errors
+
+        def fill(axes: Any) -> str:
+            mark_errors(axes, 1e-9, self.max_velocity_error or 1e-9, self.error_limit or 1e-3)
+            for q in (0.5, 0.99, 1.0):
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")
+                    axes.plot(np.nanquantile(self.numbers[0], q, axis=0).clip(min=0.5e-9), color=BLUE, lw=1.0)
+            axes.set_xlabel("step")
+            return f"Median, 99 % and worst error; largest {format_size(self.max_velocity_error)}"
+
+        return draw_figure("over-time", fill, (4.9, 3.3), {"left": 0.13, "right": 0.75}, folder=folder)
 
     # -- files ---------------------------------------------------------------------------------------------
 
@@ -606,7 +605,7 @@ class Audit:
             title="lavender audit", headline=self.headline, sections=[
                 Section("The same states", [self.comparison], short=5, note=AGAINST_NOTE),
                 Section("Claims and verdicts", [self.claims], short=len(OUTCOMES), note=CLAIMS_NOTE),
-                Section("Errors", [self.errors, self.verdicts], note, [self.figure], short=5),
+                Section("Errors", [self.errors, self.verdicts], note, [self.draw_errors], short=5),
                 Section("Rows and contacts", [self.judged_sizes.table], short=2, note=SIZES_NOTE),
                 Section("Worlds that diverged", [self.diverged], short=2, note=DIVERGED_NOTE),
                 Section("Worst rows", [self.worst_rows], short=3, note=ROWS_NOTE),

@@ -121,7 +121,7 @@ def report(
         from lavender.report.findings import Report, list_skip_reasons, print_report, write
         from lavender.report.tables import read_engine_answers
 
-        engines = [] if is_campaign(context) else read_engine_answers(files, measured.lines)
+        engines = read_engine_answers(files, measured.lines)
         shown = Report(measured.lines, old, options["time_budgets"], engines)
         # Write the files before printing, as a closed pipe can end the command while it prints. After Ctrl-C, the page
         # has no figures, so that the prompt is back soon.

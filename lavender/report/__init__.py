@@ -4,7 +4,7 @@ lines = lavender.report.run(["pile.npz"], ["pgs", "osqp"])    # a pandas DataFra
 lavender.report.select_runs(lines)           # one row for each run
 lavender.report.write(lines, "report")       # records.csv, tables, figures, index.html
 lavender.report.read("report")               # the lines of its records.jsonl
-lavender.report.tables.tabulate_times(lavender.report.Report(lines))
+lavender.report.tables.tabulate_solvers(lavender.report.Report(lines))
 """
 
 from importlib import import_module

@@ -29,7 +29,7 @@ from lavender.external.backends import explain_contradicted_claim
 from lavender.judge.residuals import MAX_EXCUSED_RESIDUAL, WRONG
 from lavender.judge.solution import CONTRADICTED, NOT_PROVEN, Solution, Status, raise_if_interrupted
 from lavender.problem import Problem, check_problem
-from lavender.report.render import format_cells, render_table
+from lavender.report.render import format_cells
 from lavender.report.text import format_residual, format_tolerance
 from lavender.solvers.registry import available, get, known, specs
 from lavender.solving.limits import check_time_limit
@@ -163,7 +163,7 @@ class CrossCheck:
 
     def _repr_html_(self) -> str:
         """Return the table for notebooks."""
-        return render_table(self.frame)
+        return str(format_cells(self.frame).to_html(index=False, border=0))
 
     @property
     def frame(self) -> DataFrame:

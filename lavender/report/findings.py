@@ -1,157 +1,551 @@
-"""Compute the sentences and tables of a report, print them on a terminal, and write them to a folder."""
+"""Make the sentences, the page, the files and the terminal's text of a report."""
 
 from __future__ import annotations
 
-from collections import Counter
+import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
 import pandas as pd
+from markupsafe import Markup
 
-from lavender.base.deadline import format_seconds
 from lavender.base.errors import InputError
-from lavender.io.stored import SUFFIXES
 from lavender.problem.derived import cached_property
-from lavender.report import tables
-from lavender.report.figures import build_figures
-from lavender.report.render import Section, Statement, format_markdown, print_table, render_page, write_files
+from lavender.report import figures, tables
+from lavender.report.page import Page, fold_table, make_table
+from lavender.report.render import escape_markdown, format_markdown, print_table, write_files
 from lavender.report.runner import Event
-from lavender.report.tables import INSIDE, PLAIN_SWEEPS, STRUCTURE_ORDER, Contents, is_plug_in, rank_solvers
-from lavender.report.text import escape_markdown, escape_unprintable, format_count, format_residual
+from lavender.report.sweeps import SweepStudy
+from lavender.report.tables import ENGINE_NAME, Contents, is_plug_in, rank_solvers
+from lavender.report.text import (
+    escape_unprintable,
+    format_count,
+    format_power,
+    format_residual,
+    format_speed,
+    format_time,
+)
 from lavender.report.text import format_tolerance as format_tol
 from lavender.report.timing import format_call
-from lavender.suite import FAMILIES
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-LONG_TABLES = ("cases", "failures", "runs", "skipped")  # Tables that are not written as LaTeX and Markdown.
-GROUPED_TABLES = ("runs", "sequences", "times")  # Tables that show equal first cells once on a terminal.
-# Largest number of lines of a short report, and how many of these the command adds: a blank line, the page, reused runs
-# and cases that did not load.
-MAX_LINES, COMMAND_LINES = 25, 5
-# Largest number of warnings about cases that did not load, and of notes about crashed solvers.
-MAX_LEFT_OUT = 3
-MAX_NOTES = 20  # Largest number of notes of one kind in a complete report.
-MAX_NAMED = 2  # A sentence names up to this many ties, misses or plug-ins.
-MAX_SWEEP_ERROR = 1e-3  # [m/s] A number of sweeps is recommended if no velocity error is larger.
-PLURALS = {"mesh": "meshes"}
-LIMITATIONS = """\
-Times are wall-clock times of one call of lv.solve, with the judge and Python, whose share below about 0.2 ms is as \
-large as the solver's. A simulation that reuses a factorisation between steps needs the set-up less often. BLAS and \
-OpenMP have one thread; threads that a backend starts in other ways are not limited.
-Means of times count the solved cases only: compare them only between solvers of the same cases.
-The residual is zero exactly at a solution; the distance of an impulse from the solution also depends on the \
-conditioning."""
-
-#: Title, meaning of the numbers, and function of each table, in their order.
-SECTIONS: dict[str, tuple[str, str, Callable[[tables.Contents], pd.DataFrame]]] = {
-    "structures": ("By structure", (
-        "The solver that solves the largest number of cases to each tolerance, then the fastest, with the mean time of "
-        "the cases that it solves. Solvers after ≈ tie with it within the noise of the repetitions."
-    ), tables.tabulate_fastest),
-    "in-time": ("In a time", (
-        "The solver with the smallest residual at the 90th percentile of the cases; none if no solver halves the "
-        "residual of nine cases of ten."
-    ), tables.tabulate_in_time),
-    "costs": ("Cost and rows", (
-        "Time to the middle tolerance as a power of the number of rows, fitted to the cases that a solver solves; "
-        "scatter: typical factor between a case and the fit."
-    ), tables.tabulate_costs),
-    "times": ("By law", "Number of cases that each solver solves, and their mean time.", tables.tabulate_times),
-    "budgets": ("By iterations", "Residual after fixed numbers of iterations.", tables.tabulate_budgets),
-    "claims": ("Claims and verdicts", (
-        "A claim is correct if the judge confirms it. The judge computes the residual from the problem's data."
-    ), tables.tabulate_claims),
-    "failures": (
-        "Failures", "Runs that missed their tolerance, that died, or that made a false claim.", tables.tabulate_failures
-    ),
-    "sweeps": ("Sweeps", (
-        "Largest errors over the steps after the first, after a fixed number of sweeps, from zero impulses (cold) and "
-        "from the impulses of the step before (carried). The velocity error is that of the worst row, the motion error "
-        "the largest difference of a body's velocity from that of a solution, over about 20 steps."
-    ), tables.tabulate_sweeps),
-    "engines": ("Inside the engine", (
-        "The engine's own answers, judged like all others. Its time excludes the copy of the problem and the judge."
-    ), tables.tabulate_engines),
-    "sequences": (
-        "Sequences", "All steps, cold and with the impulses of the step before (carried).", tables.tabulate_sequences
-    ),
-    "cases": ("Cases", "", tables.tabulate_cases),
-    "runs": ("Every case", "Time to each tolerance and smallest residual.", tables.tabulate_runs),
+MAX_SOLVERS = 10  # Rows of the table of solvers; the matrix has all.
+MAX_CASES = 40  # Above this number of problems, the matrix has a line for each structure.
+MAX_MATRIX_ROWS = 100  # Lines of the folded matrix of all problems; matrix.csv has all.
+MAX_WARNINGS = 3  # Warnings of one kind on the first screen.
+RATIO_EDGES = (1.1, 2.0, 5.0, 20.0)  # Edges of the colours of the matrix.
+COLUMNS_OF_FILE = (
+    "form",
+    "floor [-]",
+    "iterations",
+    "worst row",
+)  # runs.csv has these columns, the page has not.
+MUCH_FASTER = 1.25  # A solver is faster than another on a problem from this ratio of times on.
+LAW_TITLES = {
+    "linear": "joints only (linear)", "lcp": "contacts without friction, boxes (LCP)", "coulomb": "Coulomb friction",
+    "cone": "friction cone (relaxed)",
 }  # fmt: skip
-CAMPAIGN_SECTIONS = ("times", "budgets", "claims", "failures")  # Tables of a campaign, which has no times.
+HOW_TO_READ = (
+    "Times are wall-clock times of one call of lv.solve with the judge and Python, whose share below about 0.2 ms is "
+    "as large as the solver's: the minimum of the repetitions. The residual is the judge's relative residual, 1 at the "
+    "zero impulse and 0 exactly at a solution. Means are geometric, shifted by 10 µs; a problem that a solver does not "
+    "solve or does not accept counts as the time limit. Solvers tie if their means differ by less than twice the "
+    "spread of their repetitions. A simulation that reuses a factorisation between steps needs the set-up less often. "
+    "BLAS and OpenMP have one thread. Problems that the zero impulse solves are not ranked."
+)
 
 
-class Report(tables.Contents):
+class Section(NamedTuple):
+    """A table of a report with its title and the meaning of its numbers."""
+
+    title: str
+    frame: pd.DataFrame
+    note: str = ""
+
+
+class Report(Contents):
     """Contents of a report (`Contents`) with its sentences and tables."""
 
     @cached_property
-    def statements(self) -> tuple[Statement, ...]:
-        """The sentences of the recommendation."""
-        return recommend(self)
+    def ranking(self) -> pd.DataFrame:
+        """The ranking of solvers on `subject` to the middle tolerance, the engine's own included."""
+        return rank_solvers(self, self.tolerance, self.subject)
+
+    @cached_property
+    def first(self) -> str:
+        """The recommended solver; empty if none solves a case."""
+        solvers = self.ranking[(self.ranking["solved"] > 0) & (self.ranking.index != ENGINE_NAME)]
+        return str(solvers.index[0]) if len(solvers) else ""
+
+    def _describe_cases(self, names: Sequence[str]) -> str:
+        """Return words for cases: the only one's name, a number of problems, or of steps of a sequence."""
+        sequences = [name for name in self.cases.loc[list(names), "sequence"].unique() if name]
+        lost = sum(len(self.left_out.get(name, ())) for name in sequences or [""])
+        left_out = f" ({lost} left out)" if lost else ""
+        if sequences:
+            of = sequences[0] if len(sequences) == 1 else f"{len(sequences)} sequences"
+            return f"{format_count(len(names), 'step')} of {of}{left_out}"
+        return (f"{len(names)} problems" if len(names) > 1 else str(names[0])) + left_out
+
+    @cached_property
+    def verdict(self) -> str:
+        """The answer in one sentence."""
+        if self.is_sweep_study:
+            return self.sweeps.verdict
+        if not len(self.frame):
+            if len(self.newest):
+                return "The zero impulse solves every problem: no solver is ranked."
+            stopped = "Stopped: no problem was measured with every solver."
+            return stopped if self.is_stopped and len(self.runs) else "Nothing was measured."
+        named, target = self._describe_cases(self.subject), f"to {format_power(self.tolerance)}"
+        stopped = "Stopped early. " if self.is_stopped else ""
+        if not self.first:
+            best = self.frame.loc[self.frame["relative"].astype(float).idxmin()]
+            return (
+                f"{stopped}No solver brings {named} {target}; the smallest residual is "
+                f"{format_residual(best['relative'])}, by {best['solver']}."
+            )
+        row, n = self.ranking.loc[self.first], len(self.subject)
+        solved = (
+            f"all {named}" if row["solved"] == n > 1 else named if n == 1 else f"{row['solved']} of {named}"
+        )
+        text = (
+            f"{'Stopped early; so far, use' if self.is_stopped else 'Use'} {self.first}: it solves {solved}"
+        )
+        if self.is_campaign:
+            return f"{text} {target} (no times were measured)."
+        time = format_time(row["mean"])
+        if n == 1:
+            return f"{text} {target} in {time}."
+        unsolved = "" if row["solved"] == n else f", unsolved ones at {format_time(self.time_limit)}"
+        return f"{text}, in {time} on average ({format_time(row['worst'])} at worst{unsolved})."
+
+    @cached_property
+    def sentences(self) -> list[str]:
+        """Up to three sentences on other solvers and misses, and one on warm starts, the engine and sequences."""
+        if self.is_sweep_study:
+            return self.sweeps.sentences
+        if not self.first:
+            return []
+        parts = [self._describe_rivals(), self._describe_single_wins(), self._describe_misses()]
+        steps = [case for case in self.get_times(self.tolerance) if self.cases.at[case, "sequence"]]
+        if steps:
+            parts.append(self._describe_steps(steps))
+        return [*filter(None, [*parts, self._describe_engine()])]
+
+    def _describe_rivals(self) -> str:
+        """Return the ratios of the next three solvers that solve as many cases, or that they tie."""
+        row = self.ranking.loc[self.first]
+        rivals = self.ranking[
+            (self.ranking["solved"] == row["solved"])
+            & (self.ranking["false"] <= row["false"])
+            & ~self.ranking.index.isin([self.first, ENGINE_NAME])
+        ]
+        if self.is_campaign:
+            return f"As many are solved by {_join(rivals.index)}." if len(rivals) else ""
+        ties, others = rivals.index[rivals["tie"]], rivals[~rivals["tie"]].head(3)
+        texts = [f"{name} takes {r / row['mean']:.1f}×" for name, r in others["mean"].items()]
+        texts = [*texts[:1], *(text.replace(" takes", "") for text in texts[1:])]
+        tied = f"{_join(ties)} tie{'s' * (len(ties) == 1)} with it" if len(ties) else ""
+        text = "; ".join(filter(None, (tied, f"{', '.join(texts)} that time" if texts else "")))
+        same, n = int((self.ranking["solved"] == row["solved"]).sum()) - 1, len(self.subject)
+        last = ""
+        if len(self.ranking.index.difference([ENGINE_NAME])) == 1:
+            pass
+        elif n > 1 and same <= 3:
+            last = f"no other solver solves {f'all {n}' if row['solved'] == n else 'as many'}"
+        elif same == 0:
+            last = "no other solver solves it"
+        text = "; ".join(filter(None, (text, last)))
+        return f"{text.replace('no', 'No', 1) if text.startswith('no other') else text}." if text else ""
+
+    def _describe_single_wins(self) -> str:
+        """Return on how many problems which other solvers are faster, and the largest factor."""
+        honest = self.ranking.index[(self.ranking["false"] == 0) & (self.ranking.index != ENGINE_NAME)]
+        times = self.get_times(self.tolerance).loc[[*{*honest, self.first}], self.subject].sort_index()
+        own, best = times.loc[self.first], times.min()
+        lost = own.index[own > MUCH_FASTER * best]
+        if self.is_campaign or not len(lost) or len(self.subject) == 1:
+            return ""
+        wins = times[lost].idxmin().value_counts().head(3)
+        ratio = own[lost] / best[lost]
+        counts = ", ".join(f"{name} on {n}" for name, n in wins.items())
+        factor = f"{ratio.max():.1f}" if ratio.max() < 99.5 else f"{ratio.max():.0f}"
+        slower = f"{self.first} is then up to {factor}× slower ({ratio.idxmax()})"
+        return f"On single problems others are faster: {counts}; {slower}."
+
+    def _describe_misses(self) -> str:
+        """Return the cases that solvers accept and do not solve."""
+        missed = (self.ranking["tried"] - self.ranking["solved"]).sort_values(ascending=False, kind="stable")
+        missed = missed[missed > 0]
+        limit = "" if self.is_campaign else f" in {format_time(self.time_limit)}"
+        if not len(missed):
+            return (
+                f"Every solver solves each problem that it accepts{limit}." if len(self.ranking) > 1 else ""
+            )
+        own = self.ranking.loc[self.first]
+        text = ", ".join(f"{n} by {name}" for name, n in missed.head(6).items())
+        text += f" and {len(missed) - 6} more solvers" if len(missed) > 6 else ""
+        if own["solved"] < len(self.subject):
+            unsolved = self.get_times(self.tolerance)[self.subject].loc[self.first]
+            text += f". {self.first} misses {_join(unsolved.index[unsolved.isna()])}"
+        return f"Not solved{limit}: {text}."
+
+    def _describe_steps(self, steps: Sequence[str]) -> str:
+        """Return how steps of sequences are solved, if they are not the first sentence, and their warm starts."""
+        text = ""
+        ranking = rank_solvers(self, self.tolerance, steps)
+        first = self.first
+        if set(steps) != set(self.subject):
+            solvers = ranking[(ranking["solved"] > 0) & (ranking.index != ENGINE_NAME)]
+            if not len(solvers):
+                return f"No solver solves the {self._describe_cases(steps)}."
+            first = str(solvers.index[0])
+            row = solvers.iloc[0]
+            text = f"For the {self._describe_cases(steps)} use {first}: it solves {row['solved']}"
+            text += f", in {format_time(row['mean'])} on average. "
+        runs = self.ranked_runs[self.ranked_runs["case"].isin(steps) & (self.ranked_runs["solver"] == first)]
+        runs = runs[(runs["tol"] <= self.tolerance) & (runs["start"].astype(str) == "carried")]
+        runs = runs[runs["tol"] == runs["tol"].max()]
+        if not len(runs):
+            return f"{text}Each step is solved cold."
+        names = ["case", "solver", "tol", "iterations", "solution_hash"]
+        cold = set(
+            self.frame.loc[self.frame["start"] == "cold", names]
+            .astype(str)
+            .itertuples(index=False, name=None)
+        )
+        n = sum(run not in cold for run in runs[names].astype(str).itertuples(index=False, name=None))
+        carrying = runs["carry_time"].mean()
+        mapping = f" (mapping takes {format_time(carrying)} a step, not included)" if carrying > 0.0 else ""
+        changed = f"which changed {n} of {len(runs)} solves"
+        return f"{text}Each step starts from the impulses of the step before{mapping}, {changed}."
+
+    def _describe_engine(self) -> str:
+        """Return the errors of the engine's own answers, and its place if it is ranked."""
+        answers = tables.read_own_answers(self)
+        parts = []
+        if len(answers):
+            worst = answers.loc[answers["velocity"].idxmax()]
+            above = int((answers["velocity"] > self.error_limit).sum())
+            parts.append(
+                f"leaves up to {format_speed(worst['velocity'])} ({worst['worst'] or worst['file']}), above "
+                f"{format_speed(self.error_limit)} in {above} of {format_count(len(answers), 'answer')}"
+            )
+        if ENGINE_NAME in self.ranking.index:
+            row, n = self.ranking.loc[ENGINE_NAME], len(self.subject)
+            place = (
+                "ties with the first"
+                if row["tie"] and self.ranking["tie"].sum() > 1
+                else f"has place {row['place']}"
+            )
+            solved = f"{row['solved']} of {n} to {format_power(self.tolerance)}"
+            parts.append(
+                f"{place}: {solved}, in {format_time(row['mean'])} on average, without copy and judge"
+            )
+        name = tables.get_engine_name(answers if len(answers) else self.engines) if parts else ""
+        return f"Your engine's own {name} {'; it '.join(parts)}." if parts else ""
+
+    @cached_property
+    def code(self) -> tuple[str, ...]:
+        """Lines of Python with which the recommended solver was timed."""
+        if self.is_sweep_study or not self.first:
+            return ()
+        runs = self.ranked_runs
+        runs = runs[runs["case"].isin(self.subject) & (runs["solver"] == self.first)]
+        runs = runs[runs[["tol", "relative"]].max(axis=1) <= self.tolerance]
+        runs = runs[runs["tol"] == runs["tol"].max()]
+        call = SimpleNamespace(**runs.loc[runs["iterations"].astype(int).idxmax()].to_dict())
+        return format_call(call, bool((self.cases.loc[self.subject, "guess"] != "").any()))
+
+    @cached_property
+    def alarms(self) -> list[str]:
+        """Sentences on contradicted claims and on solvers that died."""
+        failures = tables.select_failures(self) if len(self.frame) else self.frame
+        failures = failures.astype(
+            dict.fromkeys(("solver", "case", "status", "message", "status_conflict"), str)
+        )
+        false = failures[failures["status_conflict"] != ""]
+        # Each solver that died is named once, plug-ins first. A backend that was killed at its time limit is not named.
+        died = failures[failures["status"].str.startswith(tables.DEATHS)].drop_duplicates("solver")
+        own = died["solver"].map(is_plug_in).astype(bool)
+        died = died[own | (died["status"] != "KILLED")].sort_values(
+            "solver", key=lambda s: ~s.map(is_plug_in)
+        )
+        crashed = [f"{r.solver} on {r.case}: {r.status}: {r.message}" for r in died.itertuples()]
+        false_claims = [
+            f"{r.solver} on {r.case}: {r.status_conflict.partition('; observed')[0]}"
+            for r in false.itertuples()
+        ]
+        return [*_limit("crashed", crashed, MAX_WARNINGS), *_limit("false claim", false_claims)]
 
     @cached_property
     def warnings(self) -> list[str]:
-        """Sentences on a busy machine, on missing times and on cases that are left out."""
-        texts = [self.busy_warning] if self.busy_warning else []
-        texts += ["Error and robustness without times: runs end by iterations."] if self.is_campaign else []
-        left_out = list_cases_not_loaded(self)
-        texts += [f"Left out of all numbers: {cases}: {reason}" for cases, reason in left_out[:MAX_LEFT_OUT]]
-        more = len(left_out) - MAX_LEFT_OUT
-        return [*texts, f"{more} more are left out: see the table Not run."] if more > 0 else texts
+        """Sentences on a busy machine, missing times, cases that are left out, and possible mistakes in data."""
+        return [
+            *(
+                [f"{self.busy} The times are invalid; measure again with --no-reuse."]
+                if self._shows_times
+                else []
+            ),
+            *(["Error and robustness without times: runs end by iterations."] if self.is_campaign else []),
+            *([f"Not measured to the end: {_join(self.unfinished)}."] if self.unfinished else []),
+            *_limit("left out", [f"{cases}: {reason}" for cases, reason in list_cases_not_loaded(self)]),
+            *_limit("suspicious", [f"{case}: {reason}" for case, reason in list_diagnostics(self)]),
+        ]
+
+    @property
+    def _shows_times(self) -> bool:
+        """Whether the machine was busy and the first screen shows times, which then are void."""
+        return bool(self.busy and not self.is_campaign and not self.is_sweep_study)
+
+    @property
+    def is_sweep_study(self) -> bool:
+        """Whether the report has only fixed numbers of sweeps, on steps in sequence."""
+        return bool(
+            len(self.frame) and (self.frame["mode"] == "budget").all() and len(tables.tabulate_sweeps(self))
+        )
 
     @cached_property
-    def overview(self) -> pd.DataFrame:
-        """The table of the first screen: the fastest solver by structure, or each solver if there is one structure."""
-        target = f"to {format_tol(self.tolerance)}"
-        if not len(self.frame):
-            return self.frame.iloc[:, :0]
-        if "sweeps" in self.sections and (self.frame["mode"] == "budget").all():
-            starts = ("carried", "cold")
-            errors = [f"{kind} error, {start} [m/s]" for kind in ("velocity", "motion") for start in starts]
-            name, wanted = "sweeps", ["sequence", "solver", "sweeps", *errors]
-        elif len(self.structures) > 1 and not self.is_campaign:
-            name, wanted = "structures", ["structure", target, f"time {target} [s]"]
-        else:
-            name, wanted = "times", ["law", "solver", "cases", f"solved {target}", f"time {target} [s]"]
-        table = self.sections[name].frames[0].rename(columns={f"time {target} [s]": "time [s]"})
-        single = [c for c in ("law", "sequence") if c in table and table[c].nunique() == 1]
-        return table[[c for c in (*wanted, "time [s]") if c in table and c not in single]]
+    def sweeps(self) -> SweepStudy:
+        """The sentences and blocks of a study of sweeps."""
+        return SweepStudy(self, self.error_limit)
 
     @cached_property
     def sections(self) -> dict[str, Section]:
-        """The tables by name, in their order; tables without rows are left out."""
-        names = CAMPAIGN_SECTIONS if self.is_campaign else tuple(SECTIONS)
-        made = []
-        for name, (title, note, make) in SECTIONS.items():
-            if name in names and len(self.frame):
-                made.append(Section(title, [make(self)], note, name=name))
-        if len(self.newest):
-            made += [self._compare_with_earlier_run()] if self.earlier is not None else []
-            note = "The zero impulse solves these cases. They are left out of all rankings."
-            made.append(
-                Section("Solved by the zero impulse", [tables.tabulate_idle(self)], note, name="idle")
-            )
+        """The tables by name; tables without rows are left out."""
+        sections: dict[str, Section] = {}
+        if self.earlier is not None and len(self.newest):
+            changes = tables.tabulate_changes(self)
+            title = f"Against {escape_unprintable(str(self.earlier.attrs.get('source', 'earlier runs')))}"
+            note = f"{changes.attrs['compared']} times compared, on problems with the same numbers in both."
+            sections["changes"] = Section(title, changes, note)
+        if len(self.frame):
+            sections |= {
+                "solvers": Section("Solvers", tables.tabulate_solvers(self), "Ranked to the middle tolerance."),
+                "structures": Section("By structure and size", tables.tabulate_structures(self), (
+                    "The solver that solves the largest number of problems to each tolerance, then the fastest, with "
+                    "its mean time. In a time: the smallest residual at the 90th percentile. Solvers after ≈ tie."
+                )),
+                "costs": Section("Time against rows", tables.tabulate_costs(self), (
+                    "Time to the middle tolerance as a power of the number of rows."
+                )),
+                "sequences": Section("Sequences", tables.tabulate_sequences(self), (
+                    "All steps, cold and with the impulses of the step before (carried)."
+                )),
+                "sweeps": Section("Sweeps", tables.tabulate_sweeps(self), (
+                    "Largest errors over the steps after the first, after a fixed number of sweeps."
+                )),
+            }  # fmt: skip
+            if self.is_campaign:
+                sections = {
+                    name: some for name, some in sections.items() if name not in ("structures", "costs")
+                }
+            sections["runs"] = Section("Every time and residual", tables.tabulate_runs(self))
+        skips = self.skips.groupby("reason", sort=False).agg(
+            solvers=("solver", lambda x: _join(dict.fromkeys(s for s in x if s), 99)),
+            cases=("case", lambda x: _join(dict.fromkeys(x), 4)),
+        )
+        sections["skipped"] = Section("Not run, and why", skips.reset_index()[["solvers", "cases", "reason"]])
         diagnostics = pd.DataFrame(list_diagnostics(self), columns=["case", "possible mistake"])
-        made.append(Section("Diagnostics about the data", [diagnostics], name="diagnostics"))
-        made.append(Section("Not run", [self.skips[["case", "solver", "reason"]]], name="skipped"))
-        return {section.name: section for section in made if len(section.frames[0])}
+        sections["diagnostics"] = Section("Possible mistakes in the data", diagnostics)
+        return {name: section for name, section in sections.items() if len(section.frame)}
 
-    def _compare_with_earlier_run(self) -> Section:
-        """Return the table of changes since the earlier run; its note has the number of compared times."""
-        assert self.earlier is not None
-        changes = tables.tabulate_changes(self)
-        compared = int(changes.pop("compared").iloc[0])
-        note = f"{compared} times compared, on cases with the same numbers in both (no steps of sequences)"
-        if changes.empty:
-            changes = pd.DataFrame(
-                {"change": ["nothing beyond noise" if compared else "nothing was compared"]}
+    # -- page ----------------------------------------------------------------------------------------------
+
+    def make_page(self, folder: Path | None = None, with_figures: bool = True) -> Page:
+        """Make the page; with `folder`, the figures are also written there."""
+        n, solvers = len(self.frame["case"].unique()), len(self.frame["solver"].unique())
+        limit = "" if self.is_campaign or not n else f" · limit {format_time(self.time_limit)} a solve"
+        source = f"lavender report · {format_count(n, 'problem')} × {format_count(solvers, 'solver')}{limit}"
+        blocks: list[Any] = []
+        if self.is_sweep_study:
+            source = self.sweeps.source
+            blocks = self.sweeps.make_blocks(folder, with_figures)
+        elif len(self.frame):
+            blocks = self._make_blocks(folder, with_figures)
+        title = "lavender report --sweeps" if self.is_sweep_study else "lavender report"
+        sections = self.sections
+        order = ("runs", "structures", "costs", "sequences", "sweeps", "diagnostics", "skipped")
+        changes = [fold_table(*sections["changes"], is_open=True)] if "changes" in sections else []
+        if "runs" in sections:  # The file has all columns.
+            runs = sections["runs"].frame
+            few = [
+                c
+                for c in runs
+                if not c.endswith("median [s]") and c not in ("form", "floor [-]", "iterations", "worst row")
+            ]
+            sections = sections | {"runs": sections["runs"]._replace(frame=runs[few])}
+        folded = [
+            fold_table(*sections[name], is_grouped=name == "runs") for name in order if name in sections
+        ]
+        machine = fold_table("Machine, versions, settings", self.describe_run())
+        notes = {"folded": [{"note": HOW_TO_READ}], "title": "How to read this page", "open": False}
+        return Page(
+            title, source, self.verdict, self.sentences, [line.strip() for line in self.code if "lv.solve" in line],
+            alarms=self.alarms, warnings=self.warnings,
+            blocks=[*blocks, *changes, *folded, machine, notes], footer=self._make_footer(),
+            mark=self.sweeps.mark if self.is_sweep_study else "", is_bad=self.is_sweep_study and self.sweeps.is_bad,
+        )  # fmt: skip
+
+    def _make_blocks(self, folder: Path | None, with_figures: bool) -> list[Any]:
+        """Make the table of solvers, the matrix and the figures."""
+        names = figures.select_drawn_solvers(list(map(str, self.ranking.index)))
+        times = self.get_times(self.tolerance)
+        n, drawn = len(self.subject), dict[str, list[Any]]()
+        if with_figures and not self.is_campaign and names:
+            best = times[self.subject].min()
+            slowest = str(best.idxmax()) if best.notna().any() else self.subject[0]
+            drawn["error"] = [Markup(figures.draw_error_against_time(self, slowest, names, folder))]
+            if n > 1:
+                drawn["profile"] = [Markup(figures.draw_profile(times[self.subject], names, folder))]
+            if n > 1 and len(self.tolerances) > 1:
+                drawn["slope"] = [Markup(figures.draw_time_to_accuracy(self, names, folder))]
+        beside = drawn.get("slope" if n > 1 else "error", [])
+        blocks: list[Any] = [{"pair": [[self._make_league()], beside]}]
+        if n > 1:
+            blocks.append(self._make_matrix(self._group_cases()))
+            if any(map(len, (drawn.get("profile", ()), drawn.get("error", ())))):
+                blocks.append({"pair": [drawn.get("profile", []), drawn.get("error", [])]})
+            if len(self.subject) > MAX_CASES and not self.is_campaign:
+                single = self.cases.loc[self.subject].sort_values(["law", "rows"]).head(MAX_MATRIX_ROWS)
+                every = [(LAW_TITLES.get(law, law), case, [case]) for case, law in single["law"].items()]
+                blocks.append(
+                    {"folded": [self._make_matrix(every)], "title": "Every problem × solver", "open": False}
+                )
+        return blocks
+
+    def _make_league(self) -> dict[str, Any]:
+        """Make the table of the first ten solvers, all plug-ins and the engine."""
+        ranking, rows = self.ranking, list[Any]()
+        shown = [
+            i
+            for i, name in enumerate(ranking.index)
+            if i < MAX_SOLVERS or name == ENGINE_NAME or is_plug_in(name)
+        ]
+        shown = ranking.iloc[shown]
+        n = int(ranking["cases"].iloc[0]) if len(ranking) else 0
+        means = shown["mean"].clip(lower=1e-9)
+        low, high = np.log10(means.min()) - 0.03, np.log10(means.max()) + 0.03
+        has_false = bool((shown["false"] > 0).any())
+        for name, row in shown.iterrows():
+            css = "first" if name == self.first else ""
+            missed, refused = int(row["tried"] - row["solved"]), int(n - row["tried"])
+            notes = [f"{missed} ✗"] if missed else []
+            notes += [f"{refused} not accepted"] if refused else []
+            notes += ["tie"] if row["tie"] and shown["tie"].sum() > 1 else []
+            cells: list[Any] = [(str(name), css, ""), (f"{row['solved']}/{n}", css, "")]
+            if not self.is_campaign:
+                ratio = row["mean"] / ranking.loc[self.first or ranking.index[0], "mean"]
+                place = 100.0 * (np.log10(max(row["mean"], 1e-9)) - low) / (high - low)
+                dot = Markup(f'<span class="dot"><i style="left:{place:.1f}%"></i></span>')
+                cells += [(format_time(row["mean"]), css, ""), (f"{ratio:.1f}", css, ""), (dot, "bar", "")]
+            cells += (
+                [(f"{row['false']} ✗" if row["false"] else "0", "bad" * bool(row["false"]), "")]
+                if has_false
+                else []
             )
-        title = f"Against {escape_unprintable(str(self.earlier.attrs.get('source', 'earlier runs')))}"
-        return Section(title, [changes], note, name="changes")
+            rows.append([*cells, (", ".join(notes), "text q wide" + " bad" * bool(missed), "")])
+        heads: list[Any] = ["solver", "solved"]
+        heads += [] if self.is_campaign else [f"{'mean ' * (n > 1)}time", "× best", ("", "bar", "")]
+        heads += ["false claims"] if has_false else []
+        note = ""
+        if n > 1 and not self.is_campaign:
+            note = (
+                f"Shifted geometric mean (10 µs), on a logarithmic scale; a problem not solved or not accepted counts "
+                f"as {format_time(self.time_limit)}."
+            )
+            note += f" The table below has all {len(ranking)} solvers." if len(ranking) > len(shown) else ""
+        named = f"all {n} problems" if n > 1 else "one problem"
+        small = f"{named}, to residual {format_power(self.tolerance)}"
+        heads.append(("", "wide", ""))
+        return make_table(rows, heads, classes="full", title="Which solver", small=small, note=note)
+
+    def _group_cases(self) -> list[tuple[str, str, list[str]]]:
+        """Return (group, name, cases) of the lines of the matrix: problems or structures, then sequences."""
+        single = [case for case in self.subject if not self.cases.at[case, "sequence"]]
+        lines = []
+        if len(single) <= MAX_CASES:
+            facts = self.cases.loc[single]
+            for law, some in facts.groupby("law", sort=False):
+                order = some.sort_values("rows", kind="stable").index
+                lines += [(LAW_TITLES.get(str(law), str(law)), case, [case]) for case in order]
+        for name, cases in self.structures.items():
+            is_sequence = bool(self.cases.at[cases[0], "sequence"])
+            if is_sequence or len(single) > MAX_CASES:
+                title = "sequences" if is_sequence else "structures"
+                count = format_count(len(cases), "step" if is_sequence else "problem")
+                label = f"{name.removeprefix('sequence ')}, {count}"
+                lines.append((title, label, cases))
+        return lines
+
+    def _make_matrix(self, lines: Sequence[tuple[str, str, Sequence[str]]]) -> dict[str, Any]:
+        """Make the matrix of problems × solvers: times as multiples of the fastest solver's."""
+        times = self.get_times(self.tolerance)
+        order = tables.order_solvers(self)
+        best, accepted = times.min(), self.accepted
+        ratios = times.div(best.where(best > 0.0, 1.0), axis=1)
+        best_runs = self.ranked_runs.sort_values("relative", key=lambda x: x.astype(float))
+        best_runs = best_runs.drop_duplicates(["solver", "case"]).set_index(["solver", "case"])
+        rows: list[Any] = []
+        group = ""
+        for title, label, cases in lines:
+            if title != group:
+                rows.append({"group": title, "span": len(order) + 2})
+                group = title
+            cases = list(cases)
+            fastest = (
+                format_time(best[cases].mean()) if best[cases].notna().any() and not self.is_campaign else "–"
+            )
+            facts = self.cases.loc[cases[0]]
+            cells: list[Any] = [
+                (label, "", f"{label}, {facts['rows']} rows, {facts['structure']}"),
+                (fastest, "b", ""),
+            ]
+            for solver in order:
+                is_accepted = accepted.loc[solver, cases]
+                if not is_accepted.any():
+                    cells.append(("·", "cn", ""))
+                    continue
+                own, missed = (
+                    ratios.loc[solver, cases],
+                    int((is_accepted & times.loc[solver, cases].isna()).sum()),
+                )
+                ratio = own.median()
+                if missed:
+                    run = best_runs.loc[(solver, cases[0])] if (solver, cases[0]) in best_runs.index else None
+                    why = f"{solver}: {missed} of {len(cases)} not solved, else {ratio:.1f}× the fastest"
+                    if len(cases) == 1 and run is not None:
+                        why = f"{solver}: {run['status']}, residual {format_residual(float(run['relative']))}"
+                    cells.append(("✗" if len(cases) == 1 else f"{missed} ✗", "cx", why))
+                else:
+                    text = "1" if ratio < 1.05 else f"{ratio:.1f}" if ratio < 9.95 else f"{ratio:.0f}"
+                    text = "✓" if self.is_campaign else text if ratio < 999.5 else ">999"
+                    mean = "" if self.is_campaign else format_time(times.loc[solver, cases].mean())
+                    cells.append(
+                        (text, f"c{np.searchsorted(RATIO_EDGES, ratio)}", f"{solver} {mean}".strip())
+                    )
+            rows.append(cells)
+        solved = times.notna().sum(axis=1)
+        foot = ["solved", ("", "b", ""), *(str(solved[name]) for name in order)]
+        limit = "" if self.is_campaign else f" in {format_time(self.time_limit)}"
+        key = [("1", "c0"), ("to 2", "c1"), ("to 5", "c2"), ("to 20", "c3"), ("slower", "c4"), ("✗", "cx"),
+               (f"not solved{limit}; · not accepted", ""), ("Columns: best first.", "wide")]  # fmt: skip
+        heads = [
+            "",
+            ("fastest", "b", ""),
+            *((Markup("<span>{}</span>").format(name), "", "") for name in order),
+        ]
+        return make_table(
+            rows, heads, foot=foot, key=key, classes="matrix ratios",
+            title="Time on each problem, as a multiple of the fastest solver",
+            small=f"to residual {format_power(self.tolerance)}",
+        )  # fmt: skip
 
     def describe_run(self) -> pd.DataFrame:
         """Return the machine, versions and plan of the newest run."""
@@ -168,31 +562,28 @@ class Report(tables.Contents):
             }
         return pd.DataFrame(facts.items(), columns=["fact", "value"], dtype=object)
 
-
-def render_report(report: Report, figures: bool = True, folder: Path | None = None) -> str:
-    """Return the page of a report as HTML; with `folder`, each figure is also written there as an SVG file."""
-    drawn = build_figures(report) if figures else []
-    files = "The folder of this page has every run in records.csv, the tables in tables/ and the figures in figures/."
-    sections = [
-        Section("Figures", figures=drawn[1:], name="figures"),
-        *report.sections.values(),
-        Section("Machine, versions, options", [report.describe_run()], files, name="machine"),
-        Section("Limitations", note=LIMITATIONS, name="limits"),
-    ]
-    if len(report.frame) and "failures" not in report.sections:
-        note = "Every run reached its target or the round-off floor, and every claim holds."
-        sections.insert(1, Section("No failures", note=note, name="failures"))
-    return render_page(
-        "lavender report", report.statements, sections[len(drawn) < 2 :], warnings=report.warnings,
-        first_figure=drawn[0] if drawn else None, folded=True, folder=folder,
-    )  # fmt: skip
+    def _make_footer(self) -> list[Any]:
+        """Return the files for a paper, and the versions, machine and date."""
+        run = self.machine
+        links = [f'<a href="tables/{name}.csv">{name}.csv</a>' for name in self.sections]
+        files = Markup(
+            'For a paper: <a href="tables/solvers.tex">solvers.tex</a>, figures/ as PDF, SVG and PNG; '
+            f'data: <a href="records.csv">records.csv</a> (every run), {", ".join(links)}.'
+        )
+        if not run:
+            return [files]
+        versions = ", ".join(f"{name} {x}" for name, x in run["versions"].items())
+        started = run["started"][:16].replace("T", " ")
+        software = f"lavender {run['lavender']} ({run['build'].get('commit', 'wheel')}), {versions}"
+        computer = f"Python {run['python']}; {run['cpu']}, {run['cores']} cores, 1 thread"
+        return [files, f"{software}, {computer}; run {run['run']}, {started} UTC."]
 
 
 def write(
     source: pd.DataFrame | Report, folder: str | Path, *, figures: bool = True,
     watch: Callable[[Event], None] = lambda event: None,
 ) -> Path:  # fmt: skip
-    """Write `records.csv`, `tables/*.csv`, `tables/*.tex`, `figures/*.svg`, `summary.md` and `index.html`.
+    """Write `index.html`, `records.csv`, `tables/*.csv`, `tables/solvers.tex`, `figures/*` and `summary.md`.
 
     Parameters
     ----------
@@ -221,113 +612,105 @@ def write(
             f"source is a {type(source).__name__}; the DataFrame of lavender.report.run or a Report is needed"
         )
     folder, files = Path(folder), dict[str, Any]({"records.csv": report.runs})
-    for name, section in report.sections.items():
-        for kind in ("csv",) if name in LONG_TABLES else ("csv", "tex"):
-            files[f"tables/{name}.{kind}"] = section.frames[0]
+    files |= {f"tables/{name}.csv": section.frame for name, section in report.sections.items()}
+    if "solvers" in report.sections and len(report.ranked_runs):
+        files["tables/matrix.csv"] = lambda: tables.tabulate_matrix(report)
+        files["tables/solvers.tex"] = lambda: make_latex_table(report)
     files["summary.md"] = lambda: summarise(report)
-    files["index.html"] = lambda: render_report(report, figures, folder / "figures")
+    files["index.html"] = lambda: report.make_page(folder / "figures", figures).render()
     order = {name: i for i, name in enumerate(files)}
     write_files(folder, files, lambda name: watch(Event(order[name], len(files), name, "", phase="writing")))
     return folder / "index.html"
 
 
+def make_latex_table(report: Report) -> str:
+    """Return the table of solvers for a paper: solved cases and mean times [ms]; needs the package booktabs."""
+    table = tables.tabulate_solvers(report)
+    solved = table["solved"].astype(str) + "/" + table["cases"].astype(str)
+    paper = pd.DataFrame({"solved": solved.to_numpy()}, index=table["solver"].map(_escape_latex))
+    paper.index.name = None
+    times = [f"to {format_tol(x)} [s]" for x in report.tolerances]
+    for tolerance, name in zip(report.tolerances, times, strict=True):
+        if name in table:
+            paper[f"$10^{{{round(np.log10(tolerance))}}}$"] = 1e3 * table[name].to_numpy()
+    numbers = list(paper.columns[1:])
+    n, run = int(table["cases"].max()), report.machine
+    caption = (
+        f"Problems solved to a residual of {format_tol(report.tolerance)}"
+        + (", and shifted geometric mean of the time [ms] to each residual" if numbers else "")
+        + f" over {format_count(n, 'problem')} (shift 10 µs; unsolved or not accepted at {report.time_limit:g} s). "
+        f"lavender {_escape_latex(str(run.get('lavender', '')))}, {_escape_latex(str(run.get('cpu', '')))}, one thread."
+    )
+    style = paper.style.format(precision=3, na_rep="--", subset=numbers)
+    style = style.highlight_min(subset=numbers, props="textbf:--rwrap;") if numbers else style
+    return style.to_latex(hrules=True, column_format="lr" + "r" * len(numbers), label="tab:solvers", position="t",
+                          caption=caption)  # fmt: skip
+
+
+def _escape_latex(text: str) -> str:
+    """Escape the characters that LaTeX reads as commands."""
+    return re.sub(r"([&%$#_{}])", r"\\\1", text.replace("\\", "/")).replace("~", "-").replace("^", "-")
+
+
 def summarise(report: Report) -> str:
-    """Return recommendations and tables in Markdown, to paste into a pull request."""
+    """Return the sentences and the table of solvers in Markdown, to paste into a pull request."""
     lines = ["## lavender report", ""]
     if run := report.machine:
         machine = f"{run['cpu']}, {run['threads']} thread; lavender {run['lavender']}, Python {run['python']}"
         lines += [escape_markdown(f"{machine}; run {run['run']}, {run['started']}"), ""]
-    for statement in report.statements:
-        lines += [escape_markdown(statement.text), ""]
-        lines += ["```python", *statement.code, "```", ""] if statement.code else []
-    for text in report.warnings:
-        lines += [f"**{escape_markdown(text)}**", ""]
-    for name, section in report.sections.items():
-        if name not in LONG_TABLES:
-            lines += [f"**{escape_markdown(section.title)}** {escape_markdown(section.note)}".rstrip(), ""]
-            lines += [*format_markdown(section.frames[0]), ""]
+    for text in (report.verdict, *report.alarms, *report.sentences, *report.warnings):
+        lines += [escape_markdown(text), ""]
+    lines += ["```python", *report.code, "```", ""] if report.code else []
+    for name in ("changes", "solvers"):
+        if name in report.sections:
+            lines += [*format_markdown(report.sections[name].frame), ""]
     return "\n".join(lines)
 
 
-# -- on a terminal -----------------------------------------------------------------------------------------
-
-
 def print_report(report: Report, console: Console, complete: bool = False) -> None:
-    """Print the recommendation, a table to the middle tolerance, and notes.
+    """Print the sentences, the first solvers or the sweeps, and warnings; `complete` prints every table."""
+    page = Page(
+        "", "", report.verdict, report.sentences, report.code, alarms=report.alarms, warnings=report.warnings
+    )
+    page.print_head(console)
+    short = ["changes", "sweeps" if report.is_sweep_study else "solvers"]
+    for name, section in report.sections.items():
+        if not complete and name not in short:
+            continue
+        note = f": {section.note}" if section.note else ""
+        frame, optional = section.frame, tuple[str, ...]()
+        if complete or name == "changes":
+            console.print(f"\n{section.title}{note}", style="bold", highlight=False, markup=False)
+        else:
+            console.print()
+        if not complete and name == "sweeps":
+            starts = ("carried", "cold")
+            errors = [f"{kind} error, {start} [m/s]" for kind in ("velocity", "motion") for start in starts]
+            wanted = ["sequence"] * (frame["sequence"].nunique() > 1) + ["solver", "sweeps", *errors]
+            frame = frame[[head for head in wanted if head in frame]]
+        elif not complete:
+            frame, optional = frame.head(MAX_SOLVERS), ("tie", "false claims", "accepted", "slowest [s]")
+        print_table(console, frame, optional)
 
-    A short report has up to `MAX_LINES` lines, none wider than the terminal. `complete` prints every sentence, table
-    and warning.
-    """
-    from rich.text import Text
 
-    lines: list[Text] = []
-    for i, statement in enumerate(report.statements):
-        lines.append(Text(statement.text, style="" if i else "bold"))
-        is_cut = len(statement.code) > 1 and not complete
-        code = [statement.call_line, "# all lines: --tables"] if is_cut else statement.code
-        lines += [Text(f"    {line}") for line in code]
-    lines += [Text(report.busy_warning, style="yellow")] if report.busy_warning else []
-    for text in lines:
-        console.print(text, highlight=False)
-    notes = [Text(text, style=style) for text, style in _list_notes(report, MAX_NOTES if complete else 1)]
-    if complete:
-        for name, section in report.sections.items():
-            note = f": {section.note}" if section.note else ""
-            console.print(Text.assemble("\n", (section.title, "bold"), note))
-            print_table(console, section.frames[0], grouped=name in GROUPED_TABLES)
-    elif n := len(report.overview):
-        above = sum(len(text.wrap(console, console.width)) for text in lines)
-        height = MAX_LINES - COMMAND_LINES - len(notes) - above
-        shown = n if n <= height - 2 else max(1, height - 3)
-        console.print()
-        print_table(console, report.overview.head(shown), cut=True)
-        if shown < n:
-            console.print(f"{n - shown} more: --tables", highlight=False, style="dim")
-    for text in notes:
-        console.print(
-            text, highlight=False, no_wrap=not complete, overflow="fold" if complete else "ellipsis"
+def _join(names: Any, most: int = 3) -> str:
+    """Join up to `most` names, and the number of the others."""
+    names = list(map(str, names))
+    more = len(names) - most
+    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
+
+
+def _limit(kind: str, texts: Sequence[str], most: int = 1) -> Iterator[str]:
+    """Yield the first texts of a kind of warnings, with their number if there are more."""
+    for i, text in enumerate(texts[:most], 1):
+        place = (
+            ""
+            if len(texts) == 1
+            else f" ({i} of {len(texts)})"
+            if most > 1
+            else f", the first of {len(texts)}"
         )
-
-
-def _list_notes(report: Report, longest: int) -> Iterator[tuple[str, str]]:
-    """Yield (note, style): at most `longest` notes of each kind; if there are more, a note has their number."""
-    failures = tables.select_failures(report) if len(report.frame) else report.frame
-    failures = failures.astype(dict.fromkeys(("solver", "case", "status", "message", "status_conflict"), str))
-    false = failures[failures["status_conflict"] != ""]
-    # Each solver that died is named once, plug-ins first. A backend that was killed at its time limit is not named.
-    died = failures[failures["status"].str.startswith(tables.DEATHS)].drop_duplicates("solver")
-    died = died.assign(own=died["solver"].map(is_plug_in).astype(bool)).sort_values("own", ascending=False)
-    died = died[died["own"] | (died["status"] != "KILLED")]
-    kinds = {
-        "crashed": ("red", [f"{r.solver} on {r.case}: {r.status}: {r.message}" for r in died.itertuples()]),
-        "false claim": ("red", [f"{r.case}, {r.solver}: {r.status_conflict}" for r in false.itertuples()]),
-        "suspicious": ("yellow", [f"{case}: {reason}" for case, reason in list_diagnostics(report)]),
-        "left out": ("yellow", [f"{cases}: {reason}" for cases, reason in list_cases_not_loaded(report)]),
-    }
-    for kind, (style, texts) in kinds.items():
-        shown = max(longest, MAX_LEFT_OUT) if kind == "crashed" else longest
-        for i, text in enumerate(texts[:shown], 1):
-            place = f" ({i} of {len(texts)})" if shown > 1 else f", the first of {len(texts)}"
-            yield f"{kind}{place if len(texts) > 1 else ''}: {text}", style
-    reasons = report.skips.loc[report.skips["solver"] != "", "reason"]
-    skipped = [reason.partition(":")[0] for reason in reasons]
-    replacements = Counter(pair for pair in skipped if " → " in pair)
-    for pair, n in replacements.items():
-        cases = format_count(n, "case")
-        yield f"{pair} on {cases} with bounds: the same method; the first accepts only free rows", ""
-    if refused := len(skipped) - replacements.total():
-        pairs = format_count(refused, "pair")
-        yield f"{pairs} of case and solver not run, or not to the end: the page has the reasons", "dim"
-    if "changes" in report.sections:
-        section = report.sections["changes"]
-        counts = sorted(Counter(section.frames[0]["change"]).items())
-        text = ", ".join(f"{n} {kind}" if "target" in section.frames[0] else kind for kind, n in counts)
-        yield f"{section.title}: {text} ({section.note})", ""
-    if "idle" in report.sections:
-        frame = report.sections["idle"].frames[0]
-        case, _, solver, velocity, _ = frame.iloc[-1]
-        cases, speed = format_count(len(frame), "case"), format_residual(velocity)
-        yield f"{cases} solved by the zero impulse; largest error {speed} m/s, by {solver} on {case}", "dim"
+        yield f"{kind}{place}: {text}"
 
 
 def list_diagnostics(report: Report) -> list[tuple[str, str]]:
@@ -373,197 +756,3 @@ def list_cases_not_loaded(report: Report) -> list[tuple[str, str]]:
             else:
                 cases.append((first["case"], first["reason"]))
     return cases
-
-
-# -- recommendation ----------------------------------------------------------------------------------------
-
-
-def recommend(report: Contents) -> tuple[Statement, ...]:
-    """Recommend a solver for all single cases together, then for the steps of all sequences.
-
-    A campaign, which has no times, has no recommendation.
-    """
-    if report.is_campaign:
-        return ()
-    if not len(report.frame):
-        stopped = report.is_stopped and len(report.runs)
-        return (Statement("Stopped: no problem was measured with every solver."),) if stopped else ()
-    single, sweeps = report.frame["step"] < 0, _recommend_sweeps(report)
-    if sweeps and (report.frame["mode"] == "budget").all():
-        return sweeps
-    parts = [some for some in (report.frame[single], report.frame[~single]) if len(some)]
-    return (*(_recommend_for(report, some) for some in parts), *sweeps)
-
-
-def _recommend_sweeps(report: Contents) -> tuple[Statement, ...]:
-    """State for each sequence the smallest number of sweeps that keeps every velocity error below the limit."""
-    table, statements = tables.tabulate_sweeps(report), []
-    limit = f"{1e3 * MAX_SWEEP_ERROR:g} mm/s"
-    for name, own in table.groupby("sequence", sort=False) if len(table) else ():
-        columns = [c for start in ("carried", "cold") if (c := f"velocity error, {start} [m/s]") in own]
-        smallest = {}
-        for column in columns:
-            good = own[(own[column] <= MAX_SWEEP_ERROR) & (own["steps"] == own["steps"].max())]
-            plain = good[good["solver"].isin(PLAIN_SWEEPS)]
-            smallest[column] = (plain if len(plain) else good).nsmallest(1, "sweeps").to_dict("records")
-        if "carried" in columns[0] and smallest[columns[0]]:
-            best, *cold = (x for column in columns for x in smallest[column])
-            cold = [f"cold: {x['sweeps']} of {x['solver']}" for x in cold] or ["cold: not reached"]
-            text = (
-                f"{name}: {format_count(best['sweeps'], 'sweep')} of {best['solver']} with warm starts keep every "
-                f"velocity error below {limit} ({format_residual(best[columns[0]])} m/s; {cold[0]})"
-            )
-            plain = own[own["solver"].isin(PLAIN_SWEEPS)]
-            if len(plain) and best["solver"] not in PLAIN_SWEEPS:
-                least = plain.loc[plain[columns[0]].idxmin()]
-                error = format_residual(least[columns[0]])
-                text += f"; without acceleration {least['sweeps']} of {least['solver']} leave {error} m/s"
-        else:
-            best = own.loc[own[columns[0]].idxmin()].to_dict()
-            text = (
-                f"{name}: no measured number of sweeps keeps every velocity error below {limit}; the smallest is "
-                f"{format_residual(best[columns[0]])} m/s, after {best['sweeps']} sweeps of {best['solver']}"
-            )
-        statements.append(Statement(f"{text}{_describe_own_sweeps(report, str(name))}."))
-    return tuple(statements)
-
-
-def _describe_own_sweeps(report: Contents, sequence: str) -> str:
-    """Return the largest velocity error of the engine's own answers to a sequence, if it was recorded."""
-    steps = report.cases[report.cases["sequence"] == sequence]
-    sources = steps.loc[steps["step"] > 0, "source"]  # The first step does not count in the table either.
-    answers = report.engines.reindex([str(Path(s)) for s in sources]).dropna(subset="velocity")
-    if not len(answers):
-        return ""
-    counts = answers["iterations"].dropna()
-    own = f" {counts.max():.0f} iterations" if len(counts) else " answers"
-    error = format_residual(answers["velocity"].max())
-    return f"; the engine's own{own} ({tables.get_engine_name(answers)}): {error} m/s"
-
-
-def _recommend_for(report: Contents, frame: pd.DataFrame) -> Statement:
-    """Recommend the first solver of the ranking on some cases, and name misses, ties, plug-ins and the engine."""
-    cases = list(frame["case"].unique())
-    ranking = rank_solvers(report, report.tolerance, cases)
-    named = _describe_cases(report, cases)
-    reached = f"down to {format_tol(report.tolerance)} of the error of the zero impulse"
-    engine = tables.rank_engine(report, report.cases.loc[cases], report.tolerance)
-    if not len(ranking) or not ranking["solved"].iloc[0]:
-        stopped = "Stopped: no" if report.is_stopped else "No"
-        return Statement(_add_engine(f"{stopped} solver brings {named} {reached}.", engine, None))
-    solver, first, runs = str(ranking.index[0]), ranking.iloc[0], report.ranked_runs
-    runs = runs[runs["case"].isin(cases)]
-    own = runs[(runs["solver"] == solver) & (runs[["tol", "relative"]].max(axis=1) <= report.tolerance)]
-    missed, unreached = _list_unsolved_cases(report, runs, cases, solver)
-    time = _describe_solved(first, named)
-    if first["worst"] > 3.0 * first["mean"]:
-        time += f" ({format_seconds(first['worst'])} at worst, {first['hardest']})"
-    loosest = own[own["tol"] == own["tol"].max()]
-    use = f"Stopped: {solver}" if report.is_stopped else f"Use {solver}: it"
-    sentences = [f"{use} {time}, {_describe_start(frame, loosest)}, {reached}."]
-    if missed:
-        sentences.append(f"Missed: {_shorten_list(missed)}.")
-    if unreached:
-        steps = format_count(unreached, "step")
-        sentences.append(f"Not reached within the time of a pass (--sequence-time-limit): {steps}.")
-    if report.unfinished:
-        sentences.append(f"Not measured to the end: {_shorten_list(report.unfinished)}.")
-    ties = [
-        f"{name} ({format_seconds(t)})" for name, t in ranking.loc[ranking["tie"], "mean"].iloc[1:].items()
-    ]
-    if ties:
-        sentences.append(f"As fast within the noise of the repetitions: {_shorten_list(ties)}.")
-    plug_ins = [
-        f"{name}: place {row['place']} of {len(ranking)}, {_describe_solved(row, format_count(row['cases'], 'case'))}"
-        for name, row in ranking.iterrows()
-        if is_plug_in(str(name)) and name != solver
-    ]
-    if plug_ins:
-        sentences.append(f"Plug-in {_shorten_list(plug_ins, '; ')}.")
-    call = SimpleNamespace(**loosest.loc[loosest["iterations"].idxmax()].to_dict())
-    guessed = bool((report.cases.loc[cases, "guess"] != "").any())
-    return Statement(_add_engine(" ".join(sentences), engine, first), format_call(call, guessed))
-
-
-def _describe_solved(result: Any, named: str) -> str:
-    """Return the number of missed cases of a ranked result, then the mean time of the solved ones."""
-    misses, solved = int(result["cases"] - result["solved"]), int(result["solved"])
-    time = format_seconds(result["mean"]) + (" on average" if solved > 1 else "")
-    if not misses:
-        return f"solves {named} in {time}"
-    if not solved:
-        return f"misses all of {named}" if misses > 1 else f"misses {named}"
-    return f"misses {misses} of {named} and solves the other{'s' if solved > 1 else ''} in {time}"
-
-
-def _describe_start(frame: pd.DataFrame, runs: pd.DataFrame) -> str:
-    """Describe the start of runs; of carried impulses, count the runs that differ from the cold ones."""
-    if not (runs["start"] == "carried").any():
-        return "cold"
-    names = ["case", "solver", "tol", "iterations", "solution_hash"]
-    cold = set(frame.loc[frame["start"] == "cold", names].itertuples(index=False, name=None))
-    n = sum(run not in cold for run in runs[names].itertuples(index=False, name=None))
-    carrying = format_seconds(runs["carry_time"].mean()) if runs["carry_time"].notna().any() else ""
-    apart = f"mapping them takes {carrying} a step, not included; " if carrying else ""
-    return f"with the impulses of the previous recorded step as start ({apart}it changed {n} of {len(runs)} solves)"
-
-
-def _list_unsolved_cases(
-    report: Contents, runs: pd.DataFrame, cases: Sequence[str], solver: str
-) -> tuple[list[str], int]:
-    """Return the cases that a solver misses, each with its smallest residual, and the number of steps not reached.
-
-    A step is not reached if the pass to the tolerance ended before it, and no pass to a larger tolerance missed it.
-    """
-    own = runs[runs["solver"] == solver]
-    is_run = (own["tol"] <= report.tolerance) | (own["relative"] > own["tol"])
-    left = own[is_run].groupby("case", observed=True)["relative"].min().reindex(list(cases))
-    left = left[~(left <= report.tolerance)]
-    is_lost = left.isna() & report.cases.loc[left.index, "sequence"].isin(
-        set(own["sequence"].astype(str)) - {""}
-    )
-    missed = left[~is_lost].items()
-    texts = [
-        f"{case} ({'not accepted' if x != x else f'residual {format_residual(x)}'})" for case, x in missed
-    ]
-    return texts, int(is_lost.sum())
-
-
-def _shorten_list(texts: Sequence[str], separator: str = ", ") -> str:
-    """Join up to `MAX_NAMED` texts, and the number of the others."""
-    more = len(texts) - MAX_NAMED
-    return separator.join(texts[:MAX_NAMED]) + (f" and {more} more" if more > 0 else "")
-
-
-def _describe_cases(report: Contents, names: Sequence[str]) -> str:
-    """Return words for cases: steps of sequences, built-in problems, or the structure that all of them have."""
-    infos, n = report.cases.loc[list(names)], len(names)
-    sequences = [name for name in infos["sequence"].unique() if name]
-    lost = sum(len(report.left_out.get(name, ())) for name in sequences or [""])
-    left_out = f" ({lost} left out)" if lost else ""
-    if sequences:
-        of = sequences[0] if len(sequences) == 1 else f"your {format_count(len(sequences), 'sequence')}"
-        return f"the {format_count(n, 'step')} of {of}{left_out}"
-    if report.is_stopped:
-        return f"the {format_count(n, 'problem')} measured so far{left_out}"
-    is_file = infos["source"].astype(str).str.endswith(SUFFIXES)
-    if not is_file.any() and all(name.partition("(")[0] in FAMILIES for name in names):
-        return (f"the {n} built-in problems" if n > 1 else names[0]) + left_out
-    common = set.intersection(*(set(words.split(", ")) for words in infos["structure"]))
-    shape = next((s for s in STRUCTURE_ORDER[1:5] if s in common), "problem")
-    return (f"your {format_count(n, shape, PLURALS.get(shape, ''))}" if n > 1 else f"your {shape}") + left_out
-
-
-def _add_engine(text: str, engine: Any, first: Any) -> str:
-    """Add the engine's own solver to the sentence: at its beginning if it ranks first, else at its end."""
-    if engine is None:
-        return text
-    own = f"the engine's own {engine['solver']}"
-    solves = f"{_describe_solved(engine, format_count(engine['cases'], 'case'))}, {INSIDE}"
-    if engine["solved"] and first is not None and tables.is_tie(first, engine):
-        return f"{text} As fast within the noise of the repetitions is {own}: it {solves}."
-    if engine["solved"] and (
-        first is None or (-engine["solved"], engine["mean"]) < (-first["solved"], first["mean"])
-    ):
-        return f"First is {own}: it {solves}. {text}"
-    return f"{text} T{own[1:]} {solves}."

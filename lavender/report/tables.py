@@ -22,10 +22,11 @@ from lavender import io
 from lavender.base.deadline import format_seconds
 from lavender.base.errors import LavenderError
 from lavender.io.stored import ENGINE, SUFFIXES, read_whole_file
-from lavender.judge.residuals import AT_FLOOR, DEFAULT_THRESHOLD, UNCONVERGED, WRONG, at_floor
-from lavender.judge.solution import CONFIRMED, CONTRADICTED, NOT_PROVEN
+from lavender.judge.residuals import DEFAULT_THRESHOLD, at_floor
+from lavender.judge.solution import CONFIRMED, CONTRADICTED
 from lavender.problem.derived import cached_property
 from lavender.report import machine
+from lavender.report.page import DEFAULT_ERROR_LIMIT
 from lavender.report.store import (
     Row,
     describe_target,
@@ -34,11 +35,11 @@ from lavender.report.store import (
     select_runs,
     select_skips,
 )
-from lavender.report.text import escape_unprintable, format_count, format_tolerance
+from lavender.report.text import escape_unprintable, format_tolerance
 from lavender.solvers import registry
 
 Frame: TypeAlias = pd.DataFrame
-INSIDE = "inside the engine, warm-started, without copy and judge"
+ENGINE_NAME = "your engine"  # Name of the engine's own solver among the solvers.
 SERVED_RESIDUAL = 0.5  # A case is served if at most this fraction of the start's residual remains.
 # A solver is recommended for a time or budget if it serves at least this share of the cases.
 SERVED_QUANTILE = 0.9
@@ -112,7 +113,9 @@ def compute_mean(times: Any, axis: int = 0) -> Any:
 def rank_solvers(report: Contents, tolerance: float, cases: Iterable[str] | None = None) -> Frame:
     """Rank solvers by the number of cases that they bring to a tolerance, then by their mean time.
 
-    Solvers with a contradicted claim come last. The first rows are within noise of the best (`tie`), `auto` first.
+    In the mean, a case that a solver does not solve or does not accept counts as the time limit, so that the means of
+    all solvers can be compared. Solvers with a contradicted claim come last. The first rows are within noise of the
+    best (`tie`), `auto` first.
 
     Parameters
     ----------
@@ -124,23 +127,26 @@ def rank_solvers(report: Contents, tolerance: float, cases: Iterable[str] | None
     Returns
     -------
     DataFrame
-        By solver: `solved`, `cases`, `mean` [s] and `worst` [s] of the solved cases, `hardest` (case), `false`,
-        `noise`, `tie` and `place`.
+        By solver: `solved`, `tried` (accepted cases), `cases`, `mean` [s] over all cases, `worst` [s] of the solved
+        cases, `hardest` (case), `false` (number of false claims), `noise`, `tie` and `place`.
     """
     times = report.get_times(tolerance)
-    names = times.columns if cases is None else [case for case in cases if case in times]
-    times = times.loc[report.has_runs[names].any(axis=1), names]
-    false = report.frame["case"].isin(names) & (report.frame["claim_check"] == CONTRADICTED)
-    mean, solved = compute_mean(times, axis=1), times.notna().sum(axis=1)
+    names = list(times.columns) if cases is None else [case for case in cases if case in times]
+    accepted = report.accepted[names]
+    times = times.loc[accepted.any(axis=1), names]
+    false = report.frame[report.frame["case"].isin(names) & (report.frame["claim_check"] == CONTRADICTED)]
     ranking = pd.DataFrame({
-        "solved": solved, "cases": len(names), "mean": mean, "worst": times.max(axis=1),
-        "hardest": times.fillna(-1.0).idxmax(axis=1) if len(names) else "",
-        "false": times.index.isin(report.frame.loc[false, "solver"]), "noise": report.noise.reindex(times.index),
+        "solved": times.notna().sum(axis=1), "tried": accepted.loc[times.index].sum(axis=1), "cases": len(names),
+        "mean": compute_mean(times.clip(upper=report.time_limit).fillna(report.time_limit), axis=1),
+        "worst": times.max(axis=1), "hardest": times.fillna(-1.0).idxmax(axis=1) if len(names) else "",
+        "false": false["solver"].astype(str).value_counts().reindex(times.index).fillna(0).astype(int),
+        "noise": report.noise.reindex(times.index),
     })  # fmt: skip
-    ranking = ranking.sort_values(["false", "solved", "mean"], ascending=[True, False, True], kind="stable")
+    ranking = ranking.assign(liar=ranking["false"] > 0)
+    ranking = ranking.sort_values(["liar", "solved", "mean"], ascending=[True, False, True], kind="stable")
     records = ranking.to_dict("records")
-    tie = np.array([is_tie(records[0], x) and x["false"] <= records[0]["false"] for x in records], bool)
-    ranking = ranking.assign(tie=tie, place=np.where(tie, 1, np.arange(1, len(tie) + 1)))
+    tie = np.array([is_tie(records[0], x) and x["liar"] <= records[0]["liar"] for x in records], bool)
+    ranking = ranking.assign(tie=tie, place=np.where(tie, 1, np.arange(1, len(tie) + 1))).drop(columns="liar")
     order = sorted(
         range(len(tie)), key=lambda i: (not tie[i], tie[i] and ranking.index[i] != PREFERRED_SOLVER)
     )
@@ -157,12 +163,7 @@ def is_tie(first: Any, other: Any) -> bool:
 def is_plug_in(solver: str) -> bool:
     """Return whether a solver is not part of lavender: a plug-in of the user, installed here or not."""
     spec = registry.specs().get(solver)
-    return spec is None or not spec.builtin
-
-
-def put_preferred_first(names: Iterable[Any]) -> list[str]:
-    """Return equally good solvers in their order, with `PREFERRED_SOLVER` first."""
-    return sorted(map(str, names), key=lambda name: name != PREFERRED_SOLVER)
+    return solver != ENGINE_NAME and (spec is None or not spec.builtin)
 
 
 # -- answers of engines ------------------------------------------------------------------------------------
@@ -241,14 +242,12 @@ def _complete_answer(folder: Path, answer: Row) -> Row | None:
     return {name: escape_unprintable(text) for name, text in texts.items()} | numbers
 
 
-def rank_engine(report: Contents, cases: Frame, tolerance: float) -> Row | None:
-    """Return an engine's result on cases as solvers are ranked; None if it did not answer every case in a time."""
-    answers = report.engines.reindex([str(Path(source)) for source in cases["source"]])
-    if not len(cases) or not (answers["seconds"] >= 0.0).all():
-        return None
-    times = answers.loc[answers["relative"] <= tolerance, "seconds"]
-    return {"solver": get_engine_name(answers), "solved": len(times), "cases": len(cases),
-            "mean": float(compute_mean(times)), "worst": times.max(), "noise": MIN_NOISE}  # fmt: skip
+def read_own_answers(report: Contents) -> Frame:
+    """Return the engine's answers to the cases of a report, with `case` and `step` of each."""
+    sources = {str(Path(s)): case for case, s in report.cases["source"].astype(str).items()}
+    answers = report.engines[report.engines.index.isin(list(sources)) & report.engines["velocity"].notna()]
+    cases = answers.index.map(sources)
+    return answers.assign(case=cases, step=report.cases.loc[cases, "step"].to_numpy())
 
 
 def get_engine_name(answers: Frame) -> str:
@@ -273,12 +272,15 @@ class Contents:
         Time budgets for which a solver is recommended; default: three decades about the fastest times.
     engines : DataFrame
         Answers of the engines that recorded the steps: `lavender.report.tables.read_engine_answers`.
+    error_limit : float, m/s
+        Velocity error with which sentences and figures compare; in rad/s on angular rows.
     """
 
     lines: Frame
     earlier: Frame | None = None
     times: Sequence[float] = ()
     engines: Frame = field(default_factory=_make_answers)
+    error_limit: float = DEFAULT_ERROR_LIMIT
     _times: dict[float, Frame] = field(default_factory=dict, init=False)  # Results of `get_times`.
 
     @cached_property
@@ -361,15 +363,55 @@ class Contents:
         return self.newest[~self.newest["nothing_to_do"].astype(bool)]
 
     @cached_property
+    def subject(self) -> list[str]:
+        """The cases of the first sentence: single problems, or if there are none the steps of sequences."""
+        cases = self.frame.drop_duplicates("case")
+        single = cases[cases["step"] < 0]
+        return list(map(str, (single if len(single) else cases)["case"]))
+
+    @cached_property
     def ranked_runs(self) -> Frame:
-        """The runs of `frame` that rankings count."""
-        return select_ranked_runs(self.frame)
+        """The runs of `frame` that rankings count, and the engine's own answers if it gave all of them in a time."""
+        runs = select_ranked_runs(self.frame)
+        cases = runs.drop_duplicates("case")
+        answers = self.engines.reindex([str(Path(s)) for s in self.cases.loc[cases["case"], "source"]])
+        if self.is_campaign or not len(cases) or not (answers["seconds"] >= 0.0).all():
+            return runs
+        own = cases.assign(
+            solver=ENGINE_NAME, tol=0.0, claims=False, claim_check=CONFIRMED, status_conflict="", form="",
+            status=answers["verdict"].to_numpy(), message="", start=np.where(cases["step"] < 0, "cold", "carried"),
+            time=answers["seconds"].to_numpy(), time_median=answers["seconds"].to_numpy(),
+            iterations=answers["iterations"].fillna(0).astype(int).to_numpy(),
+            relative=answers["relative"].to_numpy(), velocity=answers["velocity"].to_numpy(),
+            worst_name=answers["worst"].to_numpy(),
+        )  # fmt: skip
+        return pd.concat(
+            [runs.astype({name: object for name in runs if runs[name].dtype == "category"}), own]
+        )
 
     @cached_property
     def has_runs(self) -> Frame:
         """Whether each solver (row) has a run on each case (column), of the runs that rankings compare."""
         runs = self.ranked_runs[["solver", "case"]].astype(str)
         return pd.crosstab(runs["solver"], runs["case"]) > 0
+
+    @cached_property
+    def accepted(self) -> Frame:
+        """Whether each solver (row) accepts each case (column): it has a run on it, or on a step of its sequence."""
+        sequences = self.cases.loc[self.has_runs.columns, "sequence"].astype(str).to_numpy()
+        accepted = self.has_runs.copy()
+        for name in set(sequences) - {""}:
+            some = sequences == name
+            accepted.loc[:, some] = np.repeat(
+                accepted.loc[:, some].any(axis=1).to_numpy()[:, None], some.sum(), 1
+            )
+        return accepted
+
+    @cached_property
+    def time_limit(self) -> float:
+        """Time limit of a solve [s], which a case that is not solved counts in means."""
+        limit = self.frame["time_limit"].max()
+        return float(limit) if 0.0 < limit < math.inf else 1.0
 
     @cached_property
     def noise(self) -> pd.Series[float]:
@@ -416,112 +458,70 @@ class Contents:
         return group_cases_by_structure(self.frame)
 
     @cached_property
-    def busy_warning(self) -> str:
-        """A sentence if other processes used the processors while times were taken; else empty."""
-        if self.is_campaign or (self.frame["mode"] == "budget").all():  # Errors do not depend on the load.
-            return ""
+    def busy(self) -> str:
+        """A sentence if other processes used the processors during the measurement; else empty."""
         loads = [None if x != x else float(x) for x in self.frame["load"]]
-        busy = machine.make_busy_warning(loads, int(self.frame["cores"].iloc[0]))
-        return f"{busy} The times are invalid; measure again with --no-reuse." if busy else ""
+        return machine.make_busy_warning(loads, int(self.frame["cores"].iloc[0])) if len(loads) else ""
 
 
 # -- tables ------------------------------------------------------------------------------------------------
 
 
-def tabulate_fastest(report: Contents) -> Frame:
-    """Tabulate the fastest solver to each tolerance by structure and sequence, with the solvers that tie with it."""
-    rows = []
-    for name, cases in report.structures.items():
-        row: Row = {"structure": name, "cases": len(cases)}
+def tabulate_solvers(report: Contents) -> Frame:
+    """Tabulate the solvers in their ranking: solved and accepted cases, and the mean time to each tolerance."""
+    ranking = rank_solvers(report, report.tolerance, report.subject)
+    table = pd.DataFrame({
+        "solver": ranking.index.astype(str), "solved": ranking["solved"].array, "accepted": ranking["tried"].array,
+        "cases": ranking["cases"].array,
+    })  # fmt: skip
+    if not report.is_campaign:
         for tolerance in report.tolerances:
-            ranking, target = rank_solvers(report, tolerance, cases), f"to {format_tolerance(tolerance)}"
-            ties, first = list(map(str, ranking.index[ranking["tie"]]))[:MAX_TIES], ranking.head(1)
-            row[target] = " ≈ ".join(ties) or "none"
-            if ties and (solved := first["solved"].iloc[0]) < len(cases):
-                row[target] = row[target].replace(ties[0], f"{ties[0]} ({solved}/{len(cases)})", 1)
-            row[f"time {target} [s]"] = first["mean"].iloc[0] if ties else math.nan
-        rows.append(row)
-    return pd.DataFrame(rows)
+            means = rank_solvers(report, tolerance, report.subject)["mean"].reindex(ranking.index)
+            table[f"to {format_tolerance(tolerance)} [s]"] = means.array
+        table["slowest [s]"] = ranking["worst"].array
+        table["tie"] = ranking["tie"].array
+    return table.assign(**{"false claims": ranking["false"].array})
 
 
-def tabulate_times(report: Contents) -> Frame:
-    """Tabulate the mean time of each solver to each tolerance by law, and the number of cases that reach it.
-
-    Solvers are in the order of their ranking to the middle tolerance.
-    """
-    tables = []
-    for law, some in report.frame.groupby("law", observed=True):
-        cases = list(some["case"].unique())
-        order = rank_solvers(report, report.tolerance, cases).index
-        parts: Row = {"law": law, "solver": order, "cases": len(cases)}
-        for tolerance in report.tolerances:
-            target, ranking = f"to {format_tolerance(tolerance)}", rank_solvers(report, tolerance, cases)
-            for head, name in ((f"solved {target}", "solved"), (f"time {target} [s]", "mean")):
-                parts[head] = ranking.loc[order, name].array
-        tables.append(pd.DataFrame(parts))
-    table = pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
-    return table.drop(columns=[c for c in table if c.startswith("time")]) if report.is_campaign else table
+def order_solvers(report: Contents) -> list[str]:
+    """Return the solvers in their ranking on the subject of a report, then those with runs on other cases alone."""
+    names = list(map(str, rank_solvers(report, report.tolerance, report.subject).index))
+    return names + [name for name in report.get_times(report.tolerance).index if name not in names]
 
 
-def tabulate_cases(report: Contents) -> Frame:
-    """Tabulate each case: size, fastest solvers to the middle tolerance, and residual of its stored answer."""
-    false = report.frame.loc[
-        report.frame["claim_check"] == CONTRADICTED, ["solver", "case"]
-    ].drop_duplicates()
-    times = report.get_times(report.tolerance).copy()
-    for solver, case in false.itertuples(index=False):
-        times.loc[times.index == solver, times.columns == case] = math.nan
-    fastest = times.min()
-    near = times.div(1.0 + report.noise.reindex(times.index), axis=0) <= fastest
-    table = report.cases.loc[times.columns, ["case", "law", "rows", "contacts", "islands", "structure"]]
-    table[f"fastest to {format_tolerance(report.tolerance)}"] = [
-        " ≈ ".join(put_preferred_first(times[case][near[case]].sort_values().index)[:MAX_TIES]) or "none"
-        for case in times.columns
-    ]
-    return table.assign(**{"time [s]": fastest, "stored answer [-]": report.cases["stored"]}).dropna(
-        axis=1, how="all"
-    )
+def tabulate_matrix(report: Contents) -> Frame:
+    """Tabulate the time [s] of each solver (columns, in their ranking) on each case to the middle tolerance."""
+    times = report.get_times(report.tolerance)
+    facts = report.cases.loc[times.columns, ["case", "law", "rows", "structure"]].reset_index(drop=True)
+    return facts.join(times.loc[order_solvers(report)].T.add_suffix(" [s]").reset_index(drop=True))
 
 
 def tabulate_runs(report: Contents) -> Frame:
-    """Tabulate the time to each tolerance, smallest residual, status and claim of each solver on each case."""
-    runs = report.frame[(report.frame["order"] == "given") & (report.frame["step"] < 0)]
+    """Tabulate each solver on each case: time to each tolerance, smallest errors, status, and reasons of failures."""
+    frame = report.newest
+    runs = frame[(frame["order"] == "given") & ((frame["step"] < 0) | ~frame["solver"].isin([ENGINE_NAME]))]
     keys = ["case", "solver", "start"]
     # pandas 3.1 cannot align two indices of categories with codes of different sizes (above 127 cases).
-    runs = runs.astype(dict.fromkeys(keys, str))
+    runs = runs.astype(dict.fromkeys((*keys, "claim_check", "status_conflict", "message"), str))
     to_tolerance = runs[runs["mode"] == "tol"] if (runs["mode"] == "tol").any() else runs
-    table = runs.groupby(keys, sort=False)[["relative"]].min()
-    for tolerance in report.tolerances:
-        reached = to_tolerance[to_tolerance[["tol", "relative"]].max(axis=1) <= tolerance]
-        reached = reached.groupby(keys)["time"]
-        table[f"to {format_tolerance(tolerance)} [s]"] = reached.min().reindex(table.index)
-    last = to_tolerance.groupby(keys)[["status", "form"]].last()
-    checks = runs["claim_check"].map({CONFIRMED: 0, NOT_PROVEN: 1, CONTRADICTED: 2}).astype(int)
-    worst = checks.groupby([runs[k] for k in keys]).max()
-    table = table.join(last)
-    table["claim"] = worst.map({0: "", 1: NOT_PROVEN, 2: f"✗ {CONTRADICTED}"})
-    table = table.reset_index().rename(columns={"relative": "smallest residual [-]"})
-    warm = table["start"].astype(str) != "cold"
-    return table.assign(
-        solver=table["solver"].astype(str) + np.where(warm, " (" + table["start"].astype(str) + ")", "")
-    ).drop(columns="start")
-
-
-def tabulate_claims(report: Contents) -> Frame:
-    """Tabulate how many claims of each solver the judge confirms."""
-    f = report.newest
-    counts = pd.DataFrame({
-        "solver": f["solver"].astype(str), "runs": 1, "claims": f["claims"].astype(int),
-        "contradicted": (f["claims"] & (f["claim_check"] == CONTRADICTED)).astype(int),
-        "to a tolerance": (f["mode"] == "tol").astype(int), "reached": f["success"].astype(int),
-        "died": f["status"].astype(str).str.startswith(DEATHS).astype(int),
-    })  # fmt: skip
-    table = counts.groupby("solver").sum().reset_index()
-    claims = table["claims"].where(table["claims"] > 0)
-    rate = 100.0 * (claims - table["contradicted"]) / claims
-    rounded = rate.round(1).clip(0.1, 99.9)  # Only exact rates are 0 % or 100 %.
-    table.insert(2, "correct rate [%]", rounded.where((rate > 0.0) & (rate < 100.0), rate))
-    return table
+    table = runs.groupby(keys, sort=False)[["relative", "velocity", "roundoff_floor"]].min()
+    table.columns = ["smallest residual [-]", "velocity error [m/s]", "floor [-]"]
+    for tolerance in () if report.is_campaign else report.tolerances:
+        target = f"to {format_tolerance(tolerance)}"
+        reached = to_tolerance[to_tolerance[["tol", "relative"]].max(axis=1) <= tolerance].sort_values("time")
+        first = reached.drop_duplicates(keys).set_index(keys).reindex(table.index)
+        table.insert(table.shape[1] - 3, f"{target} [s]", first["time"])
+        table.insert(table.shape[1] - 3, f"{target}, median [s]", first["time_median"])
+    table = table.join(to_tolerance.groupby(keys)[["status", "form", "iterations", "worst_name"]].last())
+    missed = select_failures(report).astype(dict.fromkeys((*keys, "status_conflict", "message"), str))
+    conflict = missed["status_conflict"]
+    missed = missed.assign(reason=np.where(conflict != "", "✗ " + conflict + ". ", "") + missed["message"])
+    reasons = missed[missed["reason"] != ""].groupby(keys)["reason"].last()
+    table["reason of a failure"] = reasons.reindex(table.index).fillna("")
+    table = table.reset_index().rename(columns={"worst_name": "worst row"})
+    warm = table["start"] != "cold"
+    table["solver"] += np.where(warm, " (" + table["start"] + ")", "")
+    return table.drop(columns="start")
 
 
 def select_failures(report: Contents) -> Frame:
@@ -534,81 +534,69 @@ def select_failures(report: Contents) -> Frame:
     return f[missed | died | (f["claim_check"] == CONTRADICTED)]
 
 
-def tabulate_failures(report: Contents) -> Frame:
-    """Tabulate failed runs with the row of the largest error and the reason."""
-    f = select_failures(report)
-    conflict = f["status_conflict"].astype(str)
-    message = f["message"].astype(str)
-    return pd.DataFrame({
-        "case": f["case"].astype(str), "solver": f["solver"].astype(str), "start": f["start"].astype(str),
-        "target": [describe_target(*x) for x in zip(f["mode"], f["tol"], f["max_iter"], strict=True)],
-        "status": f["status"].astype(str), "residual [-]": f["relative"], "floor [-]": f["roundoff_floor"],
-        "velocity error [m/s]": f["velocity"], "worst row": f["worst_name"].astype(str),
-        "reason": np.where(conflict != "", "✗ " + conflict + ". " + message, message),
-    })  # fmt: skip
+def tabulate_structures(report: Contents) -> Frame:
+    """Tabulate by structure and sequence the fastest solver to each tolerance with its ties, and the best in a time.
+
+    A solver is named for a time if it serves at least `SERVED_QUANTILE` of the cases, with the smallest residual at
+    this quantile; solvers within `RESIDUAL_NOISE_FACTOR` of it tie.
+    """
+    rows, runs = [], select_starts(report.frame)
+    for name, cases in report.structures.items():
+        row: Row = {"structure": name, "cases": len(cases)}
+        sizes = report.cases.loc[cases, "rows"]
+        row["rows"] = f"{sizes.min()}" + (f" to {sizes.max()}" if sizes.max() > sizes.min() else "")
+        for tolerance in report.tolerances:
+            ranking, target = rank_solvers(report, tolerance, cases), f"to {format_tolerance(tolerance)}"
+            ties, first = list(map(str, ranking.index[ranking["tie"]]))[:MAX_TIES], ranking.head(1)
+            row[target] = " ≈ ".join(ties) or "none"
+            if ties and (solved := first["solved"].iloc[0]) < len(cases):
+                row[target] = row[target].replace(ties[0], f"{ties[0]} ({solved}/{len(cases)})", 1)
+            row[f"time {target} [s]"] = first["mean"].iloc[0] if ties else math.nan
+        for t in report.time_budgets:
+            done = runs[(runs["time"] <= t) & runs["case"].isin(cases)]
+            left = done.groupby(["solver", "case"], observed=True)["relative"].min().unstack()
+            left = left.reindex(columns=cases).fillna(1.0)
+            left = left[(left <= SERVED_RESIDUAL).mean(axis=1) >= SERVED_QUANTILE]
+            # Between two infinite residuals, the interpolated quantile is nan.
+            score = left.quantile(SERVED_QUANTILE, axis=1).fillna(math.inf).sort_values(kind="stable")
+            near = map(str, score.index[score <= RESIDUAL_NOISE_FACTOR * score.min()])
+            names = sorted(near, key=lambda name: name != PREFERRED_SOLVER)
+            row[f"in {format_seconds(t)}"] = " ≈ ".join(names[:MAX_TIES]) or "none"
+        rows.append(row)
+    return pd.DataFrame(rows)
 
 
 def tabulate_costs(report: Contents) -> Frame:
     """Tabulate how the time to the middle tolerance grows with the number of rows: time = a rows^exponent.
 
-    The exponent is fitted to the logarithms of the cases that a solver solves.
+    The exponent is fitted to the logarithms of the cases that a solver solves; the scatter is the typical factor
+    between a case and the fit.
     """
     times, rows_of = report.get_times(report.tolerance), report.cases["rows"].to_dict()
     rows = []
     for solver, own in times.iterrows():
-        t = own.dropna()
-        t, n = t[t > 0.0], np.array([rows_of[c] for c in t.index if t[c] > 0.0], float)
+        t = own[own > 0.0]
+        n = np.array([rows_of[c] for c in t.index], float)
         if len(t) < MIN_FIT_CASES or n.min() <= 0.0 or n.max() < MIN_FIT_SIZE_RATIO * n.min():
             continue
         x, y = np.log(n), np.log(t.to_numpy(float))
         exponent, constant = np.polyfit(x, y, 1)
-        scatter = float(np.exp(np.std(y - exponent * x - constant)))
-        at = math.exp(constant + exponent * math.log(1000.0))
         rows.append({
             "solver": solver, "cases": len(t), "rows": f"{n.min():.0f} to {n.max():.0f}",
-            "exponent of rows": round(float(exponent), 2), "fit at 1000 rows [s]": at,
-            "scatter [factor]": round(scatter, 2),
+            "exponent of rows": round(float(exponent), 2),
+            "fit at 1000 rows [s]": math.exp(constant + exponent * math.log(1000.0)),
+            "scatter [factor]": round(float(np.exp(np.std(y - exponent * x - constant))), 2),
         })  # fmt: skip
     return pd.DataFrame(rows).sort_values("fit at 1000 rows [s]") if rows else pd.DataFrame()
-
-
-def tabulate_budgets(report: Contents) -> Frame:
-    """Tabulate the residual of each solver after fixed numbers of iterations: median and 90th percentile."""
-    runs = select_starts(report.frame[report.frame["mode"] == "budget"])
-    groups = runs.groupby(["solver", "max_iter"], observed=True)["relative"]
-    # Between two infinite residuals, the interpolated quantile is nan.
-    table = groups.quantile([0.5, SERVED_QUANTILE]).fillna(math.inf).unstack([1, 2]).sort_index(axis=1)
-    names = {0.5: "median", SERVED_QUANTILE: "90 %"}
-    table.columns = [f"{format_count(n, 'iteration')}, {names[q]} [-]" for n, q in table.columns]
-    return table.rename_axis("solver").reset_index() if len(runs) else pd.DataFrame()
-
-
-def tabulate_in_time(report: Contents) -> Frame:
-    """Tabulate the solver with the smallest residual within each time by structure; none if it serves too few cases."""
-    rows: list[Row] = [{"structure": name, "cases": len(cases)} for name, cases in report.structures.items()]
-    runs = select_starts(report.frame)
-    for t in report.time_budgets:
-        done = runs[runs["time"] <= t].groupby(["solver", "case"], observed=True)["relative"].min().unstack()
-        left = done.reindex(columns=list(runs["case"].unique())).fillna(1.0)
-        for row, cases in zip(rows, report.structures.values(), strict=True):
-            own = left[cases][(left[cases] <= SERVED_RESIDUAL).mean(axis=1) >= SERVED_QUANTILE]
-            # Between two infinite residuals, the interpolated quantile is nan.
-            score = own.quantile(SERVED_QUANTILE, axis=1).fillna(math.inf).sort_values(kind="stable")
-            near = put_preferred_first(score.index[score <= RESIDUAL_NOISE_FACTOR * score.min()])
-            row[f"in {format_seconds(t)}"] = " ≈ ".join(near[:MAX_TIES]) or "none"
-            row[f"residual in {format_seconds(t)} [-]"] = score[near[0]] if near else math.nan
-    return pd.DataFrame(rows)
 
 
 def tabulate_sequences(report: Contents) -> Frame:
     """Tabulate the time and iterations of all steps of each sequence, cold and with carried (warm) impulses.
 
-    The time to map impulses to the next step is apart from the times of the solves, as an engine stores impulses in
-    its contacts.
+    The time to map impulses to the next step is a column of its own, as an engine stores impulses in its contacts.
     """
-    runs = report.frame[(report.frame["step"] >= 0) & (report.frame["order"] == "given")].astype(
-        {"start": str}
-    )
+    frame = report.frame
+    runs = frame[(frame["step"] >= 0) & (frame["order"] == "given")].astype({"start": str})
     keys = ["sequence", "solver", "mode", "tol", "max_iter"]
     groups = runs.groupby([*keys, "start"], observed=True)
     table = groups.agg(steps=("case", "size"), time=("time", "sum"), carry=("carry_time", "sum"),
@@ -652,39 +640,11 @@ def tabulate_sweeps(report: Contents) -> Frame:
     return out.sort_values("solver", key=lambda solvers: solvers.map(order.index), kind="stable")
 
 
-def tabulate_engines(report: Contents) -> Frame:
-    """Tabulate engines' own answers, and the fastest solver here on the same cases, to the middle tolerance."""
-    target, rows = f"to {format_tolerance(report.tolerance)}", []
-    folders = report.cases["source"].astype(str).map(lambda source: str(Path(source).parent))
-    for folder, every in report.engines.groupby("folder", sort=False):
-        own, cases = every[every["verdict"] != LEFT_OUT], report.cases[folders == folder]
-        if not len(own):
-            continue
-        ranking = rank_solvers(report, report.tolerance, cases.index)
-        first = {"solver": "none"} | next(
-            iter(ranking[ranking["solved"] > 0].reset_index().to_dict("records")), {}
-        )
-        engine = rank_engine(report, cases, report.tolerance) or {"solver": get_engine_name(own)}
-        shown = [x["solver"] + (f" ({x['solved']}/{x['cases']})" if x.get("solved") != x.get("cases") else "")
-                 for x in (engine, first)]  # fmt: skip
-        worst = own.sort_values("velocity", na_position="first").iloc[-1]
-        rows.append({
-            "recorded": Path(folder).name, "steps": len(own), "not recorded": len(every) - len(own),
-            "rows": own["rows"].median(), "engine's own": shown[0], f"own {target} [s]": engine.get("mean", math.nan),
-            "residual, median [-]": own["relative"].median(), "worst [-]": own["relative"].max(),
-            "above floor": int((own["verdict"] != AT_FLOOR).sum()),
-            "stopped early": int(own["verdict"].isin([UNCONVERGED, WRONG]).sum()),
-            "velocity error [m/s]": worst["velocity"], "worst row": worst["worst"],
-            "first here": ("≈ " if "mean" in engine and "mean" in first and is_tie(engine, first) else "") + shown[1],
-            f"first {target} [s]": first.get("mean", math.nan),
-        })  # fmt: skip
-    return pd.DataFrame(rows)
-
-
 def tabulate_changes(report: Contents) -> Frame:
     """Tabulate times to a tolerance that differ from an earlier run beyond noise, on cases with the same numbers.
 
-    Earlier times are multiplied by the change of the time of the loop of fixed work on the same case.
+    Earlier times are multiplied by the change of the time of the loop of fixed work on the same case. The number of
+    compared times is `attrs["compared"]`.
     """
     rows, keys = [], ["case", "sha", "solver", "start", "tol"]
     assert report.earlier is not None
@@ -704,12 +664,8 @@ def tabulate_changes(report: Contents) -> Frame:
             kinds = ("lost", "reached") if math.inf in (before, after) else ("slower", "faster")
             rows.append({"case": r.case, "solver": r.solver, "target": f"to {format_tolerance(r.tol)}",
                          "before [s]": before, "now [s]": after, "change": kinds[int(after < before)]})  # fmt: skip
-    return pd.DataFrame(rows).assign(compared=len(both)) if rows else pd.DataFrame({"compared": [len(both)]})
-
-
-def tabulate_idle(report: Contents) -> Frame:
-    """Tabulate cases that the zero impulse solves, with the largest error of any solver, in units."""
-    idle = report.newest[report.newest["nothing_to_do"].astype(bool)].sort_values("velocity")
-    idle = idle.drop_duplicates("case", keep="last")
-    columns = {"velocity": "velocity error [m/s]", "error_energy": "error energy [√J]"}
-    return idle[["case", "rows", "solver", "velocity", "error_energy"]].rename(columns=columns)
+    changes = pd.DataFrame(rows)
+    if not rows:
+        changes["change"] = ["nothing beyond noise" if len(both) else "nothing was compared"]
+    changes.attrs["compared"] = len(both)
+    return changes

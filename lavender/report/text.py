@@ -63,6 +63,32 @@ def format_tolerance(tolerance: float) -> str:
     return f"{mantissa}e{int(exponent)}"
 
 
+def format_time(t: float) -> str:
+    """Return a time [s] with two or three digits in s, ms or µs, which no line break divides: 8.1 ms, 611 µs."""
+    scale, unit = next((u for u in TIME_UNITS if t >= 0.9995 * u[0]), TIME_UNITS[-1])
+    x = t / scale
+    return f"{x:.2g}\u00a0{unit}" if x < 9.95 else f"{x:.0f}\u00a0{unit}"
+
+
+def format_speed(v: float, unit: str = "m/s") -> str:
+    """Return a velocity error with two digits and a prefix of its unit: 0.23 mm/s; below 0.1 µm/s as a power of ten."""
+    if not math.isfinite(v):
+        return NONE
+    for scale, prefix in ((1.0, ""), (1e-3, "m"), (1e-6, "µ")):
+        if v >= 0.0995 * scale:
+            x = v / scale
+            return f"{x:.0f}\u00a0{prefix}{unit}" if x >= 9.95 else f"{x:.2g}\u00a0{prefix}{unit}"
+    return f"{v:.0e}\u00a0{unit}".replace("e-0", "e-").replace("0e+00", "0")
+
+
+def format_power(x: float) -> str:
+    """Return a positive number of an axis, rounded to a power of ten: 0.1, 1, 10, else 10 with an exponent."""
+    n = round(math.log10(x))
+    if -2 < n < 3:
+        return f"{10.0**n:g}"
+    return "10" + str(n).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+
+
 def format_ratio(x: float) -> str:
     """Return a ratio in words: "2.0 times", "850 times"; from a million on, as a power of ten: "1e8 times"."""
     if not math.isfinite(x):
@@ -115,9 +141,3 @@ def make_file_name(name: str) -> str:
         return short
     digest = hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:12]
     return f"{short[: MAX_FILE_NAME_LENGTH - 13]}-{digest}"
-
-
-def escape_markdown(text: str) -> str:
-    """Return a text on one line, with Markdown and HTML in it escaped."""
-    text = " ".join(text.split()).replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
-    return re.sub(r"([\\`*\[\]|])", r"\\\1", text)

@@ -124,7 +124,7 @@ def test_imports_of_the_package_are_declared():
     known |= declared("newton") | {"lavendersim", "mujoco_warp", "pinocchio", "pydrake", "qoco", "siconos", "warp"}
     known |= {"genesis"}  # genesis-world, of the extra `genesis`
     known |= {"cupy"}  # imported only for a caller who gives arrays of it
-    known |= {"PIL"}  # Pillow, which matplotlib requires
+    known |= {"PIL", "markupsafe"}  # which matplotlib and jinja2 require
     known |= {"typing_extensions"}  # for type checkers alone, which bring its stub
     known |= set(sys.stdlib_module_names) | {"lavender", "lavender_ext"}
     found = set()

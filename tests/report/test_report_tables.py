@@ -3,13 +3,11 @@
 import json
 import math
 
-import numpy as np
 import pandas as pd
 import pytest
 from approved_texts import check_text
 
 from lavender.report import Report, tables
-from lavender.report.findings import recommend
 from lavender.report.render import format_cells, format_markdown, list_number_heads
 from lavender.report.tables import read_engine_answers
 from lavender.report.text import format_percent
@@ -65,11 +63,11 @@ SCENARIOS = [
     ("a run to 1e-3 that reached 1e-7 counts for 1e-3 alone, and a budget for none", [
         record("a", "pgs", 1e-5, 1e-7, tol=1e-3), record("a", "pgs", 3e-5, 1e-7),
         record("a", "pgs", 1e-6, 1e-9, **BUDGET),
-    ], {}, "times"),
+    ], {}, "solvers"),
     ("solved cases come before time, and false claims last", [
         *all_of("ab", ("slow", 1e-2)), record("a", "fast", 1e-5, 1e-8), record("b", "fast", 1e-5, 1e-2),
         record("a", "liar", 1e-6, 1e-8), record("b", "liar", 1e-6, 1e-8, **FALSE_CLAIM),
-    ], {}, "rank claims failures"),
+    ], {}, "rank solvers runs"),
     ("7 % within the noise of 8 % is a tie with auto first", repeated(NOISY, 1.0, 1.04, 1.08), {}, "rank"),
     ("7 % above the noise of 4 % is no tie", NOISY, {}, "rank"),
     ("7 % within the noise of the slower solver alone is a tie", [
@@ -79,23 +77,23 @@ SCENARIOS = [
     ], {}, "rank"),
     ("words of structures, laws and sequences are groups", all_of(("a", "b", "c", "walk[0]"), ("pgs", 1.0)), {
         "walk": True, "cases": {"b": {"structure": "stack, redundant", "law": "coulomb"},
-                                "c": {"structure": "pile, friction", "law": "coulomb"}}}, "fastest"),
+                                "c": {"structure": "pile, friction", "law": "coulomb"}}}, "structures"),
     ("two of three cases are solved by three solvers, of which two are equally fast", [
         *all_of("ab", ("newton", 1.0), ("auto", 1.001), ("pgs", 3.0)), record("c", "pgs", 1.0, 0.5),
-    ], {}, "fastest cases times"),
+    ], {}, "structures solvers"),
     ("times are rows to the power 1.5; three cases are too few for a fit", [
         *(record(c, "pgs", 1e-6 * n**1.5, 1e-8) for c, n in SIZES.items()), *all_of(list(SIZES)[:3], ("few", 1e-6)),
     ], {"cases": {c: {"rows": n} for c, n in SIZES.items()}}, "costs"),
     ("of 2 claims one is false, a run died, and a budget claims nothing", [
         record("a", "pgs", 1.0, 1e-8), record("b", "pgs", 1.0, 0.5, **FALSE_CLAIM),
         record("c", "pgs", 1.0, math.inf, status="KILLED", claims=False), record("c", "pgs", 1.0, 0.1, **BUDGET),
-    ], {}, "claims"),
+    ], {}, "solvers"),
     ("a miss at the floor, a proof and a budget are no failures", [
         record("a", "good", 1.0, 1e-8), record("a", "floor", 1.0, 1e-5, roundoff_floor=1e-5),
         record("a", "missed", 1.0, 1e-2, message="slow"), record("a", "liar", 1.0, 0.5, **FALSE_CLAIM),
         record("a", "proved", 1.0, 1.0, status="INFEASIBLE"), record("a", "budget", 1.0, 0.5, **BUDGET),
         record("a", "lucky liar", 1.0, 1e-9, **FALSE_CLAIM),
-    ], {}, "failures"),
+    ], {}, "runs"),
     ("the carried start changes no solve and halves the time", carried(), {"walk": True}, "sequences"),
     ("the carried start changes the iterations of 3 solves", carried(iterations=2), {"walk": True}, ""),
     ("the carried start changes the impulses of 3 solves", carried(solution_hash="x"), {"walk": True}, ""),
@@ -108,22 +106,17 @@ SCENARIOS = [
     ("only accelerated sweeps keep 1 mm/s", sweeps(SWEEPS[0], SWEEPS[3], ("carried", 2, "anderson", 1e-6)),
      {"walk": True}, ""),
     ("a late run is a miss within 10 ms", [*all_of("ab", ("late", 1.0)), *all_of("ab", ("early", 1e-3), relative=1e-2)],
-     {"times": [1e-2]}, "in_time"),
-    ("no run ends within 10 ms", all_of("ab", ("late", 1.0)), {"times": [1e-2]}, "in_time"),
-    ("residuals 0.1, 0.2, ... 1 within a budget", [
-        record(f"c{i}", "pgs", 1.0, x, **BUDGET) for i, x in enumerate(np.linspace(0.1, 1.0, 10))], {}, "budgets"),
-    ("residuals 0.1, 0.2, ... 1 and five infinite ones within a budget", [
-        *(record(f"c{i}", "pgs", 1.0, x, **BUDGET) for i, x in enumerate(np.linspace(0.1, 1.0, 10))),
-        *(record(f"d{i}", "pgs", 1.0, np.inf, **BUDGET) for i in range(5))], {}, "budgets"),
+     {"times": [1e-2]}, "structures"),
+    ("no run ends within 10 ms", all_of("ab", ("late", 1.0)), {"times": [1e-2]}, "structures"),
     ("two steps were not reached within the time of a pass, and one was missed", [
         *(step_of(i, "pgs", 1e-8 if i < 3 else 0.25) for i in range(4)),
         *(step_of(i, "pgs", 0.5, **BUDGET) for i in range(6)), *(step_of(i, "pgs", 5e-4, tol=1e-3) for i in range(6)),
     ], {"walk": True}, ""),
     ("stopped with two of three solvers unfinished", STOPPED,
-     {"walk": True, "whole": False, "solvers": ["auto", "pgs", "nncg"]}, "fastest"),
+     {"walk": True, "whole": False, "solvers": ["auto", "pgs", "nncg"]}, "structures"),
     ("stopped in a later sequence, with a case of which all solvers are measured", [
         *all_of("a", ("auto", 1e-3), ("pgs", 1e-3), ("nncg", 1e-3)), *STOPPED,
-    ], {"walk": True, "whole": False}, "fastest"),
+    ], {"walk": True, "whole": False}, "structures"),
     ("stopped with two of three problems complete", [
         *all_of("ab", ("auto", 1e-3), ("pgs", 1e-3)), *all_of("c", ("auto", 1e-3))], {"whole": False}, ""),
     ("stopped with no solution", [record("a", "auto", 1.0, 1.0)], {"whole": False}, ""),
@@ -137,11 +130,11 @@ SCENARIOS = [
         record(c, "pgs", t, 1e-8) for c, t in (("a", 1e-4), ("b", 1e-4), ("c", 1e-1))], {}, ""),
     ("plug-ins have their place", all_of("a", ("auto", 1e-3), ("mine", 2e-3), ("other", 3e-3)), {}, ""),
     ("three solvers within 3 % and one at 20 %", all_of("a", ("pgs", 1e-3), ("auto", 1.03e-3), ("direct", 1.2e-3)), {},
-     "cases times rank"),
-    ("two crashed plug-ins", CRASHED, {"cases": {"b": {"law": "coulomb"}}}, "claims"),
+     "solvers rank matrix"),
+    ("two crashed plug-ins", CRASHED, {"cases": {"b": {"law": "coulomb"}}}, "solvers"),
     *((f"the engine's own answers are {words}", ENGINE, {"answers": {
         case: {"solver": "NEWTON", "verdict": "wrong", "seconds": t, "relative": x}
-        for case, (t, x) in zip("ab", answers, strict=True)}}, "engines") for words, answers in (
+        for case, (t, x) in zip("ab", answers, strict=True)}}, "rank") for words, answers in (
         ("faster", [(1e-5, 1e-9), (2e-5, 1e-9)]), ("slower", [(1e-4, 1e-9), (2e-4, 1e-9)]),
         ("as fast", [(3.9e-5, 1e-9), (8e-5, 1e-9)]), ("right on one of two cases", [(1e-6, 1e-9), (1e-6, 1e-2)]),
         ("wrong or without a residual", [(1e-6, 1e-2), (1e-6, math.nan)]))),
@@ -154,8 +147,8 @@ SCENARIOS = [
 
 
 def describe_report(report, tables_shown):
-    """The recommendation of a report, and its tables with numbers of six digits."""
-    parts = [f"{statement.text} {statement.call_line or ''}" for statement in recommend(report)]
+    """The sentences of a report, and its tables with numbers of six digits."""
+    parts = [report.verdict, *report.alarms, *report.sentences, *report.warnings, *report.code]
     for name in tables_shown.split():
         frame = tables.rank_solvers(report, 1e-6) if name == "rank" else getattr(tables, f"tabulate_{name}")(report)
         parts += [f"{name}:", frame.to_csv(index=name == "rank", float_format="%.6g", lineterminator="\n").rstrip()]
@@ -177,20 +170,33 @@ def test_report_has_its_approved_recommendation_and_tables(tmp_path, name, made,
     check_text("report_scenarios.txt", name, describe_report(report, tables_shown))
 
 
-def test_terminal_of_crashed_plug_ins_has_their_errors_and_each_law_of_equal_names():
+def test_terminal_of_crashed_plug_ins_has_their_errors():
     lines = lines_of(*CRASHED, cases={"b": {"law": "coulomb"}})
     text = shown(Report(lines), 100)
     assert "crashed (1 of 2): mine on a: ERROR: ValueError" in text
     assert "crashed (2 of 2): yours on b: ERROR: TypeError: of yours" in text
-    lines.at[0, "plan"]["campaign"] = True  # without times: a row for each solver and law
-    table = shown(Report(lines), 100).splitlines()
-    assert [row.split()[:2] for row in table if " auto" in row] == [["coulomb", "auto"], ["lcp", "auto"]]
 
 
-@pytest.mark.parametrize(("runs", "false", "rate"), [(3, 1, 66.7), (2, 0, 100.0), (2100, 1, 99.9), (2, 2, 0.0)])
-def test_tabulate_claims_rounds_rates_and_keeps_0_and_100_for_exact_ones(runs, false, rate):
-    made = [record(f"c{i}", "pgs", 1.0, 1e-8, **(FALSE_CLAIM if i < false else {})) for i in range(runs)]
-    assert list(tables.tabulate_claims(report_of(*made))["correct rate [%]"]) == [rate]
+def test_report_without_times_ranks_by_solved_cases_and_shows_no_time():
+    made = [*all_of("abc", ("auto", 0.0)), *all_of("ab", ("pgs", 0.0)), record("c", "pgs", 0.0, 0.5)]
+    lines = lines_of(*made)
+    lines.at[0, "plan"]["campaign"] = True
+    report = Report(lines)
+    assert report.verdict == "Use auto: it solves all 3 problems to 10⁻⁶ (no times were measured)."
+    page = report.make_page().render()
+    assert "µs" not in page.replace("10\u00a0µs", "").replace("10 µs", "") and "<svg" not in page and "✓" in page
+    assert "[s]" not in ",".join(report.sections["solvers"].frame)
+
+
+def test_rank_solvers_counts_unsolved_and_refused_cases_as_the_time_limit():
+    """Geometric mean, shifted by 10 µs, of 1 ms and the limit of 2 s."""
+    made = [*all_of("ab", ("all", 4e-2)), *all_of("a", ("some", 1e-3), ("few", 1e-3)), record("b", "some", 1.0, 0.5)]
+    ranking = tables.rank_solvers(report_of(*made), 1e-6)
+    expected = math.sqrt((1e-3 + 1e-5) * (2.0 + 1e-5)) - 1e-5
+    assert ranking.loc[["some", "few"], "mean"].to_numpy() == pytest.approx(expected)
+    assert ranking[["solved", "tried"]].to_dict("index") == {
+        "all": {"solved": 2, "tried": 2}, "some": {"solved": 1, "tried": 2}, "few": {"solved": 1, "tried": 1}
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -220,21 +226,21 @@ def test_format_cells_times_have_one_unit_and_sizes_one_format():
     sizes = format_cells(pd.DataFrame({"a [-]": [0.35, 0.2], "b [m/s]": [2.9e-3, math.nan]}))
     assert sizes.to_numpy().tolist() == [["3.5e-1", "2.9e-3"], ["2.0e-1", "–"]]
     markdown = format_markdown(pd.DataFrame({"a": ["<b>|*x*"]}))
-    assert markdown == ["| a |", "|---|", r"| &lt;b&gt;\|\*x\* |"]
+    assert markdown == ["| a |", "| --- |", r"| &lt;b&gt;\|\*x\* |"]
 
 
 def test_tables_of_200_cases_of_which_few_are_solved_are_complete():
     """pandas has codes of one byte for up to 127 categories, and did not align them with codes of two bytes."""
     made = [record(f"c{i}", s, 1e-3, 1e-8 if i < 3 else 0.5, tol=1e-3) for i in range(200) for s in ("auto", "pgs")]
     report = report_of(*made)
-    assert len(report.sections["runs"].frames[0]) == 400
-    assert report.sections["runs"].frames[0]["to 1e-3 [s]"].notna().sum() == 6
-    assert len(report.sections["failures"].frames[0]) == 394
+    assert len(report.sections["runs"].frame) == 400
+    assert report.sections["runs"].frame["to 1e-3 [s]"].notna().sum() == 6
+    assert len(tables.select_failures(report)) == 394
 
 
-def test_tabulate_in_time_counts_a_case_that_a_solver_did_not_end_in_time_as_unsolved():
+def test_tabulate_structures_counts_a_case_that_a_solver_did_not_end_in_time_as_unsolved():
     made = [record("a", "half", 1e-3, 1e-9), record("b", "half", 1.0, 1e-9)]
     made += [record(case, "both", 1e-3, 1e-2, tol=1e-3) for case in "ab"]
     report = Report(lines_of(*made), times=(1e-2, 10.0))
-    [row] = tables.tabulate_in_time(report).to_dict("records")
+    [row] = tables.tabulate_structures(report).to_dict("records")
     assert [x for name, x in row.items() if name.startswith("in ")] == ["both", "half"]

@@ -9,13 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lavender.audit.page import ResultPage, StepSizes, describe_exceedance
+from lavender.audit.page import ResultPage, Section, StepSizes, describe_exceedance
 from lavender.audit.settings import MERGE_NOTE, MujocoSetting
 from lavender.audit.tune.measured import Measured
 from lavender.base.deadline import format_seconds
 from lavender.problem.derived import cached_property
-from lavender.report.figures import Curve, Figure
-from lavender.report.render import Section
 from lavender.report.text import format_ratio, format_size
 
 if TYPE_CHECKING:
@@ -301,21 +299,18 @@ class Tuning:
         shown.pop(now, None)
         return [now, *sorted(shown, key=lambda m: m.mean_step_time)]
 
-    @property
-    def figure(self) -> Figure:
-        """Figure of error over time: every setting, a line through the Pareto front, and the model's own setting."""
+    def draw_settings(self, folder: Path) -> str:
+        """Draw the error over the time of a step."""
+        from lavender.report.drawing import BLUE, draw_figure, mark_errors
 
-        def curve(name: str, settings: list[Measured], **more: Any) -> Curve:
-            places = [(m.mean_step_time, m.worst_error) for m in settings]
-            return Curve(name, name, [x for x, _ in places], [y for _, y in places], **more)
+        def fill(axes: Any) -> str:
+            points = np.array([(m.mean_step_time, max(m.worst_error, 0.5e-9)) for m in self._same_problem])
+            mark_errors(axes, 1e-9, float(points[:, 1].max()), self.error_limit or 1e-3)
+            axes.plot(*points.T, "o", color=BLUE)
+            axes.set_xlabel("time of a step [s]")
+            return f"{len(points)} settings"
 
-        solvers = dict.fromkeys(m.solver for m in self.measured)
-        by = {s: [m for m in self._same_problem if m.solver == s] for s in solvers}
-        parts = [curve(s, settings, points=True) for s, settings in by.items() if settings]
-        parts.append(curve("fastest for its error", self.pareto_front, unmarked=True))
-        parts.append(curve("model's own setting", [self.present_result], points=True))
-        return Figure("time-and-error", Path(self.model).name, "time of a step [s]",
-                      "error that 1 % of the steps exceed [m/s]", tuple(parts), x_log=True)  # fmt: skip
+        return draw_figure("time-and-error", fill, (4.9, 3.3), {"left": 0.13, "right": 0.75}, folder=folder)
 
     @property
     def headline(self) -> list[str]:
@@ -334,7 +329,7 @@ class Tuning:
         other = [m for m in self.measured if m.setting.changes_problem]
         shown = [now, *(m for m in self.pareto_front if m is not now)]
         every = sorted(self.measured, key=lambda m: m.mean_step_time)
-        figures = [] if self.reason_without_line else [self.figure]
+        figures = [] if self.reason_without_line else [self.draw_settings]
         title = "Provisional lines" if self.reason_provisional else "Lines to copy"
         short = self._tabulate_settings(self.terminal_settings).iloc[:, :4]
         numbers = {

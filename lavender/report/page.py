@@ -1,0 +1,140 @@
+"""Pages of results: one HTML file without scripts or external parts, and its short form for a terminal.
+
+A page begins with the answer: a sentence, at most three more, and lines to copy. Figures and tables follow, and folded
+parts with all details. A block of a page is HTML (`Markup`), or a dictionary with one of these keys:
+
+    pair     two lists of blocks, side by side on a wide screen
+    folded   list of blocks below a `title`, `open` or not
+    code     lines to copy
+    bar      (percentage, colour) of the parts of a stacked bar, with the description `alt`
+    rows     lines of a table, with `title`, `small`, `note`, `key`, `classes`, `heads` and `foot`; a cell is a text or
+             (text, classes, title), and {"group": text, "span": columns} is a line between groups
+    note     a paragraph
+
+Every text but `Markup` is escaped.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from lavender.base.errors import require_packages
+from lavender.report.render import format_cells, list_number_heads
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from rich.console import Console
+
+DEFAULT_ERROR_LIMIT = (
+    1e-3  # [m/s, rad/s on angular rows] Pages compare with this velocity error if none is given.
+)
+MAX_ROWS = 500  # Largest number of rows of a table on a page; files have all rows.
+
+
+@dataclass
+class Page:
+    """Contents of a page.
+
+    Parameters
+    ----------
+    title : str
+        Name of the command.
+    source : str
+        Command, input and its size.
+    verdict : str
+        The answer in one sentence, with its size in the user's unit.
+    sentences : list of str
+        Up to three sentences on the answer.
+    code : list of str
+        Lines to copy.
+    mark, is_bad : str, bool
+        Result of a comparison with a limit, shown before the verdict.
+    alarms : list of str
+        Sentences on wrong results, shown first.
+    warnings : list of str
+        Sentences on conditions on which shown numbers depend.
+    blocks : list
+        See the module.
+    footer : list
+        Files, versions, machine, date and command.
+    """
+
+    title: str
+    source: str
+    verdict: str
+    sentences: Sequence[str] = ()
+    code: Sequence[str] = ()
+    mark: str = ""
+    is_bad: bool = False
+    alarms: Sequence[str] = ()
+    warnings: Sequence[str] = ()
+    blocks: Sequence[Any] = ()
+    footer: Sequence[Any] = field(default_factory=list)
+
+    def render(self) -> str:
+        """Return the page as HTML."""
+        return str(_get_template().render(page=self))
+
+    def print_head(self, console: Console) -> None:
+        """Print the verdict, the sentences, the lines to copy and the warnings."""
+        for text, style in (
+            (f"{self.mark} {self.verdict}".strip(), "bold"),
+            *((text, "bold red") for text in self.alarms), *((text, "") for text in self.sentences),
+            *((f"    {line}", "") for line in self.code), *((text, "yellow") for text in self.warnings),
+        ):  # fmt: skip
+            text = text.replace("\u00a0", " ")  # Units do not break on a page only.
+            console.print(text, style=style, highlight=False, markup=False, soft_wrap=text.startswith("    "))
+
+
+def make_table(
+    rows: Sequence[Any], heads: Sequence[Any] = (), *, title: str = "", small: str = "", note: str = "",
+    key: Sequence[tuple[str, str]] = (), classes: str = "", foot: Sequence[Any] = (),
+) -> dict[str, Any]:  # fmt: skip
+    """Make the block of a table: see the module."""
+    return {"rows": rows, "heads": heads, "title": title, "small": small, "note": note, "key": key,
+            "classes": classes, "foot": foot}  # fmt: skip
+
+
+def tabulate_frame(frame: pd.DataFrame, is_grouped: bool = False, **more: Any) -> dict[str, Any]:
+    """Make the block of a table with the first `MAX_ROWS` rows of a frame, as `format_cells` writes them.
+
+    With `is_grouped`, equal first cells of consecutive rows become one line above these rows.
+    """
+    texts = format_cells(frame.head(MAX_ROWS))
+    numbers, rows = list_number_heads(texts), list[Any]()
+    is_grouped = is_grouped and bool(texts.shape[1] > 1)
+    first, group = int(is_grouped), None
+    for row in texts.to_numpy().tolist():
+        if is_grouped and row[0] != group:
+            group = row[0]
+            rows.append({"group": group, "span": texts.shape[1] - 1})
+        rows.append(row[first:])
+    heads = list(texts)[first:]
+    # The style sheet aligns the text columns of a table; classes of cells would double the size of a page.
+    classes = " ".join(f"t{i}" for i, head in enumerate(heads, 1) if head not in numbers)
+    return make_table(rows, heads, classes=classes, **more)
+
+
+def fold_table(
+    title: str, frame: pd.DataFrame, note: str = "", is_open: bool = False, is_grouped: bool = False
+) -> dict[str, Any]:
+    """Make a folded block with the table of a frame."""
+    more = f" The first {MAX_ROWS} of {len(frame)} rows; the file has all." if len(frame) > MAX_ROWS else ""
+    table = tabulate_frame(frame, is_grouped, note=f"{note}{more}".strip())
+    return {"folded": [table], "title": title, "open": is_open}
+
+
+@functools.cache
+def _get_template() -> Any:
+    """Compile the template, once."""
+    require_packages("a page of results", "jinja2")
+    import jinja2
+
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("lavender.report"), autoescape=True, undefined=jinja2.StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    return environment.get_template("page.html.j2")

@@ -1,0 +1,292 @@
+"""Answer how many sweeps a step needs: the verdict, the figures and the table of `lavender report --sweeps`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from markupsafe import Markup
+
+from lavender.report.drawing import (
+    BLUE,
+    INK,
+    MARKERS,
+    PAPER,
+    QUIET,
+    SERIES,
+    Label,
+    draw_error_strip,
+    draw_figure,
+    label_ends,
+    mark_errors,
+)
+from lavender.report.page import make_table
+from lavender.report.tables import PLAIN_SWEEPS, Contents, read_own_answers
+from lavender.report.text import format_count, format_percent, format_speed, format_time
+
+EQUAL_RATIO = 1.1  # Solvers whose errors differ by a smaller factor at every number of sweeps are one line.
+MAX_STRIP_STEPS = 400  # Columns of the strip of steps; a column of more steps has their largest error.
+SHOWN_RATIO = 1e-4  # Errors below this fraction of the limit lie in the strip at the bottom of the figure.
+
+
+class SweepStudy:
+    """Errors of fixed numbers of sweeps on the steps of sequences, without the first step of each.
+
+    Parameters
+    ----------
+    report : Contents
+    limit : float, m/s
+        Velocity error up to which a number of sweeps is enough; in rad/s on angular rows.
+    """
+
+    def __init__(self, report: Contents, limit: float) -> None:
+        self.report, self.limit = report, limit
+        runs = report.frame
+        runs = runs[(runs["mode"] == "budget") & (runs["step"] > 0) & (runs["order"] == "given")]
+        self.runs = runs.astype(dict.fromkeys(("solver", "start", "case", "sequence"), str))
+        errors = self.runs.groupby(["start", "solver", "max_iter"])["velocity"].max().unstack()
+        complete = self.runs.groupby(["start", "solver", "max_iter"])["case"].nunique().unstack()
+        self.n_steps = self.runs["case"].nunique()
+        errors = errors.where(complete == self.n_steps)
+        self.start = "carried" if "carried" in errors.index else "cold"
+        self.errors = errors.loc[self.start].dropna(how="all")
+        self.cold = errors.loc["cold"] if "cold" in errors.index else self.errors.iloc[:0]
+        self.budgets = list(map(int, self.errors.columns))
+        order = sorted(self.errors.index, key=lambda s: (*_place_plain(s), s))
+        self.groups: list[list[str]] = []  # Solvers with equal errors are one group.
+        for solver in order:
+            same = next((g for g in self.groups if self._are_equal(g[0], solver)), None)
+            if same is None:
+                self.groups.append([solver])
+            else:
+                same.append(solver)
+        enough = [g for g in self.groups if self._find_smallest(g[0])]
+        plain = [g for g in enough if g[0] in PLAIN_SWEEPS]
+        best = min(plain or enough, key=lambda g: self._find_smallest(g[0]) or 0, default=self.groups[0])
+        self.groups.remove(best)
+        self.groups.insert(0, best)
+        self.first = best[0]
+        self.answers = read_own_answers(report)
+        self.answers = self.answers[self.answers["step"] > 0]
+
+    def _are_equal(self, one: str, two: str) -> bool:
+        """Return whether two solvers have equal errors for each number of sweeps."""
+        a, b = (self.errors.loc[name].clip(lower=1e-12) for name in (one, two))
+        return bool(
+            (a.isna() == b.isna()).all() and (np.abs(np.log(a / b)).fillna(0.0) < np.log(EQUAL_RATIO)).all()
+        )
+
+    def _find_smallest(self, solver: str, errors: pd.DataFrame | None = None) -> int | None:
+        """Return the smallest number of sweeps from which on all errors are within the limit; None without one."""
+        errors = self.errors if errors is None else errors
+        if solver not in errors.index:
+            return None
+        own = errors.loc[solver].dropna()
+        above = np.flatnonzero(own > self.limit)
+        within = own.index[int(above[-1]) + 1 if len(above) else 0 :]
+        return int(within[0]) if len(within) else None
+
+    @property
+    def source(self) -> str:
+        """Command, sequences and their size."""
+        names = list(dict.fromkeys(self.runs["sequence"]))
+        return f"lavender report --sweeps · {', '.join(names[:3])} · {format_count(self.n_steps, 'recorded step')}"
+
+    @property
+    def unit(self) -> str:
+        """Unit of the largest error of the first solver."""
+        return "m/s"
+
+    @property
+    def verdict(self) -> str:
+        """How many sweeps are enough, or that no measured number is."""
+        best, errors = self._find_smallest(self.first), self.errors.loc[self.first]
+        limit = format_speed(self.limit)
+        if best is None:
+            last = errors.last_valid_index()
+            if last is None:
+                return "No number of sweeps was measured on every step."
+            return (
+                f"{last} sweeps of {self.first} are not enough: they leave {format_speed(errors[last])}; the limit is "
+                f"{limit}."
+            )
+        text = f"{best} sweeps of {self.first} keep every velocity error below {limit}"
+        fewer = [b for b in self.budgets if b < best and errors[b] == errors[b]]
+        return f"{text}; {fewer[-1]} leave {format_speed(errors[fewer[-1]])}." if fewer else f"{text}."
+
+    @property
+    def is_bad(self) -> bool:
+        """Whether the engine's own answers exceed the limit; without them, whether no number of sweeps is enough."""
+        if len(self.answers):
+            return bool(self.answers["velocity"].max() > self.limit)
+        return self._find_smallest(self.first) is None
+
+    @property
+    def mark(self) -> str:
+        """Result of the comparison of the engine's own answers with the limit; empty without them."""
+        return ("✗ too few now" if self.is_bad else "✓ enough now") if len(self.answers) else ""
+
+    @property
+    def sentences(self) -> list[str]:
+        """Sentences on the engine's own answers, the other solvers and cold starts."""
+        lines = []
+        if len(self.answers):
+            error, n = self.answers["velocity"], len(self.answers)
+            above, worst = int((error > self.limit).sum()), self.answers.loc[error.idxmax()]
+            count = self.answers["iterations"].dropna()
+            own = f"{count.max():.0f} iterations leave" if len(count) else "answers leave"
+            row = f" ({worst['worst']})" if worst["worst"] else ""
+            share = f"{format_percent(above, n) if above else 'none'} of {format_count(n, 'step')} above the limit"
+            lines.append(
+                f"Your engine's own {own} {format_speed(error.max())}, {share}; the worst is {worst['file']}{row}."
+            )
+        needs = [(g[0], self._find_smallest(g[0])) for g in self.groups[1:]]
+        texts = [f"{name} needs {n}" if n else f"{name} more than {self.budgets[-1]}" for name, n in needs]
+        best, cold = self._find_smallest(self.first), self._find_smallest(self.first, self.cold)
+        if self.start == "carried":
+            other = (
+                f"{self.first} needs {cold}" if cold else f"{self.budgets[-1]} of {self.first} are not enough"
+            )
+            same = "From cold starts the number is the same" if cold == best else f"From cold starts {other}"
+            return [*lines, " ".join(f"{text}." for text in ("; ".join(texts), same) if text)]
+        return [*lines, f"{'; '.join(texts)}."] if texts else lines
+
+    def make_blocks(self, folder: Path | None, with_figures: bool) -> list[Any]:
+        """Make the figures and the table of sweeps × solvers."""
+        table = self._make_sweeps_table()
+        if not with_figures:
+            return [table]
+        return [{"pair": [[Markup(self._draw_errors(folder))], [Markup(self._draw_steps(folder)), table]]}]
+
+    def _draw_errors(self, folder: Path | None) -> str:
+        """Draw the largest error against the number of sweeps, with the engine's own answers as a star."""
+        low = SHOWN_RATIO * self.limit
+        colors = [BLUE, *SERIES[2:], INK, *[QUIET] * len(self.groups)]
+
+        def fill(axes: Any) -> str:
+            axes.set_xscale("log", base=2)
+            axes.set_xlim(0.85 * self.budgets[0], 1.08 * self.budgets[-1])
+            high = max(
+                float(self.errors.max(axis=None)), float(self.cold.max(axis=None)) if len(self.cold) else 0.0
+            )
+            labels = mark_errors(axes, low, high, self.limit)
+
+            def place(errors: pd.Series[float]) -> Any:
+                return errors.where(errors.isna() | (errors >= low), low / 2.0)
+
+            for i, group in enumerate(self.groups):
+                own, name = (
+                    self.errors.loc[group[0]],
+                    group[0] + f" (+{len(group) - 1} equal)" * (len(group) > 1),
+                )
+                axes.plot(self.budgets, place(own), color=colors[i], marker=MARKERS[i % 6], ms=4.5, clip_on=False,
+                          lw=1.4 if i else 2.4, ls="-" if i < 5 else "--")  # fmt: skip
+                if (last := own.last_valid_index()) is not None:
+                    labels.append(Label(float(place(own)[last]), name, colors[i], "normal" if i else "bold"))
+            if self.start == "carried" and self.first in self.cold.index:
+                axes.plot(self.budgets, place(self.cold.loc[self.first]), color=BLUE, lw=0.9, ls=(0, (3, 2)))
+            best = self._find_smallest(self.first)
+            if best is not None:
+                axes.plot(
+                    [best, best],
+                    [low / 4.0, place(self.errors.loc[self.first])[best]],
+                    color=BLUE,
+                    lw=0.8,
+                    ls=":",
+                )
+            iterations = self.answers["iterations"].dropna()
+            if len(iterations):
+                x, y = float(iterations.max()), max(float(self.answers["velocity"].max()), low / 2.0)
+                x = min(max(x, self.budgets[0]), self.budgets[-1])
+                axes.plot([x], [y], "*", ms=13, color=INK, mec=PAPER, mew=0.8, zorder=9, clip_on=False)
+                axes.annotate(
+                    f"your engine\n{iterations.max():.0f} iterations: {format_speed(y)}", (x, y), xytext=(12, 16),
+                    textcoords="offset points", fontsize=8.6, fontweight="bold", va="bottom",
+                    ha="left" if x < self.budgets[len(self.budgets) // 2] else "right",
+                    arrowprops={"arrowstyle": "-", "lw": 0.6, "color": QUIET, "shrinkB": 5},
+                )  # fmt: skip
+            axes.set_xticks(self.budgets, list(map(str, self.budgets)))
+            axes.minorticks_off()
+            axes.grid(True)
+            axes.set_xlabel("sweeps in each step")
+            axes.set_ylabel("largest velocity error of all steps [m/s]")
+            label_ends(axes, labels)
+            return "Largest velocity error against sweeps. " + "; ".join(
+                f"{g[0]}: "
+                + ", ".join(f"{b} sweeps {format_speed(e)}" for b, e in self.errors.loc[g[0]].items())
+                for g in self.groups
+            )
+
+        notes = ["Warm starts; dashed: cold starts of the first solver."] if self.start == "carried" else []
+        notes += [
+            f"{' and '.join(g[1:])} equal{'s' * (len(g) == 2)} {g[0]}." for g in self.groups if len(g) > 1
+        ]
+        margins = {"left": 0.135, "right": 0.72, "top": 0.96, "bottom": 0.14}
+        note = " ".join([*notes, "(tables/sweeps.csv)"])
+        return draw_figure("sweeps", fill, (4.9, 3.5), margins, note=note, folder=folder)
+
+    def _draw_steps(self, folder: Path | None) -> str:
+        """Draw the error of each step after each number of sweeps of the first solver, the engine's answers first."""
+        runs = self.runs[(self.runs["solver"] == self.first) & (self.runs["start"] == self.start)]
+        table = runs.pivot_table(index="max_iter", columns="case", values="velocity", sort=False).sort_index()
+        cases = list(table.columns)
+        if len(self.answers):
+            own = self.answers.set_index("case")["velocity"].reindex(cases)
+            table = pd.concat([own.to_frame("your engine").T, table])
+        parts = np.array_split(np.arange(len(cases)), min(len(cases), MAX_STRIP_STEPS))
+        errors = np.stack([np.nanmax(table.to_numpy(float)[:, part], axis=1) for part in parts], axis=1)
+        steps, n = self.report.cases.loc[cases, "step"].to_numpy(int), len(table)
+        height = 0.27 * n + 0.75
+
+        def fill(axes: Any) -> str:
+            draw_error_strip(axes, errors, 1e-6, self.limit, (-0.5, len(cases) - 0.5, n - 0.5, -0.5))
+            for i in range(1, n):
+                axes.axhline(i - 0.5, color=PAPER, lw=5 if len(self.answers) and i == 1 else 2)
+            axes.set_yticks(range(n), list(map(str, table.index)))
+            shown = np.unique(np.linspace(0, len(cases) - 1, 6).astype(int))
+            axes.set_xticks(shown, list(map(str, steps[shown])))
+            axes.set_xlabel("recorded step")
+            axes.set_ylabel("sweeps")
+            return "Steps above the limit: " + ", ".join(
+                f"{name}: {int((own > self.limit).sum())} of {len(cases)}" for name, own in table.iterrows()
+            )
+
+        margins = {"left": 0.21, "right": 0.76, "top": 0.97, "bottom": 0.55 / height}
+        note = f"Which steps need them: error of each step with {self.first}" + (
+            "; first line: your engine's answers (records.csv)." if len(self.answers) else " (records.csv)."
+        )
+        return draw_figure("sweeps-by-step", fill, (4.9, height), margins, note=note, folder=folder)
+
+    def _make_sweeps_table(self) -> dict[str, Any]:
+        """Make the table of the largest errors: sweeps × solvers, motion error and, if valid, the time last."""
+        own = self.runs[(self.runs["solver"] == self.first) & (self.runs["start"] == self.start)].groupby(
+            "max_iter"
+        )
+        motion, times = own["motion_error"].max(), own["time"].median()
+        has_motion, is_idle = motion.notna().any(), not self.report.busy
+        rows = []
+
+        def write(error: float) -> str:
+            return "–" if error != error else format_speed(error) if error > 1e-7 else "≤ 0.1\u00a0µm/s"
+
+        for budget in self.budgets:
+            errors = [float(self.errors.loc[g[0], budget]) for g in self.groups]
+            cells: list[Any] = [(write(e), "c1" if e <= self.limit else "c4", "") for e in errors]
+            cells += [(write(float(motion[budget])), "", "")] if has_motion else []
+            cells += [(format_time(times[budget]), "q wide", "")] if is_idle else []
+            rows.append([str(budget), *cells])
+        heads: list[Any] = ["sweeps", *(g[0] for g in self.groups)]
+        heads += ["motion¹"] if has_motion else []
+        heads += [("time²", "wide", "")] if is_idle else []
+        notes = f"¹ largest error of a body's velocity with {self.first}. " if has_motion else ""
+        notes += f"² median of a call with {self.first}, with judge and Python." if is_idle else ""
+        small = f"{'warm starts; ' * (self.start == 'carried')}dark: within the limit of {format_speed(self.limit)}"
+        return make_table(rows, heads, title="Largest velocity error after each number of sweeps", small=small,
+                          note=notes.strip(), classes="matrix sweeps")  # fmt: skip
+
+
+def _place_plain(solver: str) -> tuple[bool, int]:
+    """Return a sort key that puts the methods of most engines first."""
+    return solver not in PLAIN_SWEEPS, PLAIN_SWEEPS.index(solver) if solver in PLAIN_SWEEPS else 0
