@@ -43,6 +43,31 @@ class Judging(NamedTuple):
     contact_share: float = 0.0
 
 
+class LostDigits(NamedTuple):
+    """Steps with forces that have lost digits, because R is far below the diagonal of J M^-1 J^T.
+
+    Parameters
+    ----------
+    steps : int
+    digits : float
+        Largest number of digits.
+    moved_by_forces : int
+        Steps with an acceleration that is exact to `acceleration_error`, which the integrator moves by the forces.
+    acceleration_error : float, m/s
+        Largest velocity error of the accelerations of these steps.
+    """
+
+    steps: int = 0
+    digits: float = 0.0
+    moved_by_forces: int = 0
+    acceleration_error: float = 0.0
+
+    def merge(self, other: LostDigits) -> LostDigits:
+        """Return the union of two sets of steps."""
+        (a, b, c, d), (e, f, g, h) = self, other
+        return LostDigits(a + e, max(b, f), c + g, max(d, h))
+
+
 class StepState(NamedTuple):
     """The state before a step, a dict by the engine's names."""
 
@@ -101,9 +126,7 @@ class Piece(NamedTuple):
     contact_states : sequence of StepState
     n_dropped : int
         Number of constraint rows for which the engine had no memory.
-    by_motion : (int, float, float)
-        Number of steps that were judged by the acceleration, because forces lost digits; largest number of lost digits;
-        largest velocity error of these steps [m/s].
+    lost_digits : LostDigits
     against : Piece, optional
         Results of the other model on the same states.
     """
@@ -121,7 +144,7 @@ class Piece(NamedTuple):
     engine_warnings: Mapping[str, int] = MappingProxyType({})
     contact_states: Sequence[StepState] = ()
     n_dropped: int = 0
-    by_motion: tuple[int, float, float] = (0, 0.0, 0.0)
+    lost_digits: LostDigits = LostDigits()
     against: Piece | None = None
 
     @classmethod
@@ -167,12 +190,14 @@ def judge_steps(
     with_contact = np.flatnonzero(contacts > 0)
     n = min(len(with_contact), int(np.ceil(judging.contact_share * len(world))))
     chosen = with_contact[np.arange(n) * len(with_contact) // max(n, 1)]
-    answers = [x for i, x in batch.engine_answers.items() if verdict[i] != NOT_JUDGED]
+    without_digits = residuals.without_digits.values()
+    by_forces = [x.acceleration_error for x in without_digits if np.isfinite(x.acceleration_error)]
+    digits = max((x.lost_digits for x in without_digits), default=0.0)
+    lost = LostDigits(len(without_digits), digits, len(by_forces), max(by_forces, default=0.0))
     return Piece(
         world, step, numbers, verdict=verdict, rows=rows, contacts=contacts, worst=worst,
         where=[(i, CONTACT_NUMBER.sub(r"\1 ", one.worst_name).strip()) for i, one in judged.items()],
         contact_states=[StepState(int(world[i]), int(step[i]), state_of(i)) for i in chosen.tolist()],
         converged=frame.converged, n_dropped=frame.n_dropped,
-        by_motion=(len(answers), max((x.lost_digits for x in answers), default=0.0),
-                   max((x.velocity for x in answers), default=0.0)),
+        lost_digits=lost,
     )  # fmt: skip

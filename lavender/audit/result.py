@@ -20,6 +20,7 @@ from lavender.audit.pieces import (
     N_WORST_WORLDS,
     NOT_JUDGED,
     WORST_ROW_ERRORS,
+    LostDigits,
     Piece,
     StepState,
     Worst,
@@ -50,8 +51,9 @@ ERRORS_NOTE = (
     "Errors of the worst row of each judged step; in rad/s if the row is angular. At its floor: rounding explains the "
     "error, in the engine's precision. Close enough: no row has a larger error than the threshold. Stopped before "
     "convergence, or wrong: all others. Not judged: the engine's answer is not finite, or the world diverged before. "
-    "Shares are fractions of the steps judged. The errors are of the engine's forces: the accelerations by which "
-    "MuJoCo's Newton and CG move bodies are usually more accurate."
+    "Shares are fractions of the steps judged. The errors are of the integrator's input: the "
+    "residual of forces, or the distance of an acceleration's velocities from the exact ones (Euler's method without "
+    "damping, discrete, RK4)."
 )
 SIZES_NOTE = "Rows and contacts of the steps judged."
 FILES_NOTE = (
@@ -116,8 +118,7 @@ class Audit:
         States before steps with contact, if the audit keeps them; in the order of worlds and steps.
     n_dropped : int
         Number of constraint rows for which the engine had no memory.
-    by_motion : (int, float, float)
-        As for `Piece`.
+    lost_digits : LostDigits
     against : Audit, optional
         Result of another model on the same states.
     key : str
@@ -142,7 +143,7 @@ class Audit:
     engine_warnings: Counter[str] = field(default_factory=Counter)
     contact_states: list[StepState] = field(default_factory=list)
     n_dropped: int = 0
-    by_motion: tuple[int, float, float] = (0, 0.0, 0.0)
+    lost_digits: LostDigits = field(default_factory=LostDigits)
     against: Audit | None = None
     key: str = ""
 
@@ -172,8 +173,7 @@ class Audit:
         self.engine_warnings.update(piece.engine_warnings)
         self.divergences[:] = sorted([*self.divergences, *piece.divergences])
         self.n_dropped += piece.n_dropped
-        (n, *own), (more, *new) = self.by_motion, piece.by_motion
-        self.by_motion = n + more, max(own[0], new[0]), max(own[1], new[1])
+        self.lost_digits = self.lost_digits.merge(piece.lost_digits)
         if self.against is not None and piece.against is not None:
             self.against.add_piece(piece.against, keep)
 
@@ -337,13 +337,18 @@ class Audit:
                 f"The engine had no memory for {self.n_dropped} constraint rows and dropped them: its answers solve "
                 "problems without these rows. Allocate more with --njmax."
             )
-        n_by_motion, digits, error = self.by_motion
-        if n_by_motion:
-            lines.append(
-                f"In {format_count(n_by_motion, 'step')} the forces lose up to {digits:.0f} of their digits, because R "
-                "of a row is far below the diagonal of J M^-1 J^T. These steps are judged by the acceleration: the "
-                f"motion is exact to {format_size(error)} m/s."
+        lost = self.lost_digits
+        if lost.steps:
+            text = (
+                f"In {format_count(lost.steps, 'step')} the forces lose up to {lost.digits:.0f} of their digits, "
+                "because R of a row is far below the diagonal of J M^-1 J^T."
             )
+            if lost.moved_by_forces:
+                text += (
+                    f" The acceleration is exact to {format_size(lost.acceleration_error)} m/s; the steps, which use "
+                    "the forces, are not."
+                )
+            lines.append(text)
         if self.engine_warnings:
             counted = self.engine_warnings.most_common()
             texts = "; ".join(f"{text} ({format_count(n, 'time')})" for text, n in counted)

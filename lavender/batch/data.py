@@ -25,7 +25,6 @@ from lavender.base.arrays import (
     resolve_index,
 )
 from lavender.base.errors import InputError
-from lavender.judge.residuals import EngineAnswer
 from lavender.problem import FRICTION_LAWS, Problem
 from lavender.problem.cones import Cones
 from lavender.problem.generalized import MAX_ASYMMETRY, MAX_ASYMMETRY_FLOAT32
@@ -160,7 +159,8 @@ class Batch(Sequence[Problem]):
         compliance = 0.0 if compliance is None else compliance
         soft, at["soft"], _ = _flatten("compliance", compliance, n, row_shape, sizes)
         self._arrays: Any = (jac, mass, free, goal, soft, self._flatten_mu(mu))
-        self.engine_answers: dict[int, EngineAnswer] = {}  # Accelerations that `residual` judges, by world.
+        # `lavender.io.engine_motion.EngineMotion` of worlds that an engine moves by accelerations.
+        self.engine_motions: dict[int, Any] = {}
 
     # Function that returns the names of a world's blocks.
     names_of: Callable[[int], Sequence[str]] | None = None
@@ -255,8 +255,8 @@ class Batch(Sequence[Problem]):
             jac, mass, free, target=target, cones=cones, compliance=compliance, friction=self.friction,
             precision=self.precision, names=None if self.names_of is None else self.names_of(i),
         )  # fmt: skip
-        if i in self.engine_answers:
-            problem.__dict__["engine_answer"] = self.engine_answers[i]
+        if i in self.engine_motions:
+            problem.__dict__["engine_motion"] = self.engine_motions[i]
         return problem
 
     def _get_array_of_world(self, world: dict[str, int], which: int) -> Any:

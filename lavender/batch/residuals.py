@@ -226,6 +226,8 @@ class Residuals(WorldResults):
             self._impulse[:] = np.concatenate([np.zeros(0), *starts])
         # `Residual.nothing_to_do` of the worlds that single calls processed.
         self._nothing_to_do: dict[int, bool] = {}
+        # Residuals of the worlds with forces of an engine that have lost digits.
+        self.without_digits: dict[int, Residual] = {}
 
     @cached_property
     def verdict(self) -> np.ndarray:
@@ -258,6 +260,8 @@ class Residuals(WorldResults):
         """Store the residual of a world that a single call processed."""
         self._store_residual(i, residual)
         self._nothing_to_do[i] = residual.nothing_to_do
+        if residual.lost_digits:
+            self.without_digits[i] = residual
         self._worlds.numbers[NUMBER["rhs_energy"], i] = residual.energy_rhs
 
     def _get_result(self, i: int) -> Residual:
@@ -343,11 +347,13 @@ def residual_many(
     residuals._process_worlds(
         lambda hand: int(hand.judge_worlds(TOL, is_single_precision)), judge_single, threads, errors
     )
-    answers = worlds.engine_answers if type(worlds) is Batch else {}
+    above_floor = residuals._get_column("above_floor")
     for i, precision in enumerate(precisions):  # For a list of problems, the compiled loop assumes float64.
         is_float32 = precision == "float32" and not is_single_precision
-        is_engine = i in answers if type(worlds) is Batch else "engine_answer" in worlds[i].__dict__
-        if (is_float32 or is_engine) and i not in residuals.faults:
+        is_engine = (
+            i in worlds.engine_motions if type(worlds) is Batch else "engine_motion" in worlds[i].__dict__
+        )
+        if (is_float32 or (is_engine and above_floor[i] != 0.0)) and i not in residuals.faults:
             judge_single(i)
     return residuals
 

@@ -35,10 +35,11 @@ from lavender.base.errors import CapabilityError, InputError
 from lavender.base.threads import run_on_threads
 from lavender.batch.data import ERRORS, Batch, check_row_counts, check_shared_lower_triangles
 from lavender.io import mujoco as single
+from lavender.io.engine_motion import MOVERS
 from lavender.io.mujoco_discrete import MASS_TOLERANCE, compute_discrete_matrix
 from lavender.io.mujoco_memory import CHANGED_ADVICE, import_mujoco, read_step
 from lavender.io.start_states import can_sleep
-from lavender.io.stiff_rows import judge_stiff_worlds
+from lavender.io.stiff_rows import make_engine_batch
 from lavender.problem import FRICTION_LAWS
 from lavender.problem.cones import ROW, Cones, get_block_kinds
 from lavender.problem.generalized import Compressed
@@ -96,6 +97,7 @@ def from_efc(
     efc_force: Any = None,
     qfrc_smooth: Any = None,
     qacc: Any = None,
+    moved_by: str = "acceleration",
     friction: str = "cone",
     like: Any = None,
 ) -> Imported:
@@ -128,6 +130,10 @@ def from_efc(
     qacc : (n, nv), optional
         The engine's acceleration. If a number of a world is not finite or above 1e10, the engine's answer is not
         usable, whatever its forces are: all impulses of this world are NaN.
+    moved_by : {"acceleration", "forces"}
+        Quantity that the engine's integrator uses, if qacc is given. MJX moves bodies by forces with `implicitfast`,
+        and with Euler and damped joints. An acceleration is judged by the distance of its velocities from the exact
+        solution.
     friction : {"cone", "coulomb"}, default "cone"
         Law of elliptic contacts: "cone" is MuJoCo's convex relaxation. Engines that solve the Signorini condition with
         Coulomb's law need "coulomb"; their contacts have three rows and one coefficient for both tangents.
@@ -154,6 +160,7 @@ def from_efc(
         contact with torsional or rolling friction, or with different coefficients of its tangents.
     """
     friction = check_choice("friction", friction, FRICTION_LAWS)
+    check_choice("moved_by", moved_by, MOVERS)
     convert = find_converter(like)
     jac, before = as_float_array("efc_J", efc_J), as_float_array("qvel", qvel)
     # MJX and Warp store the time step as an array of one number.
@@ -212,7 +219,7 @@ def from_efc(
         return batch
 
     if efc_force is None:
-        return Imported(judge_stiff_worlds(make_batch, compliance), None)
+        return Imported(make_engine_batch(make_batch, compliance), None)
     force = as_array("efc_force", efc_force, (n, m), finite=False)
     lam, change = np.where(used_rows, dt * force, 0.0), None
     lam = lam if scale is None else lam / scale
@@ -222,7 +229,7 @@ def from_efc(
         change = dt * (acceleration - smooth)
         if nefc is None:
             _warn_of_old_forces(jac, inv_compliance, aref, row_type, force, acceleration)
-    batch = judge_stiff_worlds(make_batch, compliance, lam, change)
+    batch = make_engine_batch(make_batch, compliance, lam, change, moved_by)
     return Imported(batch, lam if convert is None else convert(lam))
 
 
@@ -273,8 +280,9 @@ class MujocoScratch:
 
 
 def from_mujoco_many(
-    model: Any, states: Any, *, threads: int = 1, errors: str = "raise", scratch: MujocoScratch | None = None
-) -> Imported:
+    model: Any, states: Any, *, threads: int = 1, errors: str = "raise", scratch: MujocoScratch | None = None,
+    velocity: Any = None,
+) -> Imported:  # fmt: skip
     """Call `mj_forward` on many states of one MuJoCo model; return the problems and MuJoCo's own answers.
 
     A model with <flag sleep="enable"/> is rejected: a state does not contain which trees sleep, so that MuJoCo would
@@ -297,6 +305,8 @@ def from_mujoco_many(
     scratch : MujocoScratch, optional
         Made once for `model`, it saves each call the time to make an MjData, more than that of 30 worlds. It needs
         threads=1. The results do not depend on it.
+    velocity : (n, nv) array, optional
+        It receives the velocity after each step that MuJoCo's answer predicts; see `lavender.io.mujoco.engine_answer`.
 
     Returns
     -------
@@ -335,6 +345,7 @@ def from_mujoco_many(
         )
     n, nv, dt = len(values), model.nv, float(model.opt.timestep)
     free, smooth, acceleration = np.full((n, nv), np.nan), np.zeros((n, nv)), np.full((n, nv), np.nan)
+    momentum, mover = np.zeros((n, nv)), ""
     mass = np.zeros((n, len(model.M_colind)))
     mass[:, model.M_rowadr + model.M_rownnz - 1] = 1.0  # States that are not finite keep the identity as M.
     triangle = model.M_colind, np.append(model.M_rowadr, len(model.M_colind))
@@ -358,6 +369,7 @@ def from_mujoco_many(
     has_moving_surfaces, kind = bool(getattr(model, "flg_surfacevel", 0)), int(kinds[size])
 
     def work(stop: bytearray) -> None:
+        nonlocal mover
         data = mj.MjData(model) if scratch is None else scratch.take_data()
         step = read_step(model, data)
         for i in pending:
@@ -374,7 +386,8 @@ def from_mujoco_many(
                 mj.mj_mulJacVec(model, data, data.efc_vel, data.qvel)
             step.read(data)
             free[i], smooth[i], mass[i] = data.qvel, data.qacc_smooth, data.M
-            acceleration[i] = data.qacc
+            acceleration[i], momentum[i] = data.qacc, dt * data.qfrc_constraint
+            mover = mover or single.find_mover(step, is_stepped=False)
             if not all_finite(data.qacc):
                 if errors == "raise":
                     raise InputError(f"state {i}: {single.DIVERGED_TEXT}")
@@ -387,7 +400,10 @@ def from_mujoco_many(
                 matrices[i] = matrix.lower
                 smooth[i] += 0.0 if matrix.change is None else matrix.change
             blocks = single.make_blocks(step, data, 1)
-            rows_of_states[i] = *copy_rows(step, blocks), blocks
+            rows = copy_rows(step, blocks)
+            rows_of_states[i] = *rows, blocks
+            if velocity is not None:
+                velocity[i] = _predict_velocity(mj, model, data, mover, rows)
         if scratch is not None:
             scratch.keep_data(data)
 
@@ -420,7 +436,7 @@ def from_mujoco_many(
         )
 
     change = None if model.opt.noslip_iterations else dt * (acceleration - smooth)
-    batch = judge_stiff_worlds(make_batch, compliance, lam, change)
+    batch = make_engine_batch(make_batch, compliance, lam, change, mover, momentum)
 
     blocks_of_worlds = dict(zip(order, blocks_of_states, strict=True))
 
@@ -432,6 +448,22 @@ def from_mujoco_many(
     batch.names_of = name_blocks_of_world
     batch.contact_counts = contact_counts
     return Imported(batch, lam)
+
+
+def _predict_velocity(mj: Any, model: Any, data: Any, moved_by: str, rows: Any) -> FloatArray:
+    """Return the velocity (nv,) after the step from the rows of `copy_rows`; `data` is advanced.
+
+    It is NaN with RK4, which uses the answers of four forward passes.
+    """
+    if model.opt.integrator == mj.mjtIntegrator.mjINT_RK4:
+        return np.full(model.nv, np.nan)
+    if moved_by == "acceleration":
+        velocity: FloatArray = data.qvel + model.opt.timestep * data.qacc
+        return velocity
+    jac, numbers, _ = rows
+    force, scale = numbers[:, 2], numbers[:, 4]
+    force = np.divide(force, scale, out=np.zeros(len(force)), where=scale != 0.0)
+    return single.integrate_forces(mj, model, data, jac.T @ force)
 
 
 def _merge_lower_triangles(matrices: dict[int, Compressed], mass: FloatArray, triangle: Any) -> Any:

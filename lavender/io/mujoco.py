@@ -27,16 +27,17 @@ the error of `impulse`.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray, as_array, mark_read_only
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.lazy_import import sparse as sp
+from lavender.io.engine_motion import EngineMotion
 from lavender.io.mujoco_discrete import MASS_TOLERANCE, compute_discrete_matrix
 from lavender.io.mujoco_memory import CHANGED_ADVICE, OTHER_MODEL_ADVICE, read_step
-from lavender.io.stiff_rows import MAX_EXAMINED_COMPLIANCE, find_engine_answer, raise_compliance
+from lavender.io.stiff_rows import MAX_EXAMINED_COMPLIANCE, raise_compliance
 from lavender.problem import Names, Problem
 from lavender.problem.cones import Cones
 from lavender.problem.generalized import Generalized
@@ -102,8 +103,9 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
     mass, change = _read_mass(step, data)
     blocks = make_blocks(step, data)
     jac = _read_jacobian(step, data, blocks)
+    before = _get_velocity_before(step)
     b, compliance, v_free, is_regular, gap, gaps = mujoco_rows.compute_problem_numbers(
-        step, blocks, jac, _get_velocity_before(step), SUM_TOLERANCE, COMPLIANCE_TOLERANCE, MAX_SAFE_ENTRY
+        step, blocks, jac, before, SUM_TOLERANCE, COMPLIANCE_TOLERANCE, MAX_SAFE_ENTRY
     )
     if not is_regular:
         _check_jacobian(*gaps)
@@ -111,37 +113,123 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
             compliance = _compute_compliance(data) * get_row_scales(blocks) * get_row_scales(blocks)
     general = Generalized.from_compressed_rows(jac, mass, v_free, like=kept.operator)
     operator = kept.operator = general.operator
-    if step.m and compliance.min() < MAX_EXAMINED_COMPLIANCE:
-        if change is not None:
-            b = mark_read_only(b - dt * general.velocity_of(change))
-            general = general.with_jacobian(v_free=v_free + dt * change)
-        return _make_stiff_problem(
-            step, data, name, change, _make_fields(kept.mj, model, blocks, b, compliance, general)
-        )
     rest = kept.mj, model, blocks, b, compliance, general
-    if is_regular and change is None and not operator.has_entry_above(MAX_SAFE_ENTRY):
+    is_stiff = step.m > 0 and compliance.min() < MAX_EXAMINED_COMPLIANCE
+    if is_regular and change is None and not is_stiff and not operator.has_entry_above(MAX_SAFE_ENTRY):
         view = make_generalized_data(blocks, b, operator, compliance, LAWS["cone"])
         problem: Problem = Problem._from_checked_data(view, "cone", name, (_make_fields, rest))
-        return problem
-    if change is not None:  # MuJoCo's own a0 is as accurate as opt.tolerance only.
-        b = mark_read_only(b - dt * general.velocity_of(change))
-        general = general.with_jacobian(v_free=v_free + dt * change)
-    return Problem(**_make_fields(*rest[:3], b, compliance, general), friction="cone", name=name, copy=False)
-
-
-def _make_stiff_problem(step: Step, data: Any, name: str, change: Any, fields: dict[str, Any]) -> Problem:
-    """Build a problem with rows of a small R, and judge MuJoCo's acceleration; see `lavender.io.stiff_rows`."""
-    problem, compliance = Problem(**fields, friction="cone", name=name, copy=False), fields["compliance"]
-    raised = raise_compliance(problem)
-    if raised is not None:
-        problem = replace(problem, compliance=raised)
-    if not step.has_noslip:
-        scale = get_row_scales(make_blocks(step, data))
-        smooth = data.qacc_smooth + (0.0 if change is None else change)
-        force = _scale_force(step, data, scale)
-        answer = find_engine_answer(problem, compliance, force, step.dt * (data.qacc - smooth))
-        problem.__dict__["engine_answer"] = answer
+    else:
+        if change is not None:  # MuJoCo's own a0 is as accurate as opt.tolerance only.
+            b = mark_read_only(b - dt * general.velocity_of(change))
+            general = general.with_jacobian(v_free=v_free + dt * change)
+        fields = _make_fields(*rest[:3], b, compliance, general)
+        problem = Problem(**fields, friction="cone", name=name, copy=False)
+        raised = raise_compliance(problem) if is_stiff else None
+        if raised is not None:
+            problem = replace(problem, compliance=raised)
+    moved_by = find_mover(step, before is not None)
+    if step.m and (moved_by == "acceleration" or is_stiff) and not step.has_noslip:
+        lam = _scale_force(step, data, get_row_scales(blocks))
+        smooth = data.qacc_smooth if change is None else data.qacc_smooth + change
+        momentum = dt * data.qfrc_constraint if is_stiff else None
+        motion = EngineMotion(lam, dt * (data.qacc - smooth), compliance, moved_by, momentum)
+        problem.__dict__["engine_motion"] = motion
     return problem
+
+
+class EngineAnswer(NamedTuple):
+    """The part of the solver's answer that MuJoCo's integrator uses, and the velocity that follows.
+
+    Parameters
+    ----------
+    moved_by : {"acceleration", "forces"}
+        Euler's method without damping, `discrete` and RK4 use qacc; Euler's method with damping, `implicit` and
+        `implicitfast` use qfrc_constraint.
+    impulse : (m,), N s
+        The forces in the rows of the problem.
+    velocity : (nv,), m/s, rad/s
+        Velocity after the step by this answer alone. NaN if it cannot be predicted: with RK4, which uses the answers of
+        four forward passes, and if `mj_step` has advanced activations that the implicit integrators differentiate.
+    """
+
+    moved_by: str
+    impulse: FloatArray
+    velocity: FloatArray
+
+
+def engine_answer(model: Any, data: Any) -> EngineAnswer:
+    """Return the answer that moved the bodies in the last step, or will move them in the next one.
+
+    The predicted velocity contains only the quantity of `moved_by`: it equals MuJoCo's own next qvel, to rounding,
+    unless the model or the data were changed between the forward pass and the integration.
+
+    Parameters
+    ----------
+    model : mujoco.MjModel
+    data : mujoco.MjData
+        After `mj_forward` or `mj_step`. It is not changed.
+    """
+    step = read_step(model, data)
+    dt, mj = _get_timestep(step), step.cache.mj
+    scale = get_row_scales(make_blocks(step, data))
+    impulse = _scale_force(step, data, scale)
+    before = _get_velocity_before(step)
+    moved_by = find_mover(step, before is not None)
+    start = data.qvel.copy() if before is None else before
+    is_runge_kutta = model.opt.integrator == mj.mjtIntegrator.mjINT_RK4
+    if is_runge_kutta or (moved_by == "forces" and before is not None and model.na):
+        return EngineAnswer(moved_by, impulse, np.full(step.n, np.nan))
+    if moved_by == "acceleration":
+        return EngineAnswer(moved_by, impulse, start + dt * data.qacc)
+    scratch = mj.MjData(model)
+    mj.mj_copyData(scratch, model, data)
+    scratch.qvel[:] = start
+    force = jacobian(model, data).T @ (scale * impulse) / dt
+    return EngineAnswer(moved_by, impulse, integrate_forces(mj, model, scratch, force))
+
+
+def integrate_forces(mj: Any, model: Any, data: Any, force: FloatArray) -> FloatArray:
+    """Return the velocity after the step (nv,) from generalised constraint forces (nv,); `data` is advanced.
+
+    MuJoCo's own integrator runs with these forces, and without an acceleration.
+    """
+    data.qfrc_constraint[:], data.qacc[:] = force, np.nan
+    is_euler = model.opt.integrator == mj.mjtIntegrator.mjINT_EULER
+    (mj.mj_Euler if is_euler else mj.mj_implicit)(model, data)
+    return np.array(data.qvel)
+
+
+def find_mover(step: Step, is_stepped: bool) -> str:
+    """Return "acceleration" if MuJoCo's integrator uses qacc, and "forces" if it uses qfrc_constraint.
+
+    They describe the same motion if the solver has converged, and with PGS. Euler's method with damping, `implicit` and
+    `implicitfast` solve (M - h dF/dv) a = qfrc_smooth + qfrc_constraint; all other methods use qacc. RK4 uses the qacc
+    of each of its four passes: after a step, the rows are those of the last pass, and qacc is the mean of all.
+    """
+    model, mj = step.model, step.cache.mj
+    option, kinds = model.opt, mj.mjtIntegrator
+    if step.is_discrete:
+        return "acceleration"
+    integrator = option.integrator
+    if integrator == kinds.mjINT_RK4:
+        return "forces" if is_stepped else "acceleration"
+    if integrator != kinds.mjINT_EULER:
+        is_implicit = integrator in (kinds.mjINT_IMPLICIT, kinds.mjINT_IMPLICITFAST)
+        return "forces" if is_implicit else "acceleration"
+    return "forces" if is_euler_damped(mj, model) else "acceleration"
+
+
+def is_euler_damped(mj: Any, model: Any) -> bool:
+    """Return whether Euler's method is implicit in the dampings of joints, so that it uses forces."""
+    bits = mj.mjtDisableBit
+    off = int(bits.mjDSBL_EULERDAMP) | int(getattr(bits, "mjDSBL_DAMPER", getattr(bits, "mjDSBL_PASSIVE", 0)))
+    if int(model.opt.disableflags) & off:
+        return False
+    if model.dof_damping.any():
+        return True
+    # MuJoCo 4 has polynomial dampings, and dampings of actuators that act on the velocities of joints.
+    poly, actuators = getattr(model, "dof_dampingpoly", None), getattr(model, "jnt_actuatorid", None)
+    return bool((poly is not None and poly.any()) or (actuators is not None and (actuators != -1).any()))
 
 
 def _make_fields(

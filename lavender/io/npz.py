@@ -18,6 +18,7 @@ from lavender.base.arrays import FloatArray, as_array, check_int
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import issparse
 from lavender.base.lazy_import import sparse as sp
+from lavender.io.engine_motion import MOVERS, EngineMotion
 from lavender.io.stored import Arrays, read_arrays, write_arrays
 from lavender.problem import Problem, check_problem
 from lavender.problem.cones import Cones, get_block_kinds
@@ -34,6 +35,7 @@ GENERALIZED = (
 )
 CSR = ("A_data", "A_indices", "A_indptr", "A_shape")
 FORMS = ("dense", "csr", "rows", "generalized")
+MOTION = ("engine_change", "engine_compliance", "engine_momentum")
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +96,8 @@ def read_npz(path: str | os.PathLike[str]) -> Stored:
 def write_npz(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = None) -> None:
     """Write a problem in our own format, optionally with an impulse (m,) [N s], for example its solution.
 
-    `read_npz(path).problem == problem`, bit for bit.
+    `read_npz(path).problem == problem`, bit for bit. If the impulse is an engine's answer, the motion of the engine is
+    written, too, so that `residual` judges what moved the bodies.
     """
     check_problem(problem)
     arrays: dict[str, Any] = {"lavender_format": np.int64(FORMAT_VERSION), "b": problem.b}
@@ -133,6 +136,12 @@ def write_npz(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = 
         meta["dof_names"] = general.names
     if problem.has_singular_program:
         meta["program"] = len(problem.qp.q)
+    motion = problem.__dict__.get("engine_motion")
+    if motion is not None and impulse is not None and np.array_equal(arrays["impulse"], motion.impulse):
+        meta["moved_by"] = motion.moved_by
+        arrays["engine_change"], arrays["engine_compliance"] = motion.change, motion.compliance
+        if motion.momentum is not None:
+            arrays["engine_momentum"] = motion.momentum
     arrays["meta"] = np.frombuffer(json.dumps(meta).encode("ascii"), np.uint8)
     write_arrays(path, arrays)
 
@@ -169,7 +178,26 @@ def _read_own_format(archive: Arrays) -> Stored:
     if "program" in meta:
         n = check_int("program", meta["program"], high=problem.m)
         problem = replace(problem, qp=recover_program(problem.csr, problem.b, problem.cones, n), copy=False)
-    return Stored(problem, "lavender", impulse=_read_vector(archive, "impulse", problem))
+    impulse = _read_vector(archive, "impulse", problem)
+    if "moved_by" in meta:
+        _add_motion(archive, problem, impulse, meta["moved_by"])
+    return Stored(problem, "lavender", impulse=impulse)
+
+
+def _add_motion(archive: Arrays, problem: Problem, impulse: FloatArray | None, moved_by: str) -> None:
+    """Add the motion of an engine to a problem in generalised coordinates."""
+    general = problem.generalized
+    if general is None or impulse is None or moved_by not in MOVERS:
+        raise InputError(
+            f"entry 'meta': moved_by is {moved_by!r:.60}; {' or '.join(MOVERS)} is needed, in generalised "
+            "coordinates and with the entry impulse"
+        )
+    change, compliance, *momentum = (
+        as_array(f"entry {name!r}", archive[name], (n,), finite=False)
+        for name, n in zip(MOTION, (general.nv, problem.m, general.nv), strict=True)
+        if name in archive or name in MOTION[:2]
+    )
+    problem.__dict__["engine_motion"] = EngineMotion(impulse, change, compliance, moved_by, *momentum)
 
 
 def _read_meta(archive: Arrays) -> dict[str, Any]:

@@ -48,7 +48,9 @@ def describe_answer(problem: Problem, impulse: Any, threshold: float) -> dict[st
         "rows": problem.m, "relative": judged.relative, "velocity": judged.velocity, "worst": judged.worst_name,
         "floor": judged.roundoff_floor, "verdict": judged.verdict, "precision": problem.precision,
         "threshold": threshold,
-    } | ({"lost_digits": judged.lost_digits} if judged.lost_digits else {})  # fmt: skip
+    } | ({"lost_digits": judged.lost_digits} if judged.lost_digits else {}) | (
+        {"moved_by": judged.moved_by} if judged.moved_by != "impulse" else {}
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -108,23 +108,6 @@ class Rounding:
         return f"impulse {self.impulse:.1e}, data {self.data:.1e}{more}"
 
 
-class EngineAnswer(NamedTuple):
-    """Error of an engine's acceleration, for an impulse that has lost its digits (`lavender.io.stiff_rows`).
-
-    `residual` returns these errors if it gets exactly `impulse` (m,) [N s]. `Residual` describes the other fields.
-    """
-
-    impulse: FloatArray
-    relative: float
-    energy: float
-    velocity: float
-    roundoff_floor: float
-    worst_row: int
-    error: FloatArray
-    slack: FloatArray
-    lost_digits: float
-
-
 class Islands(NamedTuple):
     """Errors of n islands: sets of blocks that share no moving body, tree of M or entry of A with other blocks.
 
@@ -184,8 +167,13 @@ class Residual:
         With float32: contributions to the floor.
     threshold : float, m/s
         Largest velocity error of an answer with the verdict "close enough".
+    moved_by : {"impulse", "acceleration"}
+        Judged quantity: the impulse, or the acceleration by which an engine moved the bodies. `error` then is the
+        difference of its velocities from those of the exact solution, divided by the weights of `velocity_by_row`.
     lost_digits : float
-        Decimal digits that an engine's forces have lost, if its acceleration was judged in their place; else 0.
+        Decimal digits that an engine's forces have lost, because R is far below the diagonal of A; else 0.
+    acceleration_error : float, m/s
+        Velocity error of the engine's acceleration, if forces that have lost digits were judged; else NaN.
     """
 
     relative: float
@@ -205,7 +193,9 @@ class Residual:
     precision: str = "float64"
     rounding: Rounding | None = None
     threshold: float = DEFAULT_THRESHOLD
+    moved_by: str = "impulse"
     lost_digits: float = 0.0
+    acceleration_error: float = math.nan
     # Relative residual before the refinement for an ill-conditioned M.
     _float64_relative: float = field(default=math.nan, repr=False)
 
@@ -305,8 +295,15 @@ class Residual:
     def __str__(self) -> str:
         worst = f", worst {self.worst_name} ({self.velocity:.2g} m/s)" if self.worst_row >= 0 else ""
         text = f"relative {self.relative:.2e}, energy {self.energy:.2e} sqrt(J){worst}, floor {self.roundoff_floor:.1e}"
+        if self.moved_by == "acceleration":
+            text += "; judged by its acceleration, which moves the bodies"
         if self.lost_digits:
-            text += f"; the forces lose {self.lost_digits:.0f} digits, the motion is exact to {self.velocity:.1e} m/s"
+            text += f"; the forces lose {self.lost_digits:.0f} digits"
+        if not math.isnan(self.acceleration_error):
+            text += (
+                f", its acceleration is exact to {self.acceleration_error:.1e} m/s; the step, which uses its forces, "
+                "is not"
+            )
         if self.rounding is None:
             return text
         return f"{text} of {self.precision} ({self.rounding}): {self.verdict_in_words}"
@@ -506,24 +503,33 @@ def residual(
     if tol != TOL and not (type(tol) is float and tol >= 0.0):
         tol = check_float("tol", tol, low=0.0)
     result = refine_residual(problem, judge_impulse(problem, impulse), tol)
-    answer: EngineAnswer | None = problem.__dict__.get("engine_answer")
-    is_engine = False
-    if answer is not None and np.array_equal(answer.impulse, impulse):
-        is_engine = True
-        result = _apply_engine_answer(result, answer, precision)
     if type(threshold) is not float or threshold != DEFAULT_THRESHOLD:
         result = replace(result, threshold=check_float("threshold", threshold, low=0.0))
-    return result if precision == "float64" or is_engine else _apply_float32_floor(problem, result, impulse)
+    if precision != "float64":
+        result = _apply_float32_floor(problem, result, impulse)
+    motion = problem.__dict__.get("engine_motion")  # `lavender.io.engine_motion.EngineMotion`
+    if motion is not None and not result.at_floor and np.array_equal(motion.impulse, impulse):
+        result = motion.judge(problem, result)
+    return result
 
 
-def _apply_engine_answer(result: Residual, answer: EngineAnswer, precision: str) -> Residual:
-    """Return a residual with the errors of an engine's acceleration in place of the errors of its forces."""
-    fields = answer._asdict()
-    del fields["impulse"]
-    is_rounding = _is_explained_by_rounding(answer.relative, answer.roundoff_floor, precision)
-    limit = MAX_EXCUSED_RESIDUAL if precision == "float64" else 1.0
-    above = 0.0 if is_rounding and answer.relative <= limit else answer.relative
-    return replace(result, **fields, above_floor=above, worst_island=-1, precision=precision)
+def replace_error(
+    result: Residual, problem: Problem, error: FloatArray, rounding: FloatArray, **fields: Any
+) -> Residual:
+    """Return a residual with the error (m,) [N s] of an engine's motion and its rounding."""
+    get_zero_impulse_reference(problem)
+    speeds = [problem.metric.weight * np.abs(e) for e in (error, rounding)]
+    energies = [float(np.sqrt(np.sum(problem.d * e * e))) for e in (error, rounding)]
+    relative, floor = (
+        divide_by_reference(problem.metric, e, float(v.max())) for e, v in zip(energies, speeds, strict=True)
+    )
+    limit = MAX_EXCUSED_RESIDUAL if result.precision == "float64" else 1.0
+    is_rounding = _is_explained_by_rounding(relative, floor, result.precision)
+    return replace(
+        result, relative=relative, energy=energies[0], velocity=float(speeds[0].max()), roundoff_floor=floor,
+        worst_row=int(speeds[0].argmax()), error=mark_read_only(error), worst_island=-1,
+        above_floor=0.0 if is_rounding and relative <= limit else relative, moved_by="acceleration", **fields,
+    )  # fmt: skip
 
 
 def convert_residual_from_disk(problem: Problem, of_disk: Residual) -> Residual:

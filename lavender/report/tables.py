@@ -221,7 +221,7 @@ def _complete_answer(folder: Path, answer: Row) -> Row | None:
     path, judged = folder / Path(str(answer.get("file"))).name, Row()
     with contextlib.suppress(ValueError, KeyError, TypeError, LavenderError, OSError):
         impulse = io.load_solution(path) if path.is_file() else None
-        # The acceleration of a step whose forces lost digits was judged when the step was recorded; no file holds it.
+        # Files of earlier versions do not hold the acceleration of a step with forces without digits.
         if impulse is not None and not answer.get("lost_digits"):
             judged = describe_answer(
                 io.load(path), impulse, float(answer.get("threshold", DEFAULT_THRESHOLD))

@@ -16,7 +16,7 @@ from lavender.report.tables import read_engine_answers
 LEVER_MODEL = """<mujoco><option timestep="0.002"/><worldbody>
 <geom type="box" size=".01 .02 .02" pos=".12 .028 0" condim="{condim}"/>
 <geom type="box" size=".01 .02 .02" pos=".12 -.028 0" condim="{condim}"/>
-<body><joint name="axle" axis="0 0 1" damping="0.01"/><inertial pos="0 0 0" mass=".2" diaginertia="1e-4 1e-4 1e-4"/>
+<body><joint name="axle" axis="0 0 1"/><inertial pos="0 0 0" mass=".2" diaginertia="1e-4 1e-4 1e-4"/>
 <geom type="capsule" fromto="0 0 0 .15 0 0" size=".01" condim="{condim}"/></body></worldbody>
 <actuator><motor joint="axle"/></actuator></mujoco>"""
 

@@ -1,0 +1,247 @@
+"""Judge the quantity that moved the bodies: an engine's forces, or its acceleration.
+
+An engine's solver returns forces f and an acceleration a, and its integrator uses one of them. They describe the same
+motion only if the solver has converged. The forces are judged by `lavender.residual` itself. The acceleration is judged
+by the difference of velocities from the exact solution:
+
+    error of row i = J_i (v+ - v_exact)     v+ = v* + dt (a - a0)     v_exact = v* + M^-1 J^T lambda                (1)
+
+lambda is the solution by Newton's method from the engine's forces; its own residual belongs to the rounding of (1).
+
+**Forces without digits.** If R is far below d = (J M^-1 J^T)_ii, neither the engine's forces nor lambda have digits
+(`lavender.io.stiff_rows`). One Newton step over velocities, with the engine's own R and the active rows of the forces,
+then leads from v+ to the solution:
+
+    (M + sum_active J_i^T J_i / R_i) delta = M (a - a0) dt - dt J^T f                                               (2)
+
+Rounding of f belongs to a delta of the size of rounding of a. On active rows, the slack of v+ is -J_i delta for the
+impulses of the solution; on other rows, it is w = J v+ - target. The error of each row is the step of one more
+projected update, as for every other impulse. If the step changes the active rows, the error is as large as the
+impulses that have the wrong sign.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lavender.base.arrays import FloatArray, IntArray
+from lavender.judge.residuals import Residual, replace_error
+from lavender.problem import Problem
+from lavender.solving.solve import solve
+
+MOVERS = ("acceleration", "forces")
+# [-] If R / d of all rows is larger, forces keep 11 of 16 digits.
+MAX_STIFF_RATIO = 1e-5
+MAX_MOTION_ENTRIES = 1_000_000  # Entries of J above which the dense QR factorisation of (2) takes seconds.
+MAX_BOUNDARY_ROUNDOFFS = 32.0  # [unit round-offs] Friction within this part of its bound is on the boundary.
+ROUNDOFF_OF_PRECISION = {"float64": 2.0**-53, "float32": 2.0**-24}
+EXACT_TOL = (
+    1e-12  # [-] Relative residual of the solution in (1), which is below the rounding of most problems.
+)
+SOLVERS = ("newton", "auto")  # The second one solves if the first one does not converge.
+MAX_SOLUTION_ERROR = (
+    0.1  # [-] Largest error of the solution in (1), relative to the error of the engine's forces.
+)
+
+
+@dataclass(frozen=True, eq=False)
+class EngineMotion:
+    """The part of an engine's answer to one problem that its integrator uses; `residual` judges it.
+
+    Parameters
+    ----------
+    impulse : (m,), N s
+        The engine's forces times the time step; the motion belongs to exactly these impulses.
+    change : (nv,), m/s, rad/s
+        Velocity change by the constraints, dt (a - a0).
+    compliance : (m,), 1/kg
+        The engine's R, in the rows of the problem.
+    moved_by : {"acceleration", "forces"}
+    momentum : (nv,), N s, N m s, optional
+        J^T impulse as the engine computed it (dt qfrc_constraint), which differs by rounding if large forces cancel.
+    """
+
+    impulse: FloatArray
+    change: FloatArray
+    compliance: FloatArray
+    moved_by: str
+    momentum: FloatArray | None = None
+
+    def judge(self, problem: Problem, forces: Residual) -> Residual:
+        """Return the residual of the forces or of the acceleration, by `moved_by`.
+
+        Parameters
+        ----------
+        problem : Problem
+            In generalised coordinates.
+        forces : Residual
+            Residual of the impulses.
+        """
+        general = problem.generalized
+        if general is None or not (np.isfinite(self.impulse).all() and np.isfinite(self.change).all()):
+            return forces
+        rigid = np.where(problem.d > 0.0, problem.d, np.inf)
+        ratio = float(np.min(self.compliance / rigid, where=self.compliance > 0.0, initial=1.0))
+        is_stiff = ratio <= MAX_STIFF_RATIO and problem.m * general.nv <= MAX_MOTION_ENTRIES
+        if not is_stiff:
+            return forces if self.moved_by == "forces" else self._compare_with_solution(problem, forces)
+        digits = float(-np.log10(ratio))
+        found = self._judge_stiff_rows(problem, forces)
+        if self.moved_by == "acceleration":
+            return replace(found, lost_digits=digits)
+        # The raised compliances of the problem do not belong to these forces: compare motions.
+        used = general.change(self.impulse) if self.momentum is None else general.solve(self.momentum)
+        rounding = self._estimate_rounding(problem) + np.abs(found.velocity_by_row)
+        moved = _make_velocity_error(problem, forces, general.velocity_of(used - self.change), rounding)
+        if not found.velocity < MAX_SOLUTION_ERROR * moved.velocity:
+            return replace(forces, lost_digits=digits)
+        return replace(moved, moved_by="impulse", lost_digits=digits, acceleration_error=found.velocity)
+
+    def _compare_with_solution(self, problem: Problem, forces: Residual) -> Residual:
+        """Return the error (1); the residual of the forces if the problem cannot be solved."""
+        general = problem.generalized
+        assert general is not None
+        for solver in SOLVERS:
+            solution = solve(problem, solver, tol=EXACT_TOL, impulse=self.impulse)
+            own = solution.residual
+            if own.relative <= EXACT_TOL or own.velocity <= MAX_SOLUTION_ERROR * forces.velocity:
+                break
+        else:
+            return forces
+        delta = self.change - general.change(solution.impulse)
+        rounding = self._estimate_rounding(problem) + own.velocity_by_row
+        return _make_velocity_error(problem, forces, general.velocity_of(delta), rounding)
+
+    def _estimate_rounding(self, problem: Problem) -> FloatArray:
+        """Return the rounding of the slack of each row (m,) [m/s]."""
+        general = problem.generalized
+        assert general is not None
+        moved = np.abs(self.change)
+        if problem.precision == "float32":  # M is rounded, too: |M^-1| |M| |change|.
+            columns = np.eye(general.nv)
+            mass = np.abs([general.momentum_of(column) for column in columns])
+            moved = moved + np.abs([general.solve(column) for column in columns]) @ (mass @ moved)
+        terms = abs(general.jac) @ (moved + 2.0 * np.abs(general.v_free)) + np.abs(problem.b)
+        terms += self.compliance * np.abs(self.impulse)
+        rounding: FloatArray = ROUNDOFF_OF_PRECISION[problem.precision] * terms
+        return rounding
+
+    def _judge_stiff_rows(self, problem: Problem, forces: Residual) -> Residual:
+        """Return the error by one step (2), or the residual of the forces if it is smaller."""
+        general, impulse = problem.generalized, self.impulse
+        assert general is not None
+        boundary = _find_boundary_normals(problem, impulse)
+        try:
+            delta, correction = _compute_newton_step(problem, self.compliance, impulse, self.change, boundary)
+        except np.linalg.LinAlgError:  # M is not positive definite to rounding.
+            return forces
+        slack = general.velocity_of(self.change) - problem.b + self.compliance * impulse - correction
+        error = _compute_error(problem, impulse, delta, slack, boundary)
+        rounding = self._estimate_rounding(problem) / np.where(problem.d > 0.0, problem.d, np.inf)
+        found = replace_error(forces, problem, error, rounding)
+        return found if found.velocity < forces.velocity else forces
+
+
+def _make_velocity_error(
+    problem: Problem, forces: Residual, error: FloatArray, rounding: FloatArray
+) -> Residual:
+    """Return the residual with the velocity error of each row (m,) [m/s] and its rounding (m,) [m/s]."""
+    weight = np.where(problem.metric.weight > 0.0, problem.metric.weight, np.inf)
+    return replace_error(forces, problem, error / weight, rounding / weight)
+
+
+def _find_boundary_normals(problem: Problem, impulse: FloatArray) -> dict[int, tuple[IntArray, FloatArray]]:
+    """Return rows and outward normal of each friction component at its bound, by the component's first friction row."""
+    cones, found = problem.cones, {}
+    margin = MAX_BOUNDARY_ROUNDOFFS * ROUNDOFF_OF_PRECISION[problem.precision]
+    for block, rows in cones.friction_components():
+        first, mu = cones.ptr[block], float(cones.friction_coefficient[rows[0]])
+        size, bound = float(np.linalg.norm(impulse[rows])), mu * float(impulse[first])
+        if size >= (1.0 - margin) * bound:
+            outward, own = impulse[rows] / size if size > 0.0 else np.zeros(len(rows)), rows
+            if problem.friction == "cone":
+                own, outward = np.append(first, rows), np.append(-mu, outward)
+            found[int(rows[0])] = own, outward
+    return found
+
+
+def _compute_newton_step(
+    problem: Problem,
+    compliance: FloatArray,
+    impulse: FloatArray,
+    change: FloatArray,
+    boundary: dict[int, tuple[IntArray, FloatArray]],
+) -> tuple[FloatArray, FloatArray]:
+    """Solve (1); return the changes of the impulses (m,) [N s] and of the velocities of active rows (m,) [m/s]."""
+    from scipy.linalg import qr, solve_triangular  # Its import takes longer than most solves.
+
+    general, cones = problem.generalized, problem.cones
+    assert general is not None
+    jac = general.jac.toarray()
+    # Impulses of contradictory rows cancel, so that their sum needs more digits than float64 has.
+    missing = (general.momentum_of(change) - jac.T.astype(np.longdouble) @ impulse).astype(float)
+    is_open = np.repeat((impulse[cones.ptr[:-1]] <= 0.0) & cones.is_contact, np.diff(cones.ptr))
+    active = (impulse > cones.lower) & (impulse < cones.upper) & ~is_open & (compliance > 0.0)
+    inside = active.copy()
+    combinations = []  # Outward normals of friction components at their bounds, as combinations of rows.
+    for rows, outward in boundary.values():
+        inside[rows] = False
+        if active[rows].all():
+            combinations.append((rows, outward))
+    rows_of_combinations = [outward @ jac[rows] for rows, outward in combinations]
+    compliances = [float(np.square(outward) @ compliance[rows]) for rows, outward in combinations]
+    weighted = np.vstack([jac[inside], *rows_of_combinations])
+    weighted /= np.sqrt(np.append(compliance[inside], compliances))[:, None]
+    mass = np.array([general.momentum_of(column) for column in np.eye(general.nv)])
+    stacked = np.vstack([weighted, np.linalg.cholesky(mass).T])
+    # Householder's QR of rows in descending order keeps the digits of each row, whatever the weights are.
+    order = np.argsort(-np.abs(stacked).max(axis=1), kind="stable")
+    upper, pivots = qr(stacked[order], mode="r", pivoting=True)
+    upper, step = upper[: general.nv], np.zeros(general.nv)
+    step[pivots] = solve_triangular(upper, solve_triangular(upper, missing[pivots], trans="T"))
+    moved = general.velocity_of(step)
+    delta = np.where(inside, -moved / np.where(inside, compliance, 1.0), 0.0)
+    for (rows, outward), soft in zip(combinations, compliances, strict=True):
+        delta[rows] = -outward * float(outward @ moved[rows]) / soft
+    return delta, np.where(active, moved, 0.0)
+
+
+def _compute_error(
+    problem: Problem,
+    impulse: FloatArray,
+    delta: FloatArray,
+    slack: FloatArray,
+    boundary: dict[int, tuple[IntArray, FloatArray]],
+) -> FloatArray:
+    """Return the error e (m,) [N s] of the impulses `impulse` + `delta` with this slack, without cancellation."""
+    cones, d, is_cone = problem.cones, problem.d.copy(), problem.friction == "cone"
+    for _, rows in cones.friction_components():
+        d[rows] = d[rows].mean()
+    step = slack / np.where(d > 0.0, d, np.inf)
+    low, high = impulse - cones.lower, impulse - cones.upper  # inf and -inf without bounds.
+    error = np.clip(step, high + delta, low + delta)
+    for block, rows in cones.friction_components():
+        first, mu = cones.ptr[block], float(cones.friction_coefficient[rows[0]])
+        own = np.append(first, rows) if is_cone else rows
+        error[own] = step[own]
+        if impulse[first] + delta[first] <= 0.0:
+            error[own] = -_project_on_cone(-step[own], d[own], mu) if is_cone else 0.0
+        elif int(rows[0]) in boundary:
+            outward = boundary[int(rows[0])][1]
+            if outward @ step[own] < 0.0:  # The update leaves the set and is projected on its boundary.
+                normal = outward / d[own]
+                error[own] -= normal * float(outward @ step[own]) / float(outward @ normal)
+    return error
+
+
+def _project_on_cone(impulse: FloatArray, d: FloatArray, mu: float) -> FloatArray:
+    """Return the projection of an impulse, normal first, on the friction cone in the metric of d."""
+    root = np.sqrt(d)
+    y = root * impulse
+    slope, size = mu * root[1] / root[0], float(np.linalg.norm(y[1:]))
+    if size <= slope * y[0]:
+        return impulse
+    along = max(0.0, (float(y[0]) + slope * size) / (1.0 + slope * slope))
+    return np.append(along, y[1:] * (slope * along / size)) / root

@@ -1,0 +1,161 @@
+"""What moves the bodies: the judged answer predicts MuJoCo's own next velocity, and its error is that of the motion."""
+
+import numpy as np
+import pytest
+from mujoco_scene import mj
+
+import lavender as lv
+from lavender.io import mujoco as adapter
+
+# A pressed box, a falling box on top of it, and a hinged arm.
+MODEL = """<mujoco><option timestep="0.002" integrator="{integrator}" cone="{cone}" solver="{solver}"
+iterations="{iterations}" tolerance="0"><flag eulerdamp="{eulerdamp}"/></option>
+<default><joint damping="{damping}"/></default>
+<worldbody><geom type="plane" size="5 5 1"/>
+<body name="a" pos="0 0 .099"><freejoint/><geom type="box" size=".1 .1 .1"/></body>
+<body name="b" pos="0.03 0 .299" euler="0 2 0"><freejoint/><geom type="box" size=".1 .1 .1" mass=".3"/></body>
+<body name="c" pos="0.5 0 .15"><joint name="first" axis="0 1 0" {joint}/>
+<geom type="capsule" fromto="0 0 0 .2 0 -.1" size=".04"/>
+<body name="d" pos=".2 0 -.1"><joint name="second" axis="0 1 .2" range="-10 10" {joint}/>
+<geom type="capsule" fromto="0 0 0 .2 0 0" size=".04"/></body></body>
+</worldbody>{more}</mujoco>"""
+JOINTS = {"armature": 'armature=".01"', "frictionloss": 'frictionloss=".3"'}
+MORE = {
+    "equality": '<equality><joint joint1="first" joint2="second" polycoef="0 .5 0 0 0"/></equality>',
+    "tendon": '<tendon><fixed name="t" limited="true" range="-.1 .1" damping=".2" frictionloss=".1">'
+    '<joint joint="first" coef="1"/><joint joint="second" coef="-1"/></fixed></tendon>',
+    "weld": '<equality><weld body1="b" body2="d" torquescale=".3"/></equality>',
+}  # fmt: skip
+# Integrator, damping of the joints, flag eulerdamp, and what moves the bodies.
+INTEGRATORS = {
+    "Euler": ("Euler", 0.0, "enable", "acceleration"),
+    "damped Euler": ("Euler", 0.3, "enable", "forces"),
+    "Euler without eulerdamp": ("Euler", 0.3, "disable", "acceleration"),
+    "implicit": ("implicit", 0.3, "enable", "forces"),
+    "implicitfast": ("implicitfast", 0.3, "enable", "forces"),
+    "discrete": ("discrete", 0.3, "enable", "acceleration"),
+}
+HAS_DISCRETE = mj is not None and hasattr(mj.mjtIntegrator, "mjINT_DISCRETE")
+N_STEPS = 6
+
+
+def make_model(integrator, cone, solver, feature, iterations):
+    kind, damping, eulerdamp, _ = INTEGRATORS[integrator]
+    if kind == "discrete" and not HAS_DISCRETE:
+        pytest.skip("this MuJoCo has no integrator discrete")
+    xml = MODEL.format(
+        integrator=kind, cone=cone, solver=solver, iterations=iterations, eulerdamp=eulerdamp, damping=damping,
+        joint=JOINTS.get(feature, ""), more=MORE.get(feature, ""),
+    )  # fmt: skip
+    return mj.MjModel.from_xml_string(xml)
+
+
+def iterate_steps(model):
+    """Yield the data before each step, after its forward pass, and after the step."""
+    data = mj.MjData(model)
+    data.qvel[:] = 0.3 * np.random.default_rng(0).standard_normal(model.nv)
+    for _ in range(N_STEPS):
+        forward, after = mj.MjData(model), mj.MjData(model)
+        for copied in (forward, after):
+            mj.mj_copyData(copied, model, data)
+        mj.mj_forward(model, forward)
+        mj.mj_step(model, after)
+        if np.abs(forward.qacc).max() > 1e10:  # Two iterations of CG diverge on a weld: MuJoCo restarts.
+            return
+        yield data, forward, after
+        data = after
+
+
+def get_row_jacobian(model, data):
+    return adapter.scaling(model, data)[:, None] * adapter.jacobian(model, data).toarray()
+
+
+every_model = [
+    pytest.mark.parametrize("integrator", INTEGRATORS),
+    pytest.mark.parametrize("cone", ["pyramidal", "elliptic"]),
+    pytest.mark.parametrize("solver", ["PGS", "CG", "Newton"]),
+    pytest.mark.parametrize("feature", [*JOINTS, *MORE]),
+]
+
+
+def test_engine_answer_of_unconverged_solve_predicts_the_next_velocity(integrator, cone, solver, feature):
+    model = make_model(integrator, cone, solver, feature, iterations=2)
+    for _, forward, after in iterate_steps(model):
+        for data in (forward, after):
+            answer = adapter.engine_answer(model, data)
+            assert answer.moved_by == INTEGRATORS[integrator][3]
+            # Sums of at most 20 rows in another order.
+            np.testing.assert_allclose(answer.velocity, after.qvel, rtol=1e-9, atol=1e-12)
+
+
+def test_residual_of_acceleration_is_the_distance_of_row_velocities_from_the_exact_step(
+    integrator, cone, solver, feature
+):
+    if INTEGRATORS[integrator][3] == "forces":
+        pytest.skip("forces are judged by their own residual")
+    if (integrator, solver, feature) == ("discrete", "PGS", "tendon"):
+        pytest.skip("with PGS, the matrix of discrete has no tendons, so that Newton solves another problem")
+    model, exact = (make_model(integrator, cone, name, feature, n) for name, n in ((solver, 2), ("Newton", 300)))
+    exact.opt.ls_iterations, exact.opt.ls_tolerance = 300, 1e-10
+    n_judged = 0
+    for before, forward, after in iterate_steps(model):
+        solved = mj.MjData(exact)
+        mj.mj_copyData(solved, exact, before)
+        mj.mj_step(exact, solved)
+        distance = np.abs(get_row_jacobian(model, forward) @ (after.qvel - solved.qvel)).max()
+        for data in (forward, after):
+            problem, impulse = lv.io.from_mujoco(model, data), adapter.impulse(model, data)
+            found = lv.residual(problem, impulse)
+            if found.at_floor:
+                assert distance < 1e-9
+            else:
+                n_judged += 1
+                assert found.moved_by == "acceleration"
+                # Both Newton methods stop at about 1e-12 m/s.
+                np.testing.assert_allclose(found.velocity, distance, rtol=1e-4, atol=1e-10)
+                assert np.array_equal(found.velocity_by_row.max(), found.velocity)
+    assert n_judged or solver == "Newton"
+
+
+for mark in every_model:
+    test_engine_answer_of_unconverged_solve_predicts_the_next_velocity = mark(
+        test_engine_answer_of_unconverged_solve_predicts_the_next_velocity
+    )
+    test_residual_of_acceleration_is_the_distance_of_row_velocities_from_the_exact_step = mark(
+        test_residual_of_acceleration_is_the_distance_of_row_velocities_from_the_exact_step
+    )
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("solver", ["PGS", "Newton"])
+def test_from_mujoco_many_judges_and_predicts_as_single_steps(integrator, solver):
+    model = make_model(integrator, "elliptic", solver, "tendon", iterations=2)
+    kind = mj.mjtState.mjSTATE_INTEGRATION
+    states, after, single = [], [], []
+    for before, forward, stepped in iterate_steps(model):
+        states.append(np.empty(mj.mj_stateSize(model, kind)))
+        mj.mj_getState(model, before, states[-1], kind)
+        after.append(stepped.qvel.copy())
+        single.append(lv.residual(lv.io.from_mujoco(model, forward), adapter.impulse(model, forward)))
+    velocity = np.empty((len(states), model.nv))
+    imported = lv.io.from_mujoco_many(model, np.array(states), velocity=velocity)
+    np.testing.assert_allclose(velocity, after, rtol=1e-9, atol=1e-12)
+    many = lv.residual_many(imported.batch, imported.impulse)
+    # The blocks of an equality differ, and sums have another order.
+    np.testing.assert_allclose(many.velocity_error, [x.velocity for x in single], rtol=1e-6, atol=1e-12)
+    for i, error in enumerate(many.velocity_error):
+        assert many[i].velocity == error
+
+
+def test_a_saved_problem_keeps_the_motion_of_the_engine(tmp_path):
+    model = make_model("Euler", "pyramidal", "PGS", "armature", iterations=2)
+    for _, data, _ in iterate_steps(model):
+        problem, impulse = lv.io.from_mujoco(model, data), adapter.impulse(model, data)
+        lv.io.save(problem, tmp_path / "step.npz", impulse=impulse)
+        stored = lv.io.read(tmp_path / "step.npz")
+        found = lv.residual(stored.problem, stored.impulse)
+        assert found.moved_by == "acceleration"
+        assert found.velocity == lv.residual(problem, impulse).velocity
+        # Without the engine's impulse, no motion is stored.
+        lv.io.save(problem, tmp_path / "step.npz")
+        assert lv.residual(lv.io.read(tmp_path / "step.npz").problem, impulse).moved_by == "impulse"
