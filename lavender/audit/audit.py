@@ -30,7 +30,7 @@ import numpy as np
 from lavender._version import __version__
 from lavender.audit.engine_scenes import CLAIM_ENGINES, step_scene
 from lavender.audit.environment import get_environment_data, is_environment, iterate_environment
-from lavender.audit.pieces import NOT_JUDGED, Judging, Piece, judge_steps
+from lavender.audit.pieces import NOT_JUDGED, Judging, Piece, Prediction, judge_steps
 from lavender.audit.result import Audit
 from lavender.audit.simulated_worlds import (
     ENGINES,
@@ -402,10 +402,10 @@ def audit_worlds(runs: Runs, judging: Judging, worlds: Sequence[int]) -> list[Pi
     """Simulate and judge MuJoCo's steps of some worlds, in a worker."""
     with count_engine_warnings(runs.mj) as engine_warnings:
         simulations = [simulate_world(runs, world) for world in worlds]
-        states = np.concatenate([states for states, _ in simulations])
-        divergences = [divergence for _, divergence in simulations if divergence is not None]
+        states, after = (np.concatenate([result[k] for result in simulations]) for k in (0, 2))
+        divergences = [divergence for _, divergence, _ in simulations if divergence is not None]
         world, step = np.repeat(worlds, runs.steps), np.tile(np.arange(runs.steps), len(worlds))
-        pieces = list(judge_states(runs.model, judging, states, world, step))
+        pieces = list(judge_states(runs.model, judging, states, world, step, after))
         if runs.against is not None:
             others = judge_states(runs.against[1], judging, states, world, step)
             pieces = [own._replace(against=other) for own, other in zip(pieces, others, strict=True)]
@@ -413,13 +413,21 @@ def audit_worlds(runs: Runs, judging: Judging, worlds: Sequence[int]) -> list[Pi
     return pieces
 
 
-def judge_states(model: Any, judging: Judging, states: Any, world: Any, step: Any) -> Iterator[Piece]:
-    """Judge MuJoCo's answers to the steps from states (n, size) of mjSTATE_INTEGRATION."""
+def judge_states(
+    model: Any, judging: Judging, states: Any, world: Any, step: Any, after: Any = None
+) -> Iterator[Piece]:
+    """Judge MuJoCo's answers to the steps from states (n, size) of mjSTATE_INTEGRATION.
+
+    `after` (n, nv) are the velocities after the steps, with which the predicted ones are compared.
+    """
     judge = copy.copy(model)
     judge.opt.noslip_iterations = 0
     for i in range(0, len(states), MAX_PROBLEMS_IN_MEMORY):
         part = slice(i, i + MAX_PROBLEMS_IN_MEMORY)
-        batch, impulse = from_mujoco_many(judge, states[part], errors="status")
+        # noslip iterations change the motion, and are not judged.
+        is_compared = after is not None and not model.opt.noslip_iterations
+        velocity = np.full((len(states[part]), model.nv), np.nan) if is_compared else None
+        batch, impulse = from_mujoco_many(judge, states[part], errors="status", velocity=velocity)
 
         def state_of(k: int, vectors: Any = states[part]) -> dict[str, Any]:
             own = {VECTOR: vectors[k].copy(), "model": np.array(hash_model(judge))}
@@ -427,7 +435,11 @@ def judge_states(model: Any, judging: Judging, states: Any, world: Any, step: An
 
         assert impulse is not None and batch.contact_counts is not None
         frame = Frame(batch, impulse, {}, batch.row_counts, batch.contact_counts)
-        yield judge_steps(frame, judging, world[part], step[part], state_of)
+        piece = judge_steps(frame, judging, world[part], step[part], state_of)
+        if velocity is not None:
+            predicted = Prediction.of_steps(velocity, after[part], world[part], step[part])
+            piece = piece._replace(prediction=predicted)
+        yield piece
 
 
 def _audit_environment(env: Any, policy: Any, runs: Runs, judging: Judging) -> Iterator[Piece]:
@@ -435,9 +447,9 @@ def _audit_environment(env: Any, policy: Any, runs: Runs, judging: Judging) -> I
     with count_engine_warnings(runs.mj) as engine_warnings:
         for world in range(runs.worlds):
             lost: Divergence | None = None
-            for model, states, first, diverged in iterate_environment(env, policy, runs, world):
+            for model, states, after, first, diverged in iterate_environment(env, policy, runs, world):
                 step = first + np.arange(len(states))
-                for piece in judge_states(model, judging, states, np.full(len(states), world), step):
+                for piece in judge_states(model, judging, states, np.full(len(states), world), step, after):
                     yield piece._replace(engine_warnings=dict(engine_warnings))
                     engine_warnings.clear()
                 if diverged:

@@ -17,9 +17,8 @@ from lavender.audit.simulated_worlds import Runs, has_diverged
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 
-Captured = list[
-    tuple[Any, FloatArray, bool]
-]  # Model, states before steps (n, size), and whether the last diverged.
+# Model, states before steps (n, size), velocities after them (n, nv), and whether the last step diverged.
+Captured = list[tuple[Any, FloatArray, FloatArray, bool]]
 
 
 def is_environment(source: Any) -> bool:
@@ -56,16 +55,18 @@ def capture_steps(mj: Any, env: Any) -> Iterator[Captured]:
             mj_step(model, data, nstep)
             return
         states = np.empty((nstep, mj.mj_stateSize(model, kind)))
+        after = np.full((nstep, model.nv), np.nan)
         own = copy.copy(model)
         for k in range(nstep):
             mj.mj_getState(model, data, states[k], kind)
             mj_step(model, data)
             if has_diverged(mj, data):
-                captured.append((own, states[: k + 1], True))
+                captured.append((own, states[: k + 1], after[: k + 1], True))
                 if nstep > k + 1:
                     mj_step(model, data, nstep - k - 1)
                 return
-        captured.append((own, states, False))
+            after[k] = data.qvel
+        captured.append((own, states, after, False))
 
     mj.mj_step = step
     try:
@@ -76,11 +77,12 @@ def capture_steps(mj: Any, env: Any) -> Iterator[Captured]:
 
 def iterate_environment(
     env: Any, policy: Callable[[Any], Any] | None, runs: Runs, world: int
-) -> Iterator[tuple[Any, FloatArray, int, bool]]:
+) -> Iterator[tuple[Any, FloatArray, FloatArray, int, bool]]:
     """Step an environment from `env.reset(seed=seed + world)` until `runs.steps` steps of MuJoCo are done.
 
     An episode that ends earlier is followed by the next one. Yields the model, the states before consecutive steps
-    (n, size) of mjSTATE_INTEGRATION, the number of the first of them, and whether the world diverged in the last.
+    (n, size) of mjSTATE_INTEGRATION, the velocities after them (n, nv), the number of the first of them, and whether
+    the world diverged in the last.
     """
     observation, _ = env.reset(seed=runs.seed + world)
     env.action_space.seed(runs.seed + world)
@@ -94,10 +96,10 @@ def iterate_environment(
                 f"env.step of {runs.name} called mujoco.mj_step for env.unwrapped.data no time; record the steps of "
                 "your own loop by lavender.io.Recorder"
             )
-        for model, states, diverged in captured:
+        for model, states, after, diverged in captured:
             states = states[: runs.steps - done]
             if len(states):
-                yield model, states, done, diverged
+                yield model, states, after[: len(states)], done, diverged
             done += len(states)
             if diverged:
                 return

@@ -20,6 +20,9 @@ AUDIT_VERDICTS = (*VERDICTS, "not judged")
 NOT_JUDGED = len(VERDICTS)
 WORST_ROW_ERRORS = ("velocity", "impulse", "relative", "floor")  # Errors of the worst row [m/s, N s, -, -].
 N_WORST_WORLDS = 3  # Number of worlds for which the worst step is written to a file.
+# [-] Largest difference of a velocity after a step from the predicted one, relative to the largest velocity and to
+# 1 m/s: the rounding of a solve with a mass matrix of a condition of up to 1e6.
+PREDICTION_TOLERANCE = 1e-9
 # Numbers of contacts differ between steps and are removed from the names of rows.
 CONTACT_NUMBER = re.compile(r"^(contact|limit) \d+\b ?")
 
@@ -66,6 +69,43 @@ class LostDigits(NamedTuple):
         """Return the union of two sets of steps."""
         (a, b, c, d), (e, f, g, h) = self, other
         return LostDigits(a + e, max(b, f), c + g, max(d, h))
+
+
+class Prediction(NamedTuple):
+    """Comparison of velocities after steps with those that the judged answers predict.
+
+    Parameters
+    ----------
+    steps : int
+        Steps that were compared.
+    different : int
+        Steps with a difference above `PREDICTION_TOLERANCE`.
+    largest : float, m/s or rad/s
+        Largest difference of these steps.
+    first : (world, step), optional
+        The first of these steps.
+    """
+
+    steps: int = 0
+    different: int = 0
+    largest: float = 0.0
+    first: tuple[int, int] | None = None
+
+    @classmethod
+    def of_steps(cls, predicted: FloatArray, after: FloatArray, world: Any, step: Any) -> Prediction:
+        """Compare velocities (n, nv) of steps; those with a NaN are not compared."""
+        gap = np.abs(predicted - after).max(axis=1, initial=0.0)
+        size = np.maximum(np.abs(predicted), np.abs(after)).max(axis=1, initial=0.0)
+        different = np.flatnonzero(gap > PREDICTION_TOLERANCE * np.maximum(size, 1.0))
+        first = (int(world[different[0]]), int(step[different[0]])) if len(different) else None
+        largest = float(gap[different].max(initial=0.0))
+        return cls(int(np.isfinite(gap).sum()), len(different), largest, first)
+
+    def merge(self, other: Prediction) -> Prediction:
+        """Return the union of two sets of steps."""
+        first = min((x.first for x in (self, other) if x.first is not None), default=None)
+        n, different = self.steps + other.steps, self.different + other.different
+        return Prediction(n, different, max(self.largest, other.largest), first)
 
 
 class StepState(NamedTuple):
@@ -127,6 +167,7 @@ class Piece(NamedTuple):
     n_dropped : int
         Number of constraint rows for which the engine had no memory.
     lost_digits : LostDigits
+    prediction : Prediction
     against : Piece, optional
         Results of the other model on the same states.
     """
@@ -145,6 +186,7 @@ class Piece(NamedTuple):
     contact_states: Sequence[StepState] = ()
     n_dropped: int = 0
     lost_digits: LostDigits = LostDigits()
+    prediction: Prediction = Prediction()
     against: Piece | None = None
 
     @classmethod

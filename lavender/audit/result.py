@@ -22,6 +22,7 @@ from lavender.audit.pieces import (
     WORST_ROW_ERRORS,
     LostDigits,
     Piece,
+    Prediction,
     StepState,
     Worst,
 )
@@ -119,6 +120,7 @@ class Audit:
     n_dropped : int
         Number of constraint rows for which the engine had no memory.
     lost_digits : LostDigits
+    prediction : Prediction
     against : Audit, optional
         Result of another model on the same states.
     key : str
@@ -144,6 +146,7 @@ class Audit:
     contact_states: list[StepState] = field(default_factory=list)
     n_dropped: int = 0
     lost_digits: LostDigits = field(default_factory=LostDigits)
+    prediction: Prediction = field(default_factory=Prediction)
     against: Audit | None = None
     key: str = ""
 
@@ -174,6 +177,7 @@ class Audit:
         self.divergences[:] = sorted([*self.divergences, *piece.divergences])
         self.n_dropped += piece.n_dropped
         self.lost_digits = self.lost_digits.merge(piece.lost_digits)
+        self.prediction = self.prediction.merge(piece.prediction)
         if self.against is not None and piece.against is not None:
             self.against.add_piece(piece.against, keep)
 
@@ -336,6 +340,15 @@ class Audit:
             lines.append(
                 f"The engine had no memory for {self.n_dropped} constraint rows and dropped them: its answers solve "
                 "problems without these rows. Allocate more with --njmax."
+            )
+        predicted = self.prediction
+        if predicted.first is not None:
+            world, step = predicted.first
+            lines.append(
+                f"In {predicted.different} of {format_count(predicted.steps, 'step')} the bodies did not move as the "
+                f"judged answer predicts, by up to {format_size(predicted.largest)} m/s or rad/s, first in world "
+                f"{world}, step {step}: the model or the state was changed within the step, for example by a callback, "
+                "or MuJoCo has a term that is unknown here. Verdicts of these steps do not count."
             )
         lost = self.lost_digits
         if lost.steps:
@@ -594,6 +607,7 @@ class Audit:
             "error_limit": self.error_limit, "above_limit": self.n_above_limit, "dropped_rows": self.n_dropped,
             "divergences": divergences, **self.judged_sizes.as_dict,
             "engine_warnings": dict(self.engine_warnings), "stopped": self.is_stopped,
+            "prediction": self.prediction._asdict(), "lost_digits": self.lost_digits._asdict(),
         }  # fmt: skip
         if self.converged is not None:
             totals["claims"] = self.claim_counts

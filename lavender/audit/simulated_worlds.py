@@ -319,7 +319,7 @@ def count_engine_warnings(mj: Any) -> Iterator[Counter[str]]:
         mj.set_mju_user_warning(handler)
 
 
-def simulate_world(runs: Runs, world: int) -> tuple[FloatArray, Divergence | None]:
+def simulate_world(runs: Runs, world: int) -> tuple[FloatArray, Divergence | None, FloatArray]:
     """Simulate a world.
 
     Returns
@@ -328,10 +328,13 @@ def simulate_world(runs: Runs, world: int) -> tuple[FloatArray, Divergence | Non
         Before each step, with controls and warm start (mjSTATE_INTEGRATION); NaN after the step in which the world
         diverged, and in that step if MuJoCo raised an error.
     divergence : Divergence or None
+    after : (steps, nv), m/s, rad/s
+        Velocities after each step; NaN from the step on in which the world diverged.
     """
     mj, model, kind = runs.mj, runs.model, runs.mj.mjtState.mjSTATE_INTEGRATION
     data, drive = runs.create_start_data(world), runs.make_controller(world)
     states = np.empty((runs.steps, mj.mj_stateSize(model, kind)))
+    after = np.full((runs.steps, model.nv), np.nan)
     for step in range(runs.steps):
         ctrl = drive(data, step)
         if ctrl is not None:
@@ -341,11 +344,12 @@ def simulate_world(runs: Runs, world: int) -> tuple[FloatArray, Divergence | Non
             mj.mj_step(model, data)
         except mj.FatalError as error:  # MuJoCo is out of memory.
             states[step:] = np.nan
-            return states, Divergence(world, step, f"MuJoCo raised an error: {error}", False)
+            return states, Divergence(world, step, f"MuJoCo raised an error: {error}", False), after
         if has_diverged(mj, data):
             states[step + 1 :] = np.nan
-            return states, _find_cause_of_reset(mj, model, data, states[step], world, step)
-    return states, None
+            return states, _find_cause_of_reset(mj, model, data, states[step], world, step), after
+        after[step] = data.qvel
+    return states, None, after
 
 
 def has_diverged(mj: Any, data: Any) -> bool:

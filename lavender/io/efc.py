@@ -307,6 +307,7 @@ def from_mujoco_many(
         threads=1. The results do not depend on it.
     velocity : (n, nv) array, optional
         It receives the velocity after each step that MuJoCo's answer predicts; see `lavender.io.mujoco.engine_answer`.
+        It needs states of mjSTATE_INTEGRATION.
 
     Returns
     -------
@@ -343,6 +344,8 @@ def from_mujoco_many(
             f"each state has {size} numbers; one of {sorted(kinds)} is needed, the sizes of "
             "mjSTATE_PHYSICS, mjSTATE_FULLPHYSICS and mjSTATE_INTEGRATION of the model"
         )
+    if velocity is not None and kinds[size] != mj.mjtState.mjSTATE_INTEGRATION:
+        raise InputError(f"velocity was given with states of {size} numbers; mjSTATE_INTEGRATION is needed")
     n, nv, dt = len(values), model.nv, float(model.opt.timestep)
     free, smooth, acceleration = np.full((n, nv), np.nan), np.zeros((n, nv)), np.full((n, nv), np.nan)
     momentum, mover = np.zeros((n, nv)), ""
@@ -463,7 +466,7 @@ def _predict_velocity(mj: Any, model: Any, data: Any, moved_by: str, rows: Any) 
     jac, numbers, _ = rows
     force, scale = numbers[:, 2], numbers[:, 4]
     force = np.divide(force, scale, out=np.zeros(len(force)), where=scale != 0.0)
-    return single.integrate_forces(mj, model, data, jac.T @ force)
+    return single.integrate_forces(mj, model, data, jac, force)
 
 
 def _merge_lower_triangles(matrices: dict[int, Compressed], mass: FloatArray, triangle: Any) -> Any:

@@ -123,10 +123,13 @@ class EngineMotion:
             columns = np.eye(general.nv)
             mass = np.abs([general.momentum_of(column) for column in columns])
             moved = moved + np.abs([general.solve(column) for column in columns]) @ (mass @ moved)
-        terms = abs(general.jac) @ (moved + 2.0 * np.abs(general.v_free)) + np.abs(problem.b)
-        terms += self.compliance * np.abs(self.impulse)
-        rounding: FloatArray = ROUNDOFF_OF_PRECISION[problem.precision] * terms
-        return rounding
+        moved = moved + 2.0 * np.abs(general.v_free)
+        moved = moved if general.order is None else moved[general.order]
+        indptr, columns, entries = general.operator.jac  # A sparse array would import SciPy.
+        rows = np.repeat(np.arange(problem.m), np.diff(indptr))
+        of_jacobian = np.bincount(rows, weights=np.abs(entries) * moved[columns], minlength=problem.m)
+        terms: FloatArray = of_jacobian + np.abs(problem.b) + self.compliance * np.abs(self.impulse)
+        return ROUNDOFF_OF_PRECISION[problem.precision] * terms
 
     def _judge_stiff_rows(self, problem: Problem, forces: Residual) -> Residual:
         """Return the error by one step (2), or the residual of the forces if it is smaller."""

@@ -184,16 +184,20 @@ def engine_answer(model: Any, data: Any) -> EngineAnswer:
     scratch = mj.MjData(model)
     mj.mj_copyData(scratch, model, data)
     scratch.qvel[:] = start
-    force = jacobian(model, data).T @ (scale * impulse) / dt
-    return EngineAnswer(moved_by, impulse, integrate_forces(mj, model, scratch, force))
+    velocity = integrate_forces(mj, model, scratch, jacobian(model, data), scale * impulse / dt)
+    return EngineAnswer(moved_by, impulse, velocity)
 
 
-def integrate_forces(mj: Any, model: Any, data: Any, force: FloatArray) -> FloatArray:
-    """Return the velocity after the step (nv,) from generalised constraint forces (nv,); `data` is advanced.
+def integrate_forces(mj: Any, model: Any, data: Any, jac: Any, force: FloatArray) -> FloatArray:
+    """Return the velocity after the step (nv,) from forces (m,) on the rows of J (m, nv); `data` is advanced.
 
-    MuJoCo's own integrator runs with these forces, and without an acceleration.
+    MuJoCo's own integrator runs with J^T f, and without an acceleration. Where MuJoCo's sum J^T f differs by rounding
+    only, it is used: large forces may cancel.
     """
-    data.qfrc_constraint[:], data.qacc[:] = force, np.nan
+    total, terms = jac.T @ force, abs(jac).T @ np.abs(force)
+    is_rounding = np.abs(total - data.qfrc_constraint) <= SUM_TOLERANCE * terms
+    data.qfrc_constraint[:] = np.where(is_rounding, data.qfrc_constraint, total)
+    data.qacc[:] = np.nan
     is_euler = model.opt.integrator == mj.mjtIntegrator.mjINT_EULER
     (mj.mj_Euler if is_euler else mj.mj_implicit)(model, data)
     return np.array(data.qvel)

@@ -268,3 +268,42 @@ def test_audit_writes_complete_worlds_while_it_runs(boxes, tmp_path, monkeypatch
 
     audit(boxes(EARLY), worlds=3, steps=20, workers=1, folder=tmp_path, watch=watch)
     assert seen == sorted(seen) and seen[-1] >= 40
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+def test_audit_compares_the_next_velocities_with_the_predicted_ones(integrator, tmp_path):
+    (tmp_path / "box.xml").write_text(
+        f"""<mujoco><option integrator="{integrator}" iterations="2"/><worldbody><geom type="plane" size="5 5 1"/>
+        <body pos="0 0 .099"><freejoint/><geom type="box" size=".1 .1 .1"/></body></worldbody></mujoco>"""
+    )
+    model = mj.MjModel.from_xml_path(str(tmp_path / "box.xml"))
+    whole = audit(model, worlds=2, steps=10, workers=1)
+    assert whole.prediction == (20, 0, 0.0, None)
+    assert "predicts" not in " ".join(whole.advice)
+
+    class Hooked:
+        """An environment with a hook that pushes the body within the third step of MuJoCo."""
+
+        def __init__(self):
+            self.unwrapped, self.model, self.data, self.n = self, model, mj.MjData(model), 0
+            self.action_space = type("Space", (), {"seed": lambda self, seed: None, "sample": lambda self: None})()
+
+        def reset(self, seed=None):
+            self.n = 0
+            mj.mj_resetData(self.model, self.data)
+            return None, {}
+
+        def step(self, action):
+            self.n += 1
+            self.model.opt.gravity[0] = 0.0
+            mj.set_mjcb_control(self.push if self.n == 3 else None)
+            mj.mj_step(self.model, self.data)
+            mj.set_mjcb_control(None)
+            return None, 0.0, False, False, {}
+
+        def push(self, model, data):
+            data.qfrc_applied[0] = 7.0
+
+    found = audit(Hooked(), policy=lambda observation: None, worlds=1, steps=5)
+    assert (found.prediction.steps, found.prediction.different, found.prediction.first) == (5, 1, (0, 2))
+    assert "did not move as the judged answer predicts" in " ".join(found.advice)
