@@ -49,7 +49,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -376,7 +376,7 @@ def get_zero_impulse_reference(problem: Problem) -> tuple[float, float]:
 def choose_start(problem: Problem, impulse: FloatArray, tol: float) -> FloatArray:
     """Return the start of a solve: an impulse (m,) [N s] within its bounds, or zero in islands that begin there."""
     get_zero_impulse_reference(problem)
-    start: FloatArray = measure.combine_best_islands(problem.metric, impulse, [], tol)[1]
+    start: FloatArray = measure.BestImpulse(problem.metric, impulse, tol).begin
     return start
 
 
@@ -412,8 +412,10 @@ def combine_best_islands(
     cones), or if its energy error is lower (Coulomb's law, asymmetric A, or `by_energy`).
     """
     get_zero_impulse_reference(problem)
-    best: FloatArray = measure.combine_best_islands(problem.metric, start, list(impulses), tol, by_energy)[0]
-    return best
+    best = measure.BestImpulse(problem.metric, start, tol, by_energy)
+    for impulse in impulses:
+        best.store(impulse)
+    return cast("FloatArray", best.impulse)
 
 
 def reuse_or_judge_impulse(

@@ -14,8 +14,6 @@ from lavender.base.deadline import NEVER, Deadline, Stopwatch
 from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import (
     MAX_EXCUSED_RESIDUAL,
-    choose_start,
-    combine_best_islands,
     find_relative_at_zero,
     get_zero_impulse_reference,
     residual,
@@ -23,9 +21,14 @@ from lavender.judge.residuals import (
 )
 from lavender.judge.solution import Claim, SolverStage, Status, sum_work_counts
 from lavender.problem import Problem
+from lavender.problem.cones import project_impulse
 from lavender.solvers.small import NO_TIME_MESSAGE, NO_WORK_MESSAGES, describe_stages
 from lavender.solving.loop import Loop, Record
-from lavender_ext.judge.measure import are_bit_identical, residuals_by_island
+from lavender_ext.judge.measure import (
+    BestImpulse,
+    are_bit_identical,
+    residuals_by_island,
+)
 
 # Key in `Derived.cache` of the problem's convex relaxation.
 RELAXATION_KEY = "lavender.solving.log: relaxation"
@@ -55,8 +58,9 @@ class SolveLog:
         # Smallest relative residual, the impulse (m,) [N s] with this residual, and the judge's result if it is known.
         self.best, self.impulse = inf, problem._start
         self.judged: Any = None
-        # Impulse (m,) [N s] with the best impulse of each island, until one impulse meets tol in all islands.
-        self.result = problem._start
+        self._best_islands: Any = (
+            None  # `BestImpulse` from the start of the solve; None before a start is stored.
+        )
         # Last impulse (m,) [N s] of the interior points on the convex relaxation, or None.
         self.relaxed: FloatArray | None = None
         self.stages: list[SolverStage] = []
@@ -72,11 +76,16 @@ class SolveLog:
         """Store `start` (m,) [N s], and begin from the better of it and the zero impulse in each island."""
         get_zero_impulse_reference(self.problem)  # Then the zero impulse needs no pass of the judge.
         if not are_bit_identical(start, self.problem._start):
-            self.result = combine_best_islands(self.problem, start, (), self.tol)
-            start = choose_start(self.problem, start, self.tol)
-        self.best, self.impulse = inf, start.copy()
+            self._best_islands = BestImpulse(self.problem.metric, start, self.tol)
+            start = self._best_islands.begin
+        self.impulse = start.copy()
         relative = find_relative_at_zero(self.problem, start)
         self.best = float(residual(self.problem, start).relative) if relative is None else relative
+
+    @property
+    def result(self) -> FloatArray:
+        """Impulse (m,) [N s] with the best impulse of each island, until one impulse meets tol in all islands."""
+        return self.problem._start if self._best_islands is None else self._best_islands.impulse
 
     def judge_and_store_best(self, impulse: FloatArray, judged: Any = None) -> None:
         """Judge an impulse (m,) [N s] and store it in the islands in which it is the best.
@@ -84,7 +93,7 @@ class SolveLog:
         `judged` is the judge's result if it is known.
         """
         relative = find_relative_at_zero(self.problem, impulse)
-        is_known = relative is not None and self.result is self.problem._start
+        is_known = relative is not None and self._best_islands is None
         if relative is None:
             last = reuse_or_judge_impulse(self.problem, impulse, self.judged if judged is None else judged)
             relative, impulse = float(last.relative), last.impulse
@@ -93,7 +102,10 @@ class SolveLog:
         if relative < self.best:
             self.best, self.impulse = relative, impulse.copy()
         if self.best > self.tol and not is_known:
-            self.result = combine_best_islands(self.problem, self.result, (impulse,), self.tol)
+            if self._best_islands is None:
+                self._best_islands = BestImpulse(self.problem.metric, self.problem._start, self.tol)
+            # A step of Newton's method may leave the bounds.
+            self._best_islands.store(project_impulse(self.problem.cones, impulse))
 
     def compare_with_relaxation(self, impulse: FloatArray) -> tuple[float, float]:
         """Return (ratio, residual) of an impulse (m,) [N s], the largest of all islands that are not solved.

@@ -21,10 +21,10 @@ from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.driver.driver cimport NEWTON, lav_analyse, lav_start, lav_step
 from lavender_ext.factor.factors cimport has_wide
 from lavender_ext.host cimport grow_workspace_to
-from lavender_ext.judge.bounds cimport project_far_excess, project_on_bounds
-from lavender_ext.judge.measure cimport (refine_reported_view, residual_above_floor, set_zero_impulse, relative_floor_of_score,
-                                         score_given_generalized_slack, judge_zero_impulse,
-                                         relative_residual_of_score, count_judge_scratch)
+from lavender_ext.judge.bounds cimport project_far_excess
+from lavender_ext.judge.measure cimport (choose_start, count_judge_scratch, count_start_scratch, judge_zero_impulse,
+                                         refine_reported_view, relative_floor_of_score, relative_residual_of_score,
+                                         residual_above_floor, score_given_generalized_slack, set_zero_impulse)
 from lavender_ext.judge.score cimport make_empty_score, score_t
 from lavender_ext.judge.slack cimport compute_generalized_slack
 from lavender_ext.small.call cimport (N_COUNTS, RESULT_IS_START, RESULT_SOLVED, are_all_rows_bounded, derive_small_problem,
@@ -200,8 +200,10 @@ cdef inline void solve_task(task_t* j, workspace_t* workspace, workspace_t* isla
     o.e0, o.v0 = j.zero_residual[0], j.zero_residual[1]
     if j.cold:
         set_zero_impulse(&j.p, j.lam, j.slack_error)
+    elif not grow_workspace_to(workspace, 0, count_start_scratch(&v)):
+        return
     else:
-        project_on_bounds(&j.p, j.lam)
+        choose_start(&v, True, j.zero_residual, tol, j.lam, workspace.real)
     if j.made.n_empty and not set_impulse_of_empty_rows(j):
         return
     # steps, judgement

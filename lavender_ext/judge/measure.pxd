@@ -6,6 +6,7 @@ from lavender_ext.core.block_types cimport blocks_t, islands_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.start cimport clip_zero_to_row_bounds
 from lavender_ext.core.view cimport generalized_t, view_t
+from lavender_ext.judge.best cimport count_islands
 from lavender_ext.judge.score cimport zero_if_at_floor, floor_hides_residual, relative_residual, score_t
 
 
@@ -29,6 +30,15 @@ cdef void find_reference(blocks_t* p, const double* x, const double* w, const do
 cdef bint judge_zero_impulse(view_t* v, int32_t* index, islands_t* islands, double* reference, const int32_t* empty,
                              const double* free, double* terms, double* x, double* w, double* e, double* scratch,
                              double* out) noexcept nogil
+
+
+cdef void choose_start(const view_t* v, bint symmetric, const double* zero_residual, double tol, double* lam,
+                       double* scratch) noexcept nogil
+
+
+cdef inline int64_t count_start_scratch(const view_t* v) noexcept nogil:
+    """Return the number of scratch doubles of `choose_start`."""
+    return 2 * <int64_t>v.p.n_rows + 2 * count_islands(&v.p) + count_judge_scratch(v)
 
 
 # -- the zero impulse, and a pass over an impulse relative to it -----------------------------------------

@@ -1,6 +1,6 @@
 """The judge: its pass over any form of A, and its functions for Python."""
 from libc.math cimport NAN, sqrt
-from libc.stdint cimport int32_t, int64_t
+from libc.stdint cimport int32_t
 from libc.string cimport memcmp, memcpy
 
 import numpy as np
@@ -14,8 +14,9 @@ from lavender_ext.core.problem cimport Data, Workspace, allocate_bytes
 from lavender_ext.core.velocity cimport compute_velocity_change
 from lavender_ext.core.view cimport generalized_t, view_t
 from lavender_ext.judge.bounds cimport project_far_excess, project_on_bounds
-from lavender_ext.judge.best cimport (best_workspace_size, best_t, bind_best, count_islands, copy_score_without_islands,
-                                      store_better_islands, store_start)
+from lavender_ext.core.start cimport is_zero_impulse
+from lavender_ext.judge.best cimport (begin_at_better_point, best_workspace_size, best_t, bind_best, count_islands,
+                                      copy_score_without_islands, store_better_islands, store_start)
 from lavender_ext.judge.forms cimport (compute_csr_slack, judge_impulse_over_bodies, judge_impulse_over_csr,
                                        judge_impulse_over_generalized, score_generalized_slack)
 from lavender_ext.judge.measure cimport (residual_above_floor, set_zero_impulse, relative_floor_of_score,
@@ -122,6 +123,24 @@ cdef bint judge_zero_impulse(view_t* v, int32_t* index, islands_t* islands, doub
     islands.terms = terms
     compute_reference(&v.p, x, w, e, out)
     return False
+
+
+cdef void choose_start(const view_t* v, bint symmetric, const double* zero_residual, double tol, double* lam,
+                       double* scratch) noexcept nogil:
+    """Project the start lam (m) on its bounds, and set it to the zero impulse in islands that begin there (judge/best.pxd).
+
+    zero_residual (3): E0, V0 and the relative residual of the zero impulse; scratch (`count_start_scratch`).
+    """
+    cdef score_t s = make_empty_score()
+    cdef double* now = scratch + 2 * <ssize_t>v.p.n_rows
+    project_on_bounds(&v.p, lam)
+    if is_zero_impulse(&v.p, lam):
+        return
+    s.by_island = now
+    judge_view(v, lam, scratch, scratch + v.p.n_rows, now + 2 * count_islands(&v.p), False, &s)
+    if v.p.islands == NULL:
+        now[0] = relative_residual_of_score(&s, scratch, v.p.n_rows, zero_residual[0], zero_residual[1])
+    begin_at_better_point(&v.p, now, zero_residual[2], scratch, symmetric, tol, lam)
 
 
 def compute_slack(Data p, const double[::1] lam, double[::1] w):
@@ -391,39 +410,68 @@ def residuals_by_island(Data p, const double[::1] lam):
     return label_, table_
 
 
-def combine_best_islands(Data p, impulse, list impulses, double tol, bint by_energy=False):
-    """Return two new impulses (m,) [N s]: the best of a start and the impulses (m,) in each island, and where the start begins.
+cdef class BestImpulse:
+    """The best impulse of a solve in each island, by judge/best.pxd.
 
-    By judge/best.pxd. The references of the zero impulse must be set in the data.
+    Parameters
+    ----------
+    p : Data
+        Problem that knows the references of the zero impulse.
+    start : (m,) N s
+        Start of the solve, which is projected on its bounds.
+    tol : float, -
+        Relative residual at which an island is solved.
+    by_energy : bool
+        Whether E decides in each island.
     """
-    cdef Py_ssize_t m = p.blocks.n_rows
-    cdef view_t v = p.get_pointers()
+
+    cdef Data p
+    cdef view_t v
     cdef best_t best
-    cdef score_t s
-    cdef int64_t workspace = best_workspace_size(m, count_islands(&p.blocks))
-    cdef double[::1] x = np.empty(workspace + 2 * m + count_judge_scratch(&v) + 1)
-    cdef double* w = &x[workspace]
-    cdef double now
-    cdef const double* lam
-    start = np.array(impulse, float)
-    cdef double[::1] begin = start
-    if m == 0:
-        return start, start
-    bind_best(&best, &p.blocks, &x[0])
-    best.by_energy, best.reference_energy = by_energy, p.reference_energy
-    project_on_bounds(&p.blocks, &begin[0])
-    for iterate in [start, *impulses]:
-        lam = as_double_pointer(iterate, m)
-        s = make_empty_score()
-        s.by_island = best.now
-        judge_view(&v, lam, w, w + m, w + 2 * m, False, &s)
-        now = relative_residual_of_score(&s, w, <int32_t>m, p.reference_energy, p.reference_velocity)
-        copy_score_without_islands(&best, &p.blocks, &s, now)
-        if best.seen == 0:
-            store_start(&best, &v, w, p.relative_at_zero, tol, &begin[0])
-        else:
-            store_better_islands(&best, &v, lam, w, tol)
-    return np.array(x[:m]), start
+    cdef double[::1] x
+    cdef double tol
+    cdef readonly object begin  # Impulse (m,) [N s] at which the solve begins.
+
+    def __init__(self, Data p, start, double tol, bint by_energy=False):
+        cdef Py_ssize_t m = p.blocks.n_rows
+        cdef double[::1] begin
+        self.p, self.v, self.tol = p, p.get_pointers(), tol
+        self.x = np.empty(best_workspace_size(m, count_islands(&p.blocks)) + 2 * m + count_judge_scratch(&self.v) + 1)
+        self.begin = begin = np.array(start, float)
+        bind_best(&self.best, &p.blocks, &self.x[0])
+        self.best.by_energy, self.best.reference_energy = by_energy, p.reference_energy
+        if m:
+            project_on_bounds(&p.blocks, &begin[0])
+            self.judge(&begin[0])
+            store_start(&self.best, &self.v, self.slack(), p.relative_at_zero, tol, &begin[0])
+
+    cdef double* slack(self):
+        """Return the slack (m) [m/s] of the impulse that was judged last."""
+        return &self.x[best_workspace_size(self.p.blocks.n_rows, count_islands(&self.p.blocks))]
+
+    cdef void judge(self, const double* lam):
+        """Judge lam (m) [N s] island by island."""
+        cdef int32_t m = self.p.blocks.n_rows
+        cdef double* w = self.slack()
+        cdef score_t s = make_empty_score()
+        s.by_island = self.best.now
+        judge_view(&self.v, lam, w, w + m, w + 2 * m, False, &s)
+        copy_score_without_islands(&self.best, &self.p.blocks, &s,
+                                   relative_residual_of_score(&s, w, m, self.p.reference_energy, self.p.reference_velocity))
+
+    def store(self, impulse):
+        """Store an impulse (m,) [N s] in the islands in which it is the best."""
+        cdef Py_ssize_t m = self.p.blocks.n_rows
+        cdef const double* lam
+        if m:
+            lam = as_double_pointer(impulse, m)
+            self.judge(lam)
+            store_better_islands(&self.best, &self.v, lam, self.slack(), self.tol)
+
+    @property
+    def impulse(self):
+        """The best impulse (m,) [N s], a new array."""
+        return np.array(self.x[:self.p.blocks.n_rows])
 
 
 def project_far_excess_of(Data p, impulse):

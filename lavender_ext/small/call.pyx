@@ -37,8 +37,8 @@ from lavender_ext.small.limits cimport has_only_free_rows
 from lavender_ext.host cimport free_workspace, grow_workspace_to
 from lavender_ext.small.workspace cimport fits_workspace, grow_workspace_to_arena
 from lavender_ext.judge.bounds cimport project_far_excess, project_on_bounds
-from lavender_ext.judge.measure cimport (Judged, set_zero_impulse, relative_floor_of_score, judge_view, make_judged,
-                                         relative_residual_of_score, count_judge_scratch)
+from lavender_ext.judge.measure cimport (Judged, choose_start, count_start_scratch, judge_view, make_judged,
+                                         relative_floor_of_score, relative_residual_of_score, set_zero_impulse)
 from lavender_ext.judge.score cimport make_empty_score
 from lavender_ext.local.gauss_seidel cimport prepare_exact_blocks, index_prepared_numbers
 from lavender_ext.pivot.direct cimport (PASS, PASS_HALVED, begin_direct_solve, bind_direct_arrays, direct_t,
@@ -129,15 +129,17 @@ cdef bint set_start_of_small_problem(small_problem_t* s, const small_rules_t* ru
                                      double* both, double* scratch) noexcept nogil:
     """Set the start `own` (m) [N s], the zero impulse if `cold`; return whether it is a solution, which is then judged.
 
-    The start is projected on its bounds. Its residual is checked only if another method follows. A start with a residual
-    above that of the zero impulse, or above `warm` for pivots, is replaced by the zero impulse. scratch: m numbers plus
-    those of `judge_view`.
+    Pivots that no other method follows begin as `choose_start` of judge/measure.pyx decides. If another method follows, a start
+    with a residual above that of the zero impulse, or above `warm` for pivots, is replaced by the zero impulse. scratch
+    (`count_start_scratch`).
     """
     cdef int32_t m = s.v.p.n_rows
     cdef double residual = s.zero_residual[2]
     set_zero_impulse(&s.v.p, scratch, both)
     if cold:
         memcpy(own, scratch, m * sizeof(double))
+    elif not rules.follows:
+        choose_start(&s.v, s.symmetric, s.zero_residual, tol, own, scratch)
     else:
         project_on_bounds(&s.v.p, own)
     if not rules.follows:
@@ -341,7 +343,7 @@ cdef int32_t solve_small(small_problem_t* s, const small_rules_t* rules, double*
     both (2 m) receives the slack and the error of the result, counts the work (`store_work_counts`). At the deadline the
     iterate is the result.
     """
-    cdef int64_t m = s.v.p.n_rows, scratch = m + count_judge_scratch(&s.v)
+    cdef int64_t scratch = count_start_scratch(&s.v)
     memset(counts, 0, N_COUNTS * sizeof(int32_t))
     if not grow_workspace_to(&workspaces.work, 0, scratch):
         return RESULT_FAILED

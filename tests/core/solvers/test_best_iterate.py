@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from random_problems import random_contact_problem, spd
+from random_problems import FORMS, random_contact_problem, random_lcp, spd
 
 import lavender as lv
-from lavender.judge.residuals import combine_best_islands
+from lavender.judge.residuals import choose_start, combine_best_islands
 from lavender.solvers.islands import find_islands
 
 DT = 1.0 / 60.0
@@ -191,3 +191,48 @@ def test_newton_bounds_exclude_zero_keeps_its_solution_for_any_size_of_b(name, t
         found = lv.solve(problem, name, tol=tol)
         assert found.claim_check == "confirmed"
         assert found.residual.above_floor == 0.0
+
+
+# -- one start for every host ------------------------------------------------------------------------------------------
+
+HOSTS = {
+    "prepare": lambda p, name, start: lv.prepare(p, name).solve(impulse=start),
+    "solve_many": lambda p, name, start: lv.solve_many([p], name, impulses=[start])[0],
+    "max_iter": lambda p, name, start: lv.solve(p, name, impulse=start, max_iter=lv.get(name).max_iter),
+}
+
+
+@pytest.mark.parametrize("name", ["newton", "direct", "auto"])
+@pytest.mark.parametrize("kind", [*FORMS, "bounded rows"])
+def test_solve_prepare_and_solve_many_have_the_same_bits_from_starts_better_and_worse_than_zero(kind, name):
+    for seed in range(12):
+        if kind == "bounded rows":
+            problem = random_lcp(seed, 12, rank=None if seed % 2 else 7)
+        else:
+            problem = FORMS[kind](random_contact_problem(seed, ("coulomb", "cone")[seed % 2], bodies=6, contacts=6))
+        if name not in lv.available(problem):
+            pytest.skip("the solver takes another law")
+        rng = np.random.default_rng(seed)
+        solved = lv.solve(problem, name).impulse
+        for start in (solved * 1.001, 0.3 * solved, 10.0 * rng.standard_normal(problem.m)):
+            expected = lv.solve(problem, name, impulse=start)
+            for host, call in HOSTS.items():
+                found = call(problem, name, start)
+                np.testing.assert_array_equal(found.impulse, expected.impulse, err_msg=f"{host}, seed {seed}")
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_auto_whose_start_the_zero_impulse_replaces_ends_no_worse_than_zero_under_coulomb_law(form):
+    replaced = 0
+    for seed in range(30):
+        problem = FORMS[form](random_contact_problem(seed, bodies=6, contacts=8))
+        start = np.abs(100.0 * np.random.default_rng(seed).standard_normal(problem.m))
+        begin = choose_start(problem, start, 1e-13)
+        if find_islands(problem)[0] > 1 or (begin - problem.start()).any():
+            continue
+        replaced += 1
+        zero = lv.residual(problem, problem.start())
+        for steps in (1, 2, 4, 8):
+            found = lv.solve(problem, "auto", impulse=start, tol=1e-13, max_iter=steps)
+            assert found.residual.energy <= zero.energy * (1.0 + 1e-12), (seed, steps)
+    assert replaced > 5
