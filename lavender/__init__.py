@@ -13,6 +13,8 @@ Results    `Solution`, `residual` (judge any impulse), `diagnose` (mistakes in t
 Engine     `Scene`, `Simulation`
 Measuring  `report`, `suite` (built-in problems), `io` (files and other simulators)
 
+Programs   `qp` (quadratic programs with the calls of qpsolvers)
+
 Submodules and the engine are imported at their first use.
 """
 
@@ -53,7 +55,7 @@ from lavender.solving.solve import solve
 if TYPE_CHECKING:
     from lavender import contract as contract
     from lavender import export as export
-    from lavender import io, report, suite
+    from lavender import io, qp, report, suite
     from lavender.audit.slip import SlipExplanation, explain_slip
     from lavender.base import errors as errors
     from lavender.batch.data import Batch
@@ -67,6 +69,7 @@ if TYPE_CHECKING:
     from lavender.problem import cones as cones
     from lavender.problem.row_builder import RowBuilder
     from lavender.programs.quadratic import solve_qp
+    from lavender.qp import available_solvers as available_solvers
     from lavender.report.check import CrossCheck, cross_check
     from lavender.sim import engine, scene
     from lavender.sim.engine import SOLVER_FIELDS, Simulation, Snapshot
@@ -87,6 +90,7 @@ _LAZY_NAMES = {
     "lavender.diagnostics.motion_error": ("MotionError", "motion_error"),
     "lavender.audit.slip": ("SlipExplanation", "explain_slip"),
     "lavender.problem.row_builder": ("RowBuilder",),
+    "lavender.qp": ("available_solvers",),
     "lavender.sim.engine": ("SOLVER_FIELDS", "Simulation", "Snapshot"),
     "lavender.sim.scene": ("Scene",),
     "lavender.solving.plan": ("Plan", "explain"),
@@ -102,6 +106,7 @@ _LAZY_MODULES = {
     "errors": "lavender.base.errors",
     "export": "lavender.export",
     "io": "lavender.io",
+    "qp": "lavender.qp",
     "registry": "lavender.solvers.registry",
     "report": "lavender.report",
     "scene": "lavender.sim.scene",
@@ -152,6 +157,7 @@ __all__ = [
     "UnknownName",
     "__version__",
     "available",
+    "available_solvers",
     "cross_check",
     "derivative",
     "derivatives",
@@ -165,6 +171,7 @@ __all__ = [
     "load",
     "motion_error",
     "prepare",
+    "qp",
     "redundancy",
     "register",
     "report",

@@ -47,6 +47,7 @@ MAX_CONVERTED_ENTRIES = 10**5
 # The matrix of the Newton step is dense up to this many variables and active rows, and with this share of nonzeros.
 MAX_DENSE_STEP_SIZE, MIN_DENSE_FILL = 300, 0.2
 MAX_STEP_SIZE = 20_000  # No step is done with more variables and active rows.
+MAX_FIT_SIZE = 300  # Largest number of variables and of active rows for `fit_multipliers`.
 NEAR_SLACK = 1e-8  # [-] Rows with a smaller slack in scaled units may be active with a multiplier of 0.
 # [-] Shift of the diagonal of a singular or sparse matrix of the step; each refinement reduces its effect.
 STEP_SHIFT, REFINEMENTS_OF_SHIFTED_STEP = 1e-9, 4
@@ -223,6 +224,36 @@ class ConvexProgram:
         active: npt.NDArray[np.bool_] = lam > self.scaled.jacobian @ x - self.scaled.t
         active[: self.free] = True
         return active
+
+    @np.errstate(all="ignore")
+    def fit_multipliers(self, x: FloatArray, active: npt.NDArray[np.bool_]) -> FloatArray | None:
+        """Return the multipliers (m,) of active rows that fit the gradient at x best: nonnegative least squares.
+
+        None if there are more than MAX_FIT_SIZE variables or active rows.
+        """
+        rows, scaled = np.flatnonzero(active), self.scaled
+        if max(len(x), len(rows)) > MAX_FIT_SIZE or not len(rows):
+            return None
+        x = x / (self.scales[0] * self.scales[2])
+        P = scaled.hessian
+        cost = abs(P) @ np.abs(x) + np.abs(scaled.q)
+        weight = 1.0 / np.maximum(cost, NEAR_SLACK * max(cost.max(), 1e-300))
+        matrix = (scaled.jacobian[rows].toarray() * weight).T
+        free = rows < self.free
+        signed = np.concatenate([matrix, -matrix[:, free]], axis=1)
+        size = np.sqrt((signed * signed).sum(axis=0))
+        size[size == 0.0] = 1.0
+        try:
+            found = (
+                import_module_under_lock("scipy.optimize").nnls(signed / size, weight * (P @ x + scaled.q))[0]
+                / size
+            )
+        except RuntimeError:
+            return None
+        lam = np.zeros(len(scaled.t))
+        lam[rows] = found[: len(rows)]
+        lam[rows[free]] -= found[len(rows) :]
+        return self.restore_point(x, lam)[1]
 
     def find_near_rows(self, x: FloatArray) -> npt.NDArray[np.bool_]:
         """Return the equations, and the inequalities with a slack of almost 0 in scaled units."""

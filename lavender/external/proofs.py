@@ -12,6 +12,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import Deadline
+from lavender.base.lazy_import import import_module_under_lock
 from lavender.base.lazy_import import sparse as sp
 from lavender.external.convex import ConvexProgram
 from lavender.judge.certificates import Proof, prove_infeasibility
@@ -19,6 +20,8 @@ from lavender.problem import Problem
 
 RAY_TOLERANCE = 1e-8  # [-] P d, J d and q.d count as 0 up to this multiple of their largest terms.
 FEASIBLE_TOLERANCE = 1e-6  # [-] Largest error of a row of the feasible point of an unbounded program.
+# Matrices of more rows or columns are projected by a sparse factor with this shift, which repetitions remove.
+MAX_DENSE_PROJECTION, PROJECTION_SHIFT, PROJECTIONS = 300, 1e-10, 3
 # [-] t.lambda of a proof is positive by more than this multiple of the sum of |lambda| in scaled units; the rest is
 # rounding of right-hand sides (2^10 unit roundoffs).
 PROOF_ROUNDING = 2.0**-43
@@ -116,9 +119,19 @@ def _is_feasible(program: ConvexProgram, x: FloatArray) -> bool:
 def _project_to_kernel(x: FloatArray, matrix: Any) -> FloatArray:
     """Return the nearest vector with the same zeros for which `matrix` x = 0, in the least-squares sense."""
     used = np.flatnonzero(x)
-    part = matrix.tocsc()[:, used].toarray()
+    part = matrix.tocsc()[:, used]
     out = np.zeros(len(x))
-    out[used] = x[used] - np.linalg.lstsq(part, part @ x[used], rcond=1e-10)[0]
+    if max(part.shape) <= MAX_DENSE_PROJECTION:
+        dense = part.toarray()
+        out[used] = x[used] - np.linalg.lstsq(dense, dense @ x[used], rcond=1e-10)[0]
+        return out
+    shift = -PROJECTION_SHIFT * sp.eye_array(part.shape[0])
+    splu = import_module_under_lock("scipy.sparse.linalg").splu
+    solve = splu(sp.csc_array(sp.block_array([[sp.eye_array(len(used)), part.T], [part, shift]]))).solve
+    out[used] = x[used]
+    for _ in range(PROJECTIONS):
+        correction = solve(np.concatenate([np.zeros(len(used)), -(part @ out[used])]))
+        out[used] += correction[: len(used)]
     return out
 
 

@@ -77,6 +77,10 @@ class ProgramJudge:
             if near is not None:
                 for multipliers in (near[1], complementary, lam if first is None else first[1]):
                     self.keep(near[0], multipliers, True)
+                if self.error > self.tol and not self.deadline.has_passed():
+                    fitted = self.program.fit_multipliers(near[0], self.program.find_near_rows(near[0]))
+                    if fitted is not None:
+                        self.keep(near[0], fitted, True)
             if self.error > self.tol:
                 self._polish(x, complementary, active)
         return self.error <= self.tol

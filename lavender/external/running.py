@@ -119,9 +119,9 @@ def call_backend_until_accepted(
     """Call the backend, and once more with a smaller tolerance and all rows unless the judge accepts its point.
 
     The second call has the size of the first call's x as unit. `max_iter` limits the iterations of both calls,
-    `call_iterations` those of the first one; `first_tolerance` is the tolerance of the first call as a multiple of tol;
-    `settings` are additional options of the backend; `start` is (x, lam); `needs_definite` states that the backend
-    needs a positive definite P.
+    `call_iterations` the iterations of the first one; `first_tolerance` is the tolerance of the first call as a
+    multiple of tol; `settings` are additional options of the backend; `start` is (x, lam); `needs_definite` states that
+    the backend needs a positive definite P.
     """
     best: BackendResult | None = None
     work: dict[str, int] = {"backend_calls": 0}
@@ -138,7 +138,7 @@ def call_backend_until_accepted(
         gap = SECOND_GAP if attempt else eps
         left = max_iter - work.get("iterations", 0)
         limits = Limits(
-            eps, gap, left if attempt else min(left, call_iterations), deadline.get_remaining_seconds()
+            eps, gap, left if attempt else min(left, call_iterations), deadline.get_remaining_seconds(1e-6)
         )
         begin = None if start is None else program.scale_point(*start)
         answer = _call_backend_once(scaled, begin, call, limits, dict(settings))

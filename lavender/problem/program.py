@@ -67,6 +67,10 @@ MAX_SINGULAR_PIVOT = 1e-13
 # eigenvalues that rounding causes.
 SEMIDEFINITE_SHIFT = 1e-12
 INFINITE = 1e20  # A right-hand side or bound of this size or larger counts as infinite, as in other packages.
+MAX_NAMED_ROWS = 8  # A message names up to this many rows.
+# Bounds that cross by less than this multiple of their size count as equal.
+MAX_CROSSING = 1e-12
+MAX_PROGRAM_ASYMMETRY = 1e-8  # [-] An asymmetry of P up to this multiple of its largest entry is removed.
 # Up to this many variables, the message about an indefinite P has its smallest eigenvalue.
 MAX_EIGENVALUE_SIZE = 1000
 ProgramArrays = tuple[Any, Any, Any, Any, Any, Any, Any, Any]  # P, q, G, h, A, b, lb, ub
@@ -121,11 +125,25 @@ class QPSolution:
         conflict = f"; CONTRADICTED: {conflict}" if conflict else ""
         return f"{verdict}: {status}error {self.error:.1e}, objective {self.objective:.6g}{conflict}"
 
+    @cached_property
+    def _judged(self) -> tuple[Any, ...]:
+        """Result of `judge_program` for x and the multipliers."""
+        return self.qp.judge(self.x, self.qp.select_row_multipliers(self.impulse))
+
     @property
     def objective(self) -> float:
         """Objective 1/2 x.P x + q.x."""
         curvature = self.qp.generalized.momentum_of(self.x)
         return float(0.5 * self.x @ curvature + self.qp.q @ self.x)
+
+    @property
+    def obj(self) -> float:
+        """Objective, by its name in qpsolvers."""
+        return self.objective
+
+    def is_optimal(self, eps_abs: float) -> bool:
+        """Return whether the primal and dual residuals and the duality gap are below `eps_abs`, in absolute terms."""
+        return max(self.primal_residual, self.dual_residual, self.duality_gap) < eps_abs
 
     @property
     def primal_residual(self) -> float:
@@ -147,7 +165,7 @@ class QPSolution:
         qp, lam = self.qp, self.qp.select_row_multipliers(self.impulse)
         return float(abs(self.x @ (qp.generalized.momentum_of(self.x) + qp.q) - qp.target @ lam))
 
-    @cached_property
+    @property
     def error(self) -> float:
         """Error of x and the multipliers, relative to the terms of the program's rows and columns; 0 if exact.
 
@@ -162,7 +180,7 @@ class QPSolution:
         otherwise its multiplier counts as 0. Rounding errors of the sums count as 0, and no divisor is a rounding
         error: `lavender_ext/judge/program.pyx` has the formulas.
         """
-        return float(self.qp.judge(self.x, self.qp.select_row_multipliers(self.impulse))[0])
+        return float(self._judged[0])
 
     @property
     def found(self) -> bool:
@@ -196,6 +214,8 @@ class QuadraticProgram:
         Rows of G that are in J; None if all are.
     fixed, lower, upper : (n_f,), (n_l,), (n_u,) int, or None without lb and ub
         Variables of the rows of bounds.
+    has_impossible_rows : bool
+        Whether rows G x <= -inf were given, which became 0 <= -1.
     """
 
     q: FloatArray
@@ -209,6 +229,7 @@ class QuadraticProgram:
     fixed: IntpArray | None
     lower: IntpArray | None
     upper: IntpArray | None
+    has_impossible_rows: bool = False
 
     def problem_fields(self) -> dict[str, Any]:
         """Return the fields b, cones and matrix or generalized of the constraint problem."""
@@ -276,6 +297,8 @@ class QuadraticProgram:
         target = self.target.copy()
         if b is not None:
             target[: self.n_equalities or 0] = as_array("b", b, (self.n_equalities or 0,))
+        if h is not None and self.has_impossible_rows:
+            raise InputError("h of the program has an entry of -inf; a new program is needed for another h")
         if h is not None:
             h = as_array("h", h, (self.n_inequalities or 0,), finite=False)
             h = h if self.kept is None else h[self.kept]
@@ -326,6 +349,20 @@ class QuadraticProgram:
                 z = z_of_all_rows
         return y, z, box
 
+    def describe_rows(self, impulse: FloatArray) -> str:
+        """Return the names of the rows with nonzero multipliers, such as A[0], G[3], lb[2]."""
+        none = np.zeros(0, int)
+        n_rows = self.n_inequalities or 0
+        groups = (
+            ("A", np.arange(self.n_equalities or 0)), ("lb", none if self.fixed is None else self.fixed),
+            ("G", np.arange(n_rows) if self.kept is None else self.kept),
+            ("lb", none if self.lower is None else self.lower), ("ub", none if self.upper is None else self.upper),
+        )  # fmt: skip
+        all_names = [f"{name}[{i}]" for name, indices in groups for i in indices.tolist()]
+        names = [all_names[i] for i in np.flatnonzero(self.select_row_multipliers(impulse))]
+        more = f" and {len(names) - MAX_NAMED_ROWS} more" if len(names) > MAX_NAMED_ROWS else ""
+        return ", ".join(names[:MAX_NAMED_ROWS]) + more
+
     def solution(self, solution: Any, tol: float = 1e-6) -> QPSolution:
         """Return x, y, z and z_box of a `Solution` of this problem, or of its impulses.
 
@@ -355,6 +392,7 @@ def _make_one_sided_cones(free: int, m: int) -> Cones:
 def make_quadratic_program(arrays: ProgramArrays) -> QuadraticProgram:
     """Check the arrays P, q, G, h, A, b, lb, ub and convert them to a program; see `Problem.from_qp`."""
     P, q, G, h, A, b, lb, ub = arrays
+    q, h, b, lb, ub = map(_flatten_column, (q, h, b, lb, ub))
     q = as_array("q", q, (None,))
     n = len(q)
     lower = _convert_hessian(P, n)
@@ -366,7 +404,7 @@ def make_quadratic_program(arrays: ProgramArrays) -> QuadraticProgram:
             np.full(n, infinite) if x is None else as_array(name, x, (n,), finite=False)
             for name, x, infinite in (("lb", lb, -np.inf), ("ub", ub, np.inf))
         )
-        _check_bounds(lb, ub)
+        lb, ub = _check_bounds(lb, ub)
         equal = lb == ub
         fixed, low, up = (
             np.flatnonzero(on) for on in (equal, (lb > -INFINITE) > equal, (ub < INFINITE) > equal)
@@ -383,6 +421,7 @@ def make_quadratic_program(arrays: ProgramArrays) -> QuadraticProgram:
         q=q, target=mark_read_only(target), free=free, generalized=general, is_singular=is_singular,
         n_equalities=n_a, n_inequalities=n_g,
         kept=finite_rows, fixed=fixed, lower=low, upper=up,
+        has_impossible_rows=h is not None and bool(np.isneginf(np.asarray(h, float)).any()),
     )  # fmt: skip
 
 
@@ -456,7 +495,23 @@ def _convert_hessian(P: Any, n: int) -> Compressed:
     """Return the lower triangle of P with its diagonal."""
     if get_shape("P", P) != (n, n):
         raise InputError(f"P has shape {get_shape('P', P)}; ({n}, {n}) is needed, as q has {n} entries")
-    return extract_lower_triangle("P", P, "give both triangles, or (P + P^T) / 2, which has the same x.P x")
+    hint = "give both triangles or the upper one, or (P + P^T) / 2, which has the same x.P x"
+    try:
+        return extract_lower_triangle("P", P, hint)
+    except InputError:
+        matrix = sp.csr_array(P if issparse(P) else as_array("P", P, (n, n)))
+        upper = sp.triu(matrix, 1)
+        asymmetry = abs(matrix - matrix.T)
+        if not sp.tril(matrix, -1).count_nonzero():
+            matrix = matrix + upper.T
+        elif asymmetry.max() <= MAX_PROGRAM_ASYMMETRY * abs(matrix).max():
+            matrix = 0.5 * (matrix + matrix.T)
+        return extract_lower_triangle("P", sp.csr_array(matrix), hint)
+
+
+def _flatten_column(vector: Any) -> Any:
+    """Return the entries of an (n, 1) array as (n,); other arguments unchanged."""
+    return np.asarray(vector)[:, 0] if getattr(vector, "shape", ())[1:] == (1,) else vector
 
 
 class _RowStack:
@@ -514,12 +569,15 @@ class _RowStack:
         if not (all_finite(h) and (h < INFINITE).all()):
             check_not_nan(rhs_name, h)
             finite_rows = np.flatnonzero(h < INFINITE)
-            rows, h = _select_rows(rows, finite_rows), h[finite_rows]
-            if not all_finite(h):
-                raise InputError(
-                    f"h is -inf at [{finite_rows[np.argmin(h)]}], which no x satisfies; a finite bound is "
-                    "needed, or inf for no bound"
+            is_impossible = np.isneginf(h)
+            if is_impossible.any():  # G x <= -inf becomes 0 <= -1, which no x satisfies either.
+                ptr, idx, val = rows
+                value = np.where(np.repeat(is_impossible, np.diff(ptr)), 0.0, val)
+                rows, h = (
+                    convert_to_compressed_rows("G", sp.csr_array((value, idx, ptr), (m, self.n))),
+                    np.where(is_impossible, -1.0, h),
                 )
+            rows, h = _select_rows(rows, finite_rows), h[finite_rows]
         self.add_rows(rows, -h)
         return m, finite_rows
 
@@ -532,14 +590,18 @@ def _select_rows(rows: Compressed, selected: IntpArray) -> Compressed:
     return np.concatenate([[0], np.cumsum(size[selected])]).astype(np.int32), idx[entries], val[entries]
 
 
-def _check_bounds(lb: FloatArray, ub: FloatArray) -> None:
-    """Raise InputError unless a finite number is within the bounds of each variable."""
-    bad = np.flatnonzero(~((lb <= ub) & (lb < np.inf) & (ub > -np.inf)))
+def _check_bounds(lb: FloatArray, ub: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the bounds, equal if they cross by rounding; raise InputError for NaN, lb = inf and ub = -inf.
+
+    Bounds that cross by more are two rows that contradict each other.
+    """
+    bad = np.flatnonzero(~((lb < np.inf) & (ub > -np.inf)))
     if len(bad):
         i = bad[0]
-        raise InputError(
-            f"variable {i}: lb = {lb[i]}, ub = {ub[i]}; a finite number must lie between them (lb <= ub)"
-        )
+        raise InputError(f"variable {i}: lb = {lb[i]}, ub = {ub[i]}; lb < inf and ub > -inf are needed")
+    crossing = lb - ub
+    is_rounding = (crossing > 0.0) & (crossing <= MAX_CROSSING * np.maximum(np.abs(lb), np.abs(ub)))
+    return (lb, np.where(is_rounding, lb, ub)) if is_rounding.any() else (lb, ub)
 
 
 # -- definiteness of P --------------------------------------------------------------------------------

@@ -17,13 +17,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, check_float, mark_read_only
+from lavender.base.arrays import FloatArray, as_array, check_float, mark_read_only
 from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import sparse as sp
 from lavender.external.forms import get_program
 from lavender.external.proofs import find_infeasibility_proof, find_ray
-from lavender.external.qp_solver import ProgramJudge, QPSolver, get_false_claim_error
+from lavender.external.qp_solver import OPTION_HELP, ProgramJudge, QPSolver, get_false_claim_error
 from lavender.judge.certificates import Proof
 from lavender.judge.residuals import residual
 from lavender.judge.solution import (
@@ -71,6 +71,8 @@ def solve_qp(
     lb: Any = None,
     ub: Any = None,
     solver: str = "auto",
+    initvals: Any = None,
+    verbose: bool = False,
     *,
     tol: float = 1e-9,
     time_limit: float | None = None,
@@ -92,6 +94,10 @@ def solve_qp(
         With a problem: only h and b, as other right-hand sides of the same program.
     solver : str
         "auto", a QP backend, or a solver of bounded rows if P is positive definite.
+    initvals : (n,), optional
+        Start x, for backends that accept one; other solvers start from `impulse` only.
+    verbose : bool
+        Whether a backend prints its output.
     tol : float
         `QPSolution.error` to reach.
     time_limit : float, optional, s
@@ -100,7 +106,7 @@ def solve_qp(
     impulse : (m,) or (n + m,), optional
         Start from the impulses of an earlier program (`answer.impulse`).
     **options
-        Options of the solver.
+        Options of the solver; of a backend, also its own settings by name, such as eps_abs.
 
     Returns
     -------
@@ -141,8 +147,16 @@ def solve_qp(
     limit = check_time_limit(time_limit)
     deadline = Deadline(None if limit == math.inf else limit)
     spec = get(solver)
-    solve_task = _Task(problem, spec, tol, deadline, max_iter, impulse, options)
-    return solve_task.solve(begun)
+    if _is_program_backend(spec, options):
+        own = {name: x for name, x in options.items() if name in OPTION_HELP}
+        settings = {name: x for name, x in options.items() if name not in own} | (
+            {"verbose": True} if verbose else {}
+        )
+        options = own | ({"settings": {**own.get("settings", {}), **settings}} if settings else {})
+    task = _Task(problem, spec, tol, deadline, max_iter, impulse, options)
+    if initvals is not None:
+        task.initial_x = as_array("initvals", initvals, (len(problem.qp.q),))
+    return task.solve(begun)
 
 
 def _update_program(problem: Problem, q: Any, h: Any, b: Any, others: tuple[Any, ...]) -> Problem:
@@ -182,6 +196,7 @@ class _Task:
         self.max_iter, self.options = max_iter, options
         self.qp = problem.qp
         self.start = None if start is None else problem.impulse_array(start)
+        self.initial_x: FloatArray | None = None
         self.program = get_program(self.qp)
         self.judge = ProgramJudge(self.program, max(tol, MIN_TOL), deadline)
         self.runs: list[Run] = []
@@ -245,6 +260,8 @@ class _Task:
         if self.start is not None and solver.backend.starts:
             start = self.qp.recover_variables(self.start), self.qp.select_row_multipliers(self.start)
             start = start if np.isfinite(start[0]).all() else None
+        elif self.initial_x is not None and solver.backend.starts:
+            start = self.initial_x, np.zeros(len(self.qp.target))
         judge, result = solver.solve_program(self.qp, self.judge.tol, self.max_iter, self.deadline, start)
         if judge.error < self.judge.error or self.judge.x is None:
             self.judge = judge
@@ -345,11 +362,12 @@ class _Task:
         self, impulse: FloatArray, last: Run, conflict: str, is_found: bool
     ) -> dict[str, Any]:
         """Return the fields of the solution that are computed when one is first read."""
-        judged = residual(self.problem, impulse, "float64")
+        qp, judged = self.qp, residual(self.problem, impulse, "float64")
         work = sum_work_counts(run.work for run in self.runs)
         message = last.message
         if self.proof is not None:
-            message = self.proof.message
+            names = qp.describe_rows(self.proof.y)
+            message = f"{self.proof.message}; contradicting rows: {names}"
         elif self.ray is not None:
             message = "the objective decreases without limit along the ray"
         elif last.status is INFEASIBLE and not is_found:

@@ -101,7 +101,7 @@ cdef void compute_columns(const csr_t* a, const double* lam, const double* e, do
 def judge_program(hessian, q_, jac, t_, scales, lam_, x_, int32_t free):
     """Judge x (n,) and lambda (m,) of a program by the formulas of the module.
 
-    `scales` are those of `equilibrate_program`.
+    `scales` is the result of `equilibrate_program`.
 
     Returns
     -------
