@@ -4,13 +4,11 @@ EXIT_UNMET = 1
 EXIT_BAD_INPUT = 2
 EXIT_INFEASIBLE = 3
 EXIT_INTERRUPTED = 130
-EXIT_TERMINATED = 143
 EXIT_CODES = {
     0: "completed",
     EXIT_UNMET: "completed, but a problem is not solved, a check failed, a run diverged, a step or a file of a folder "
     "is left out, or too few steps have contact",
-    EXIT_BAD_INPUT: "invalid input, or another command is writing to the folder",
+    EXIT_BAD_INPUT: "invalid input",
     EXIT_INFEASIBLE: "`solve`: the problem is infeasible, with a certificate that the judge confirms",
     EXIT_INTERRUPTED: "stopped by Ctrl-C; the results of the completed work are written",
-    EXIT_TERMINATED: "stopped by SIGTERM; the results of the completed work are written",
 }

@@ -9,7 +9,7 @@ import click
 
 from lavender.base.errors import InputError
 from lavender.base.exits import EXIT_UNMET
-from lavender.cli.measuring import explain_early_interrupt, show_page, show_progress
+from lavender.cli.measuring import show_page, show_progress
 from lavender.cli.options import (
     FILE,
     FOLDER,
@@ -84,7 +84,7 @@ def audit(
     reject_options_without_effect(context, other_engine=engine != "mujoco")
     check_writable(out, folder=True)
     limit_to_one_thread()
-    with explain_early_interrupt("the first step"), show_progress() as watch:
+    with show_progress() as watch:
         result = run(
             model, watch=watch, folder=out, reuse=not no_reuse,
             keep_contact_states=save_states is not None and save_states[0] == "contact", **options,

@@ -4,22 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import io
-import os
 import re
-import signal
-import sys
 import warnings
 from collections.abc import Iterator, Sequence
-from types import FrameType
 from typing import Any
 
 import click
 
 from lavender._version import __version__
 from lavender.base.errors import InputError, LavenderError, UnknownName
-from lavender.base.exits import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_TERMINATED
-from lavender.cli.options import discard_output, print_escaped
+from lavender.base.exits import EXIT_BAD_INPUT, EXIT_INTERRUPTED
+from lavender.cli.options import print_escaped
 
 #: Names of the commands by the heading under which `lavender --help` lists them.
 COMMAND_GROUPS = {
@@ -108,100 +103,22 @@ def cli() -> None:
 
 
 def main(args: Sequence[str] | None = None) -> None:
-    """Run the command line. An error of lavender is printed as one line and exits with 2, Ctrl-C exits with 130.
-
-    SIGTERM, which `timeout` and batch queues send, stops a command as Ctrl-C does and exits with 143; a second SIGTERM
-    ends the process at once.
-    """
-    with _record_signals() as received:
-        try:
-            code = _run_command(args)
-        except Exception as error:
-            if not received:
-                raise
-            print_escaped(f"lavender: {type(error).__name__}: {error}", err=True)
-            code = EXIT_BAD_INPUT
-    if received and code not in (0, EXIT_INTERRUPTED):
-        click.echo("lavender: stopped", err=True)
-        code = EXIT_INTERRUPTED
-    if code == EXIT_INTERRUPTED and signal.SIGTERM in received:
-        code = EXIT_TERMINATED
-    raise SystemExit(code)
-
-
-#: Signals that stop a command, with the handlers that Python installs for them.
-DEFAULT_SIGNAL_HANDLERS: dict[int, Any] = {
-    signal.SIGINT: signal.default_int_handler,
-    signal.SIGTERM: signal.SIG_DFL,
-}
-
-
-@contextlib.contextmanager
-def _record_signals() -> Iterator[list[int]]:
-    """Yield a list to which the numbers of received signals are appended.
-
-    The list is needed because C libraries may replace the exception of a signal by an error of their own.
-    """
-    received: list[int] = []
-
-    def note(number: int, frame: FrameType | None) -> None:
-        received.append(number)
-        if number == signal.SIGTERM:
-            signal.signal(number, signal.SIG_DFL)
-        signal.default_int_handler(number, frame)
-
-    for number, handler in DEFAULT_SIGNAL_HANDLERS.items():
-        with contextlib.suppress(ValueError):  # Handlers can only be set in the main thread.
-            if signal.getsignal(number) is handler:
-                signal.signal(number, note)
-    try:
-        yield received
-    finally:
-        for number, handler in DEFAULT_SIGNAL_HANDLERS.items():
-            if signal.getsignal(number) is note:
-                signal.signal(number, handler)
-
-
-def _run_command(args: Sequence[str] | None) -> int:
-    """Run a command, print the error that ended it, and return the exit code."""
-    for name in ("stdout", "stderr"):
-        # The caller closed the stream: without this, the next file gets its descriptor.
-        if getattr(sys, name) is None:
-            null_device = os.open(os.devnull, os.O_WRONLY)
-            setattr(sys, name, open(null_device, "w", encoding="utf-8", closefd=False))  # noqa: SIM115 - never closed
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # File names may not be valid UTF-8.
+    """Run the command line. An error of lavender is printed as one line and exits with 2, Ctrl-C exits with 130."""
     try:
         with _print_warnings_as_sentences():
             code = cli.main(
                 args=None if args is None else list(args), prog_name="lavender", standalone_mode=False
             )
-        sys.stdout.flush()
     except LavenderError as error:
         print_escaped(f"lavender: {error}", err=True)
         code = EXIT_BAD_INPUT
-    except click.exceptions.ClickException as error:
+    except click.ClickException as error:
         error.show()
         code = error.exit_code
-    except (click.exceptions.Abort, KeyboardInterrupt) as error:
-        # click raises Abort from KeyboardInterrupt, whose message may describe the completed part.
-        reason = str(error) or str(error.__cause__ or "")
-        click.echo(": ".join(filter(None, ("lavender: stopped", reason))), err=True)
+    except (click.Abort, KeyboardInterrupt):  # click raises Abort from KeyboardInterrupt.
+        click.echo("lavender: stopped", err=True)
         code = EXIT_INTERRUPTED
-    except (BrokenPipeError, SystemExit):
-        # The reader has closed the pipe (`lavender solvers | head`), for which click and rich raise SystemExit.
-        discard_output()
-        code = 0
-    except MemoryError as error:
-        click.echo(
-            f"lavender: not enough memory ({str(error) or 'none left'}): give a smaller problem", err=True
-        )
-        code = EXIT_BAD_INPUT
-    except OSError as error:  # For example a full disk behind stdout.
-        click.echo(f"lavender: {error}{_explain_os_error()}", err=True)
-        code = EXIT_BAD_INPUT
-    return code if isinstance(code, int) else 0
+    raise SystemExit(code if isinstance(code, int) else 0)
 
 
 @contextlib.contextmanager
@@ -218,12 +135,3 @@ def _print_warnings_as_sentences() -> Iterator[None]:
 
         warnings.showwarning = show_sentence
         yield
-
-
-def _explain_os_error() -> str:
-    """Return a hint to the cause of an OSError, or an empty text."""
-    try:
-        os.getcwd()
-    except OSError:
-        return " (the working directory no longer exists: change to another folder)"
-    return ""

@@ -13,7 +13,6 @@ import click
 
 from lavender.base.errors import InputError
 from lavender.cli.options import (
-    continue_after_closed_output,
     exit_after_interrupt,
     is_option_set,
     limit_to_one_thread,
@@ -154,24 +153,10 @@ def _make_plan(context: click.Context, files: Sequence[str]) -> tuple[Plan, dict
 def show_page(page: ResultPage, folder: Path) -> None:
     """Write a page and print its short form; exit if Ctrl-C ended the measurement."""
     path = page.write(folder)
-    with continue_after_closed_output():
-        page.print_short(make_console())
-        print_escaped(f"\npage: {path}")
+    page.print_short(make_console())
+    print_escaped(f"\npage: {path}")
     if page.is_stopped:
         exit_after_interrupt()
-
-
-@contextlib.contextmanager
-def explain_early_interrupt(first_result: str) -> Iterator[None]:
-    """Give the exception of Ctrl-C a message with the time so far and with `first_result`, which is not complete."""
-    began = time.monotonic()
-    try:
-        yield
-    except KeyboardInterrupt:
-        elapsed = time.monotonic() - began
-        raise KeyboardInterrupt(
-            f"nothing was complete yet after {elapsed:.1f} s; the first result is {first_result}"
-        ) from None
 
 
 @contextlib.contextmanager

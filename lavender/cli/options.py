@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -127,20 +126,6 @@ def make_console(stderr: bool = False) -> Console:
     has_width = Console(stderr=stderr).is_terminal or os.environ.get("COLUMNS", "0").strip("0").isdigit()
     width = max(shutil.get_terminal_size().columns, MIN_TERMINAL_WIDTH) if has_width else 10_000
     return Console(stderr=stderr, width=width)
-
-
-def discard_output() -> None:
-    """Redirect standard output to the null device after its reader has closed the pipe (`| head`)."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-@contextlib.contextmanager
-def continue_after_closed_output() -> Iterator[None]:
-    """Discard output if its reader has closed the pipe, so that the command still writes its files."""
-    try:
-        yield
-    except (BrokenPipeError, SystemExit):  # rich turns BrokenPipeError into SystemExit.
-        discard_output()
 
 
 def is_option_set(context: click.Context, name: str) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import sys
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,6 @@ from lavender.base.exits import EXIT_UNMET
 from lavender.cli.completion import complete_scene, complete_solver
 from lavender.cli.options import (
     PATH,
-    continue_after_closed_output,
     exit_after_interrupt,
     parse_parameters,
     print_escaped,
@@ -96,12 +94,11 @@ def run(
         check_writable(path)
     if film is not None and film.suffix.lower() != ".gif":
         raise InputError(f"--film {film} is of format {film.suffix!r}; a name that ends in .gif is needed")
-    live, writes = sys.stdout.isatty(), bool(files) or record is not None
+    live = sys.stdout.isatty()
 
     def show(text: str) -> None:
         # On a terminal each line replaces the previous one.
-        with continue_after_closed_output() if writes else contextlib.nullcontext():
-            click.echo(f"\r{text}\x1b[K" if live else text, nl=not live)
+        click.echo(f"\r{text}\x1b[K" if live else text, nl=not live)
 
     scene_parameters = _collect_parameters(parameters, scene_options, velocity_tol)
     simulation = Simulation(Scene(scene, **scene_parameters), report_residual=residual)

@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from lavender.base.exits import EXIT_UNMET
-from lavender.cli.measuring import explain_early_interrupt, show_page, show_progress
+from lavender.cli.measuring import show_page, show_progress
 from lavender.cli.options import FILE, FOLDER, add_worlds_options, limit_to_one_thread, threshold_option
 from lavender.io.stored import check_writable
 
@@ -46,7 +46,7 @@ def tune(context: click.Context, /, model: Path, out: Path, no_reuse: bool, **op
 
     check_writable(out, folder=True)
     limit_to_one_thread()
-    with explain_early_interrupt("the present setting on the first steps"), show_progress() as watch:
+    with show_progress() as watch:
         tuning = run(model, watch=watch, folder=out, reuse=not no_reuse, **options)
     show_page(tuning.page, out)
     if tuning.reason_without_line or (tuning.error_limit is not None and tuning.within_limit is None):
