@@ -22,7 +22,7 @@ import hashlib
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
-from time import monotonic, perf_counter
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -63,12 +63,10 @@ DEFAULT_DURATION = 60.0  # [s] Without a number of worlds, the audit takes about
 # If `worlds` is None, at most this many are simulated; more would hardly change the quantiles.
 MAX_DEFAULT_WORLDS = 4096
 DEFAULT_JOINT_WORLDS = 8  # Default number of worlds of other engines, and of episodes of environments.
-# World 0 is first judged in this process for these numbers of steps, so that Ctrl-C soon after the start has a result.
-FIRST_STEPS = (1, 20)
+TIMED_STEPS = 20  # Steps of world 0 that are timed if the number of worlds is given.
 # [s] Steps that take less time are judged in this process: each worker process takes a second to start.
 MIN_DURATION_OF_WORKERS = 2.0
 MAX_CONTACT_STATES = 1000  # Up to about this many states before steps with contact are kept.
-SAVE_INTERVAL = 60.0  # [s] Results of complete worlds are written to `folder` after this time.
 # The states before a world diverges by less than this number of steps are not kept as states with contact: their speeds
 # belong to the divergence, and `slip` simulates settings for 25 steps.
 DIVERGENCE_MARGIN = 25
@@ -81,7 +79,6 @@ def audit(
     states: Any = None, against: Any = None, keep: int | None = None, keep_contact_states: bool = False,
     precision: str | None = None, threshold: float = DEFAULT_THRESHOLD, max_velocity_error: float | None = None,
     njmax: int | None = None, workers: int = -1, backend: str = "loky",
-    folder: str | os.PathLike[str] | None = None, reuse: bool = True,
     watch: Callable[[Event], None] | None = None,
 ) -> Audit:  # fmt: skip
     """Simulate worlds of a model and judge the engine's answer to every step.
@@ -122,17 +119,13 @@ def audit(
         Processes for MuJoCo; -1: one for each core.
     backend : str
         Name of a joblib backend, as for a campaign.
-    folder : path, optional
-        Complete worlds of MuJoCo are written there every minute, and worlds of an earlier audit of the same model with
-        the same parameters are reused from there, unless `reuse` is false.
     watch : callable, optional
         Called with the progress.
 
     Returns
     -------
     Audit
-        After Ctrl-C, the result of the steps so far, with `is_stopped`: before the first results of the workers, some
-        steps of world 0.
+        After Ctrl-C, the result of the steps so far, with `is_stopped`.
 
     Raises
     ------
@@ -190,7 +183,7 @@ def audit(
     runs = Runs.of_model(model, n, steps, control=control, seed=seed).with_start_states(states)
     runs = runs.with_other_model(against)
     if engine == "mujoco":
-        more = (keep_contact_states, workers, backend, folder, reuse, watch, common)
+        more = (keep_contact_states, workers, backend, watch, common)
         return _audit_model(runs, judging, worlds, spread, *more)
     runs, note = runs.choose_spread(spread, watch)
     if watch is not None:
@@ -245,51 +238,30 @@ def audit_steps(
 
 def _audit_model(
     one: Runs, judging: Judging, worlds: int | None, spread: float | None, keep_contact_states: bool,
-    workers: int, backend: str, folder: Any, reuse: bool, watch: Callable[[Event], None] | None,
-    common: dict[str, Any],
+    workers: int, backend: str, watch: Callable[[Event], None] | None, common: dict[str, Any],
 ) -> Audit:  # fmt: skip
     """Audit a model of MuJoCo: time its first world, choose the spread, and judge all worlds in worker processes."""
     processes = count_processes(workers)
     loads: list[float | None] = []
-    early = result = _make_empty_audit(one, "mujoco", common)
-    can_reuse = folder is not None and reuse and not keep_contact_states and one.against is None
-    key = hash_parameters(one, judging, spread)
-    try:
-        stored = Audit.read_size(folder, key) if can_reuse and folder is not None else None
-        if worlds is None and stored is not None:
-            worlds = stored[0]
-        elif stored is None:
-            # Raise the error of an unsupported model once and before any worker starts.
-            from_mujoco_many(one.model, np.concatenate([one.model.qpos0, np.zeros(one.model.nv)])[None])
-            for n_steps in (*FIRST_STEPS, one.steps) if worlds is None else FIRST_STEPS:
-                begin = perf_counter()
-                early = _judge_first_steps(result, judging, n_steps, watch)
-                duration = perf_counter() - begin
-        if worlds is None:
-            worlds = choose_world_count(duration, processes)
-        runs, note = replace(one, worlds=worlds).choose_spread(spread, watch)
-        if keep_contact_states:
-            share = min(1.0, MAX_CONTACT_STATES / (worlds * runs.steps))
-            judging = judging._replace(contact_share=share)
-        result = _make_empty_audit(runs, "mujoco", common, note)
-        result.key = key
-        if stored == (worlds, runs.steps) and folder is not None:
-            result.restore(folder)
-        todo = np.flatnonzero((result.verdict < 0).any(axis=1)).tolist()
-        if stored is None and workers == -1 and backend == "loky":
-            is_short = duration / n_steps * len(todo) * runs.steps < MIN_DURATION_OF_WORKERS
-            workers = 1 if is_short else workers
-        if len(todo) < worlds:
-            n = worlds - len(todo)
-            result.notes.append(f"{format_count(n, 'world')} of an earlier audit reused (--no-reuse).")
-        pieces = _audit_mujoco(runs, judging, todo, workers, backend)
-        saved = folder if can_reuse else None
-        result = _collect(result, pieces, judging, watch, loads=loads, folder=saved)
-    except KeyboardInterrupt:
-        if not result.n_processed:
-            if not early.n_processed:
-                raise
-            return early
+    # Raise the error of an unsupported model once and before any worker starts.
+    from_mujoco_many(one.model, np.concatenate([one.model.qpos0, np.zeros(one.model.nv)])[None])
+    timed = one if worlds is None else replace(one, steps=min(TIMED_STEPS, one.steps))
+    if watch is not None:
+        watch(Event(0, 0, f"judging one world: {format_count(timed.steps, 'step')}", ""))
+    begin = perf_counter()
+    audit_worlds(timed, judging, [0])
+    duration = (perf_counter() - begin) / timed.steps * one.steps
+    if worlds is None:
+        worlds = choose_world_count(duration, processes)
+    if workers == -1 and backend == "loky" and duration * worlds < MIN_DURATION_OF_WORKERS:
+        workers = 1
+    runs, note = replace(one, worlds=worlds).choose_spread(spread, watch)
+    if keep_contact_states:
+        share = min(1.0, MAX_CONTACT_STATES / (worlds * runs.steps))
+        judging = judging._replace(contact_share=share)
+    result = _make_empty_audit(runs, "mujoco", common, note)
+    pieces = _audit_mujoco(runs, judging, range(worlds), workers, backend)
+    result = _collect(result, pieces, judging, watch, loads=loads)
     if not result.n_processed:
         raise InputError(
             "no step was judged, because workers were lost; give fewer workers (--workers), which need less memory"
@@ -306,10 +278,9 @@ def _audit_model(
 
 def _collect(
     result: Audit, pieces: Iterable[Piece], judging: Judging, watch: Callable[[Event], None] | None, *,
-    loads: list[float | None] | None = None, folder: Any = None,
+    loads: list[float | None] | None = None,
 ) -> Audit:  # fmt: skip
-    """Add pieces to a result until their end or Ctrl-C, show the progress, and write complete worlds to `folder`."""
-    saved = monotonic()
+    """Add pieces to a result until their end or Ctrl-C, and show the progress."""
     if watch is not None:
         text = f"{format_count(result.runs.worlds, 'world')} of {format_count(result.runs.steps, 'step')}"
         watch(Event(result.n_processed, result.verdict.size, text, "", phase="judging"))
@@ -321,9 +292,6 @@ def _collect(
             if watch is not None:
                 text = f"steps, {int(result.is_unconverged.sum())} unconverged"
                 watch(Event(result.n_processed, result.verdict.size, text, "", phase="judging"))
-            if folder is not None and monotonic() > saved + SAVE_INTERVAL:
-                result.write(folder)
-                saved = monotonic()
     except KeyboardInterrupt:
         if not result.n_processed:
             raise
@@ -353,23 +321,6 @@ def _make_empty_audit(runs: Runs, engine: str, common: dict[str, Any], *notes: s
         other = replace(runs, name=name, model=model, against=None)
         result.against = Audit.with_size(other, engine, **common)
     return result
-
-
-def _judge_first_steps(
-    empty: Audit, judging: Judging, n_steps: int, watch: Callable[[Event], None] | None
-) -> Audit:
-    """Judge up to the first `n_steps` steps of world 0 in this process, as the result of an audit that was stopped.
-
-    World 0 starts without noise, so that its steps do not depend on the spread.
-    """
-    runs = replace(empty.runs, steps=min(n_steps, empty.runs.steps))
-    if watch is not None:
-        watch(Event(0, 0, f"judging one world: {format_count(runs.steps, 'step')}", ""))
-    judged = copy.deepcopy(empty)
-    judged.is_stopped = True
-    for piece in audit_worlds(runs, judging, [0]):
-        judged.add_piece(piece, judging.keep)
-    return judged
 
 
 def count_processes(workers: int) -> int:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import os
 import warnings
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,8 +26,6 @@ from lavender.audit.pieces import (
 )
 from lavender.audit.simulated_worlds import Divergence, Runs
 from lavender.base.arrays import FloatArray, check_choice
-from lavender.base.errors import InputError
-from lavender.io import read
 from lavender.io.npz import write_npz
 from lavender.io.stored import prepare_step_folder, write_arrays
 from lavender.judge.residuals import AT_FLOOR, CLOSE, DEFAULT_THRESHOLD, UNCONVERGED, WRONG
@@ -42,7 +38,6 @@ QUANTILES = (0.5, 0.9, 0.99, 0.999, 1.0)
 QUANTILE_NAMES = ("50 %", "90 %", "99 %", "99.9 %", "largest error")
 SAVED_KINDS = ("worst", "contact")
 MAX_CURVE_POINTS = 60  # Largest number of points of a curve over time.
-N_SHOWN_WORLDS = 5  # Up to this many numbers of worlds are written in a sentence.
 #: Outcomes of a step of an engine that claims that its solve converged, or that it did not.
 OUTCOMES = (
     "claimed and right", "claimed and wrong", "not claimed but right", "not claimed and wrong",
@@ -123,8 +118,6 @@ class Audit:
     prediction : Prediction
     against : Audit, optional
         Result of another model on the same states.
-    key : str
-        Hash of the model and all parameters on which the numbers depend.
     """
 
     runs: Runs
@@ -148,7 +141,6 @@ class Audit:
     lost_digits: LostDigits = field(default_factory=LostDigits)
     prediction: Prediction = field(default_factory=Prediction)
     against: Audit | None = None
-    key: str = ""
 
     @classmethod
     def with_size(cls, runs: Runs, engine: str, *, has_claims: bool = False, **more: Any) -> Audit:
@@ -372,9 +364,6 @@ class Audit:
         """Return sentences on the cause of divergence; empty if no world diverged."""
         if not self.divergences:
             return ""
-        noisy = [d.world for d in self.divergences if d.world >= self.runs.n_exact_worlds]
-        if noisy and self.runs.spread and len(noisy) == self.n_diverged:
-            return self._describe_noise(noisy)
         exact = sum(map(self.has_exact_solves, self.divergences))
         if exact == self.n_diverged:
             return f"Every solve until a world diverged was exact: the cause lies {OUTSIDE_SOLVER}."
@@ -382,16 +371,6 @@ class Audit:
         if not exact:
             return text
         return f"In {exact} worlds every solve until divergence was exact: the cause lies {OUTSIDE_SOLVER}. {text}"
-
-    def _describe_noise(self, worlds: list[int]) -> str:
-        """Return sentences about worlds that diverged, all of which started with random velocities."""
-        exact = self.runs.n_exact_worlds
-        names = "World 0, which starts" if exact == 1 else f"The first {exact} worlds, which start"
-        return (
-            f"{names} without random velocities, did not diverge; the others start with {self.runs.spread:g} m/s or "
-            f"rad/s (--spread), and {_join_numbers(worlds)} diverged. To find out whether these velocities are the "
-            "cause, audit again with --spread 0, or from states of your own (--states)."
-        )
 
     def _compare_in_words(self) -> str:
         """Return a sentence with the counts of the other model on the same states; empty without one."""
@@ -526,54 +505,7 @@ class Audit:
             records["converged"] = self.converged
         if self.against is not None:
             records["against"] = self.against.numbers[0]
-        facts = {
-            "key": self.key, "where": self.where, "divergences": self.divergences,
-            "engine_warnings": self.engine_warnings, "worst_rows": [w.where for w in self.worst],
-        }  # fmt: skip
-        records["facts"] = np.array(json.dumps(facts))
         write_arrays(folder / "records.npz", records)
-
-    @staticmethod
-    def read_size(folder: str | os.PathLike[str], key: str) -> tuple[int, int] | None:
-        """Return the numbers of worlds and steps of an earlier audit with this `key`; None without one."""
-        with suppress(OSError, ValueError, KeyError), np.load(Path(folder) / "records.npz") as file:
-            if json.loads(str(file["facts"]))["key"] == key:
-                worlds, steps = file["verdict"].shape
-                return int(worlds), int(steps)
-        return None
-
-    def restore(self, folder: str | os.PathLike[str]) -> bool:
-        """Read the complete worlds of an earlier audit with the same `key`; return whether there are any."""
-        folder = Path(folder)
-        with suppress(OSError, ValueError, KeyError, InputError):
-            with np.load(folder / "records.npz", allow_pickle=False) as file:
-                records = dict(file)
-            facts = json.loads(str(records["facts"]))
-            verdict = records["verdict"]
-            is_complete, is_begun = (verdict >= 0).all(axis=1), (verdict >= 0).any(axis=1)
-            # A world that was judged in part has counts that its repetition would add again.
-            is_same = facts["key"] == self.key and verdict.shape == self.verdict.shape
-            if not is_same or (is_begun != is_complete).any():
-                return False
-            worst = []
-            with np.load(folder / "states.npz", allow_pickle=False) as file:
-                states = dict(file)
-            for i, where in enumerate(facts["worst_rows"]):
-                stored = read(folder / "worst" / f"worst_{i + 1}.npz")
-                world, step = int(states["world"][i]), int(states["step"][i])
-                state = {name: x[i] for name, x in states.items() if name not in ("world", "step")}
-                velocity = float(records["velocity"][world, step])
-                assert stored.impulse is not None
-                found: dict[str, Any] = {"problem": stored.problem, "impulse": stored.impulse, "state": state}
-                worst.append(Worst(velocity, world, step, where, **found))
-            self.numbers[:] = [records[name] for name in WORST_ROW_ERRORS]
-            self.verdict[:], self.rows[:], self.contacts[:] = verdict, records["rows"], records["contacts"]
-            self.where |= {name: (n, largest) for name, (n, largest) in facts["where"].items()}
-            self.divergences[:] = [Divergence(*d) for d in facts["divergences"]]
-            self.engine_warnings.update(facts["engine_warnings"])
-            self.worst[:] = worst
-            return bool(is_complete.any())
-        return False
 
     def save_states(self, kind: str, path: str | os.PathLike[str]) -> int:
         """Write states before steps to a file that `--states` reads, and return their number.
@@ -641,14 +573,6 @@ def _make_frame(columns: Any, rows: Sequence[Any] | None = None) -> pd.DataFrame
     if rows is None:
         return pd.DataFrame(columns)
     return pd.DataFrame(rows, columns=columns)
-
-
-def _join_numbers(numbers: list[int]) -> str:
-    """Return "world 3", "worlds 3 and 5", or "worlds 1, 2, 3 and 40 more"."""
-    shown = [str(number) for number in sorted(numbers)[:N_SHOWN_WORLDS]]
-    more = len(numbers) - len(shown)
-    last = f"{more} more" if more else shown.pop()
-    return f"world{'s' * (len(numbers) > 1)} {' and '.join(filter(None, (', '.join(shown), last)))}"
 
 
 def _select_worst(candidates: list[Worst], keep: int | None) -> list[Worst]:

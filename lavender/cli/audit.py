@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -43,9 +45,6 @@ from lavender.io.stored import check_writable
               help="Rows of a world for mujoco_warp, as in your simulation; default: as many as needed.")  # fmt: skip
 @click.option("--workers", type=int, default=-1, help="Processes, for mujoco; -1: one for each core.")
 @click.option("--backend", default="loky", show_default=True, help="A backend of joblib, such as dask.")
-@click.option(
-    "--no-reuse", is_flag=True, help="Judge all worlds again, also worlds of an earlier audit in OUT."
-)
 @click.option("--out", type=FOLDER, default=Path("lavender-audit"),
               show_default=True, help="Folder of the page, the records and the worst worlds.")  # fmt: skip
 @click.pass_context
@@ -55,7 +54,6 @@ def audit(
     model: Path,
     out: Path,
     save_states: tuple[str, Path] | None,
-    no_reuse: bool,
     **options: Any,
 ) -> None:
     """Judge every step of many worlds of a MuJoCo model.
@@ -68,8 +66,8 @@ def audit(
     Without --worlds the audit takes about a minute; the remaining time is shown. The page
     shows how many steps were judged, how many of these stopped before convergence,
     their errors with time and body, and the numbers of rows and contacts. The worst worlds are problem files in
-    OUT/worst; OUT/states.npz holds the states before them, from which --states starts again. After a stop, the same
-    command judges the other worlds and reuses the complete ones in OUT.
+    OUT/worst; OUT/states.npz holds the states before them, from which --states starts again. An earlier audit in OUT
+    is moved to OUT-1, OUT-2, ... before this one is written.
 
     Exit code 1: a world diverged, a step could not be judged, too few steps have contact, the engine dropped rows, or
     an answer that is not at its floor has a velocity error above --max-velocity-error. Exit code 130: stopped by
@@ -86,9 +84,11 @@ def audit(
     limit_to_one_thread()
     with show_progress() as watch:
         result = run(
-            model, watch=watch, folder=out, reuse=not no_reuse,
+            model, watch=watch,
             keep_contact_states=save_states is not None and save_states[0] == "contact", **options,
         )  # fmt: skip
+    if (out / "records.npz").exists():
+        os.replace(out, next(p for i in count(1) if not (p := out.with_name(f"{out.name}-{i}")).exists()))
     result.write(out)
     if save_states is not None:
         n = result.save_states(*save_states)

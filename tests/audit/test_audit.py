@@ -120,32 +120,6 @@ def test_audit_of_a_world_that_diverges_judges_the_other_worlds(boxes, monkeypat
     assert "1 world diverged, in step 4 at the earliest; 6 steps not judged" in words_of(found)
 
 
-@pytest.mark.parametrize(
-    ("worlds", "phase", "shape", "judged"),
-    [
-        (3, "judging one world: 20 steps", (3, 25), 1),
-        (3, "simulating trial worlds", (3, 25), 20),
-        (3, "3 worlds of 25 steps", (3, 25), 20),
-        (None, "judging one world: 25 steps", (1, 25), 20),
-        (None, "simulating trial worlds", (1, 25), 25),
-    ],
-)
-def test_audit_stopped_before_results_of_workers_returns_steps_of_world_0(
-    boxes, tmp_path, worlds, phase, shape, judged
-):
-    def watch(event):
-        if event.case.startswith(phase):
-            raise KeyboardInterrupt
-
-    path = boxes(EARLY)
-    found = audit(path, worlds=worlds, steps=25, workers=1, watch=watch)
-    assert found.is_stopped and found.verdict.shape == shape and found.n_processed == judged
-    want = [r.velocity for r in own_errors(path, 0, judged)]
-    np.testing.assert_allclose(found.numbers[0, 0, :judged], want, rtol=1e-6, atol=1e-12)
-    found.write(tmp_path / "out")
-    assert "Stopped before the end" in found.page.write(tmp_path / "out").read_text()
-
-
 def test_audit_stopped_before_the_first_step_raises_keyboard_interrupt(boxes):
     def watch(event):
         raise KeyboardInterrupt
