@@ -1,4 +1,4 @@
-"""The motion error of an impulse: the distance of its velocities from those of a reference impulse, in units of motion.
+"""The motion error of an impulse: how far its velocities are from the velocities of a reference, in units of motion.
 
 ```python
 error = lv.motion_error(problem, solution.impulse)     # or solution.motion_error()
@@ -115,7 +115,7 @@ class MotionError:
 
 
 def motion_error(problem: Problem, impulse: Any, reference: Any = None) -> MotionError:
-    """Compute the error of an impulse's motion: the distance of its velocities from those of a reference impulse.
+    """Compute the distance of the velocities of an impulse from the velocities of a reference impulse.
 
     With lambda* the reference and M^-1 J^T (lambda - lambda*) the difference dv of body velocities,
 
