@@ -226,7 +226,7 @@ def judge_steps(
         order = order[np.sort(np.unique(world[order], return_index=True)[1])]
     flat, worst = frame.impulse.reshape(-1), []
     for i in order[: N_WORST_WORLDS if judging.keep is None else judging.keep].tolist():
-        impulse, name = flat[batch.rows_of(i)].copy(), judged[i].worst_name
+        impulse, name = flat[batch.rows_of(i)].copy(), judged[i].worst_label
         at = float(numbers[0, i]), int(world[i]), int(step[i])
         worst.append(Worst(*at, name, batch[i], impulse, state_of(i)))
     with_contact = np.flatnonzero(contacts > 0)
@@ -238,7 +238,7 @@ def judge_steps(
     lost = LostDigits(len(without_digits), digits, len(by_forces), max(by_forces, default=0.0))
     return Piece(
         world, step, numbers, verdict=verdict, rows=rows, contacts=contacts, worst=worst,
-        where=[(i, CONTACT_NUMBER.sub(r"\1 ", one.worst_name).strip()) for i, one in judged.items()],
+        where=[(i, CONTACT_NUMBER.sub(r"\1 ", one.worst_label).strip()) for i, one in judged.items()],
         contact_states=[StepState(int(world[i]), int(step[i]), state_of(i)) for i in chosen.tolist()],
         converged=frame.converged, n_dropped=frame.n_dropped,
         lost_digits=lost,

@@ -44,7 +44,7 @@ OUTCOMES = (
     "claimed with numbers that are not finite", "not claimed, not finite",
 )  # fmt: skip
 ERRORS_NOTE = (
-    "Errors of the worst row of each judged step; in rad/s if the row is angular. At its floor: rounding explains the "
+    "Errors of the worst row of each judged step; in rad/s if its name ends so. At its floor: rounding explains the "
     "error, in the engine's precision. Close enough: no row has a larger error than the threshold. Stopped before "
     "convergence, or wrong: all others. Not judged: the engine's answer is not finite, or the world diverged before. "
     "Shares are fractions of the steps judged. The errors are of the integrator's input: the "
@@ -294,11 +294,12 @@ class Audit:
         """Return the sentence with the largest error of steps that stopped before convergence or are wrong."""
         if not self.is_unconverged.any():
             return ""
-        text = f"The worst error is {format_size(self.max_velocity_error)} m/s"
-        if self.worst and self.worst[0].velocity == self.max_velocity_error:
-            w = self.worst[0]
-            text += f" (rad/s if angular): {w.where}, world {w.world}, step {w.step}"
-        return f"{text}."
+        text = f"The worst error is {format_size(self.max_velocity_error)} "
+        if not (self.worst and self.worst[0].velocity == self.max_velocity_error):
+            return f"{text}m/s."
+        w = self.worst[0]
+        name = w.where.removesuffix(" [rad/s]")
+        return f"{text}{'m/s' if name == w.where else 'rad/s'}: {name}, world {w.world}, step {w.step}."
 
     def _describe_third(self) -> str:
         """Return the sentence on divergence, else on the other model, claims, the limit, or missing contact."""

@@ -164,6 +164,8 @@ class Batch(Sequence[Problem]):
 
     # Function that returns the names of a world's blocks.
     names_of: Callable[[int], Sequence[str]] | None = None
+    # Function that returns which rows of a world are angular, as the argument `angular` of `Problem`.
+    angular_of: Callable[[int], Any] | None = None
     contact_counts: np.ndarray | None = None  # (n,) Number of contacts with rows; None if it is not known.
     _has_shared_cones = True
 
@@ -224,10 +226,13 @@ class Batch(Sequence[Problem]):
         return replace(cones, mu=mu)
 
     def __getstate__(self) -> dict[str, Any]:
-        # Copies and pickles hold the names, because the function `names_of` may hold an engine's model.
-        if self.names_of is None:
-            return self.__dict__
-        return self.__dict__ | {"names_of": tuple(map(self.names_of, range(len(self)))).__getitem__}
+        # Copies and pickles hold the results, because the functions may hold an engine's model.
+        functions = {"names_of": self.names_of, "angular_of": self.angular_of}
+        return self.__dict__ | {
+            name: tuple(map(function, range(len(self)))).__getitem__
+            for name, function in functions.items()
+            if function is not None
+        }
 
     # -- a sequence of problems ------------------------------------------------------------------------
 
@@ -254,6 +259,7 @@ class Batch(Sequence[Problem]):
         problem = Problem.from_jacobian(
             jac, mass, free, target=target, cones=cones, compliance=compliance, friction=self.friction,
             precision=self.precision, names=None if self.names_of is None else self.names_of(i),
+            angular=None if self.angular_of is None else self.angular_of(i),
         )  # fmt: skip
         if i in self.engine_motions:
             problem.__dict__["engine_motion"] = self.engine_motions[i]

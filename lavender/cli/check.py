@@ -123,7 +123,8 @@ def check(
                 above += stored.verdict != AT_FLOOR
                 unmet += stored.verdict not in (AT_FLOOR, CLOSE)
                 show(f"stored solution ({stored.precision}): {stored.verdict_in_words}")
-                show(f"    worst row {stored.worst_name or 'none'}: {format_residual(stored.velocity)} m/s")
+                error = f"{format_residual(stored.velocity)} {stored.velocity_unit}"
+                show(f"    worst row {stored.worst_name or 'none'}: {error}")
             contradicted += len(comparison.contradicted)
             unaccepted += len(comparison.refused) == len(comparison.rows)
             if solvers or len(comparison.unsolved) + len(comparison.refused) == len(comparison.rows):

@@ -79,9 +79,8 @@ def solve(file: str, solver: str, tol: float, output: Path | None, as_json: bool
     if judged.nothing_to_do and judged.verdict != WRONG:
         if as_json:
             return
-        click.echo(
-            f"nothing to do: the zero impulse is a solution; this result differs by {judged.velocity:.1e} m/s"
-        )
+        size = f"{judged.velocity:.1e} {judged.velocity_unit}"
+        click.echo(f"nothing to do: the zero impulse is a solution; this result differs by {size}")
         return
     if tol > 0.0 and not (solution.success or judged.at_floor):
         raise click.exceptions.Exit(EXIT_UNMET)
@@ -94,6 +93,6 @@ def _describe_solution(name: str, problem: Problem, solution: Solution) -> dict[
         "case": name, "law": problem.law, "rows": problem.m, "solver": solution.solver.name,
         "status": solution.status.name, "success": solution.success, "verdict": judged.verdict,
         **{name: getattr(judged, name) for name in ("relative", "energy", "velocity", "roundoff_floor")},
-        "worst_row": judged.worst_name,
+        "worst_row": judged.worst_label,
         **{name: getattr(solution, name) for name in SAVED_FIELDS},
     }  # fmt: skip

@@ -88,22 +88,16 @@ class MotionError:
         general = self._problem.generalized
         return f"body {body}" if general is None else general.velocity_name(body)
 
-    def _get_row_unit(self) -> str:
-        """Return the unit of `rows`: " m/s" or " rad/s", or " m/s or rad/s" if bodies are not known."""
-        if self._problem is None or self._problem.rows is None or self.row < 0:
-            return " m/s or rad/s"
-        row = self._problem.jacobian[[self.row]]
-        return " m/s" if row.data[row.indices % 6 < 3].any() else " rad/s"
-
     def __str__(self) -> str:
         speed_unit = " m/s or rad/s" if self.spin is None else " m/s"
+        is_angular = self._problem is not None and self.row >= 0 and self._problem.angular_rows[self.row]
         numbers = (
             ("relative", self.relative, "", ""),
             ("kinetic", self.kinetic, " sqrt(J)", ""),
             ("energy", self.energy if self.kinetic is None else None, " sqrt(J)", ""),
             ("speed", self.speed, speed_unit, self.body_name),
             ("spin", self.spin, " rad/s", self._name_body(self.spin_body)),
-            ("rows", self.rows, self._get_row_unit(), self.row_name),
+            ("rows", self.rows, " rad/s" if is_angular else " m/s", self.row_name),
         )
         parts = [
             f"{name} {x:.2g}{unit}{f' ({where})' if where else ''}"

@@ -142,6 +142,7 @@ def _build_problem(
         compliance=compliance,
         friction=friction,
         names=[c.name for c in contacts] + [x.name for x in limits],
+        angular=[False] * (3 * len(contacts)) + [x.is_angular for x in limits],
         dof_names=list(plant.GetVelocityNames(always_add_suffix=True)),
         name=name,
     )
@@ -199,6 +200,8 @@ class _Limit:
         Index of the joint's velocity.
     sign : float
         1 for a lower limit, -1 for an upper limit.
+    is_angular : bool
+        Whether the joint rotates.
     """
 
     name: str
@@ -206,6 +209,7 @@ class _Limit:
     gap: float
     velocity: int
     sign: float
+    is_angular: bool
 
 
 def compute_free_motion(plant: Any, context: Any, dt: float) -> tuple[FloatArray, FloatArray]:
@@ -323,14 +327,14 @@ def _read_joint_limits(plant: Any, context: Any) -> list[_Limit]:
         joint = plant.get_joint(JointIndex(int(i)))
         if joint.num_velocities() != 1 or joint.num_positions() != 1:
             continue
-        velocity = joint.velocity_start()
+        velocity, is_angular = joint.velocity_start(), joint.type_name() == "revolute"
         q = float(plant.GetPositions(context)[joint.position_start()])
         low, high = float(joint.position_lower_limits()[0]), float(joint.position_upper_limits()[0])
         for word, sign, gap in (("lower", 1.0, q - low), ("upper", -1.0, high - q)):
             if math.isfinite(gap):
                 row = np.zeros((1, nv))
                 row[0, velocity] = sign
-                limits.append(_Limit(f"{joint.name()} {word}", row, gap, velocity, sign))
+                limits.append(_Limit(f"{joint.name()} {word}", row, gap, velocity, sign, is_angular))
     return limits
 
 

@@ -448,7 +448,12 @@ def from_mujoco_many(
         m = 0 if blocks is None else blocks.n_rows
         return [] if blocks is None else single.make_block_names(mj, model, blocks.ints[2 * m + 1 :], m, 1)
 
-    batch.names_of = name_blocks_of_world
+    def find_angular_rows_of_world(i: int) -> Any:
+        blocks = blocks_of_worlds.get(i)
+        m = 0 if blocks is None else blocks.n_rows
+        return None if blocks is None else single.find_angular_rows(mj, model, blocks.ints[2 * m + 1 :], m)
+
+    batch.names_of, batch.angular_of = name_blocks_of_world, find_angular_rows_of_world
     batch.contact_counts = contact_counts
     return Imported(batch, lam)
 

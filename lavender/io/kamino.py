@@ -270,6 +270,15 @@ class _Worlds:
         )  # fmt: skip
         batch.precision = "float32"
         batch.names_of = self._make_block_namer(first)
+        ends = np.cumsum(np.append(0, self.columns[self.world]))
+
+        def find_angular_rows_of_world(i: int) -> Any:
+            begin, end = self.row_ptr[i], self.row_ptr[i + 1]
+            own = jac[begin:end] if jac.ndim == 2 else jac[ends[begin] : ends[end]]
+            linear, angular = np.abs(own).reshape(end - begin, -1, 2, 3).sum(axis=(1, 3)).T
+            return (linear == 0.0) & (angular > 0.0)
+
+        batch.angular_of = find_angular_rows_of_world
         batch.contact_counts = self.contacts
         return batch, _copy_as_float64(self.engine.solver_fd.data.solution.lambdas)[self.position]
 

@@ -30,6 +30,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from lavender.base.arrays import FloatArray, IntArray, as_array, mark_read_only
 from lavender.base.errors import CapabilityError, InputError
@@ -246,6 +247,7 @@ def _make_fields(
         "b": b, "generalized": general, "compliance": compliance, "cones": Cones._from_blocks(blocks),
         "key": numbers[first : first + count].view(np.uint64),
         "names": Names(count, lambda: make_block_names(mj, model, blocks.ints[2 * m + 1 :], m)),
+        "angular": find_angular_rows(mj, model, blocks.ints[2 * m + 1 :], m),
     }  # fmt: skip
 
 
@@ -509,6 +511,36 @@ def get_row_scales(blocks: Any) -> FloatArray:
     """Return the factor of each row (m,) of the blocks of `make_blocks`."""
     scale: FloatArray = blocks.numbers[5 * blocks.n_rows : 6 * blocks.n_rows]
     return scale
+
+
+def find_angular_rows(mj: Any, model: Any, ints: IntArray, m: int) -> npt.NDArray[np.bool_] | None:
+    """Return which of m rows measure an angular velocity [rad/s], None if only contacts do; `ints` as below.
+
+    These are limits and friction of rotating joints, equalities of hinges, and the last three rows of a weld.
+    """
+    kinds, joints = mj.mjtConstraint, mj.mjtJoint
+    types, ids = ints[:m], ints[m : 2 * m]
+    rows = np.flatnonzero(types <= int(kinds.mjCNSTR_LIMIT_JOINT))
+    if not len(rows):
+        return None
+    types, ids, index = types[rows], ids[rows], np.arange(len(rows))
+    begins = np.append(True, (types[1:] != types[:-1]) | (ids[1:] != ids[:-1]))
+    place = index - np.maximum.accumulate(np.where(begins, index, 0))  # Number of a row in its equality.
+    joint, axis = np.full(len(rows), -1), np.zeros(len(rows), int)
+    is_limit, is_friction = types == int(kinds.mjCNSTR_LIMIT_JOINT), types == int(kinds.mjCNSTR_FRICTION_DOF)
+    is_equality = types == int(kinds.mjCNSTR_EQUALITY)
+    joint[is_limit] = ids[is_limit]
+    joint[is_friction] = model.dof_jntid[ids[is_friction]]
+    axis[is_friction] = ids[is_friction] - model.jnt_dofadr[joint[is_friction]]
+    equality = np.where(is_equality, model.eq_type[np.where(is_equality, ids, 0)] if model.neq else -1, -1)
+    of_joints = equality == int(mj.mjtEq.mjEQ_JOINT)
+    joint[of_joints] = model.eq_obj1id[ids[of_joints]]
+    kind = np.where(joint >= 0, model.jnt_type[joint], int(joints.mjJNT_SLIDE))
+    rotates = (kind == int(joints.mjJNT_BALL)) | (kind == int(joints.mjJNT_HINGE))
+    rotates |= (kind == int(joints.mjJNT_FREE)) & (axis >= 3)
+    angular = np.zeros(m, bool)
+    angular[rows] = rotates | ((equality == int(mj.mjtEq.mjEQ_WELD)) & (place >= 3))
+    return angular
 
 
 def make_block_names(

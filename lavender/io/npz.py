@@ -121,6 +121,8 @@ def write_npz(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = 
         operator, arrays["A"] = "dense", problem.matrix
     stored = {"compliance": problem.compliance, "guess": problem.guess, "key": problem.key}
     arrays |= {name: x for name, x in stored.items() if x is not None}
+    if problem.angular is not None:
+        arrays["angular"] = problem.angular.astype(np.int8)
     if impulse is not None:
         arrays["impulse"] = problem.impulse_array(impulse)
     names = None if problem.names is None else list(problem.names)
@@ -161,7 +163,7 @@ def _read_own_format(archive: Arrays) -> Stored:
     # Check the number of rows before bounds of that length are allocated.
     if b.ndim != 1 or ptr.ndim != 1 or len(ptr) == 0 or ptr[-1] != len(b):
         raise InputError(f"b has shape {b.shape}; cones.ptr must end with the number of its rows")
-    parts: dict[str, Any] = {name: archive[name] for name in ("guess", "key") if name in archive}
+    parts: dict[str, Any] = {name: archive[name] for name in ("guess", "key", "angular") if name in archive}
     if meta["operator"] in ("rows", "generalized"):
         parts["compliance"] = archive["compliance"]
     if meta["operator"] == "rows":

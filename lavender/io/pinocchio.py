@@ -116,7 +116,7 @@ def from_pinocchio(
         pin.computeJointJacobians(model, data, q)
         data.q_in = q  # Pinocchio evaluates joint limits at q_in, which none of its algorithms sets.
     pairs = zip(constraint_models, constraint_datas, strict=True)
-    rows, target, cones, names = _convert_constraints(model, data, pairs, dt, correction)
+    rows, target, cones, names, angular = _convert_constraints(model, data, pairs, dt, correction)
     if level == "acceleration":
         kinds = {type(_unwrap_constraint(constraint)).__name__ for constraint in constraint_models}
         if kinds - ANCHORS:
@@ -134,6 +134,7 @@ def from_pinocchio(
         compliance=compliance,
         friction=friction,
         names=names,
+        angular=angular,
         name=name,
     )
 
@@ -155,12 +156,12 @@ def _differentiate_constraint_velocity(pin: Any, model: Any, constraints: Any, q
 
 def _convert_constraints(
     model: Any, data: Any, pairs: Iterable[Any], dt: float, correction: float
-) -> tuple[Any, Any, Cones, list[str]]:
-    """Return J (m, nv), targets (m,), the blocks and their names of all constraints, one after the other."""
+) -> tuple[Any, Any, Cones, list[str], list[bool]]:
+    """Return J (m, nv), targets (m,), blocks, their names, and which rows are angular, of all constraints in order."""
     nv = int(model.nv)
     rows: list[Any] = [np.zeros((0, nv))]
     targets: list[Any] = [np.zeros(0)]
-    cones, names = Cones.free(0), []
+    cones, names, angular, rotates = Cones.free(0), [], [], _find_angular_velocities(model)
     for i, (wrapped_model, wrapped_data) in enumerate(pairs):
         model_of = _unwrap_constraint(wrapped_model)
         _check_constraint(i, model, model_of, _unwrap_constraint(wrapped_data))
@@ -178,12 +179,28 @@ def _convert_constraints(
         if hasattr(model_of, "desired_constraint_velocity"):
             target = target + np.array(model_of.desired_constraint_velocity)[order]
         rows.append(jac[order])
+        kind = type(model_of).__name__
+        if kind.startswith("Joint"):  # Each row is one velocity of a joint.
+            angular += [bool(rotates[row != 0.0].any()) for row in jac]
+        else:
+            angular += [kind == "FrameAnchorConstraintModel" and k >= 3 for k in range(len(jac))]
         targets.append(target)
         cones = cones + own_cones
-        word = f"{type(model_of).__name__.removesuffix('ConstraintModel')} {i}"
+        word = f"{kind.removesuffix('ConstraintModel')} {i}"
         blocks = own_cones.n_blocks
         names += [word] if blocks == 1 else [f"{word}, row {k}" for k in range(blocks)]
-    return np.concatenate(rows), np.concatenate(targets), cones, names
+    return np.concatenate(rows), np.concatenate(targets), cones, names, angular
+
+
+def _find_angular_velocities(model: Any) -> Any:
+    """Return which velocities (nv,) of a model are angular [rad/s]."""
+    angular = np.zeros(int(model.nv), bool)
+    for joint in list(model.joints)[1:]:
+        name, first, count = joint.shortname().removeprefix("JointModel"), int(joint.idx_v), int(joint.nv)
+        rotates = name.startswith(("R", "Spherical", "Universal", "Helical", "H"))
+        begin = 0 if rotates else {"FreeFlyer": 3, "Planar": 2}.get(name, count)
+        angular[first + begin : first + count] = True
+    return angular
 
 
 def _check_arguments(models: Any, datas: Any, dt: Any, correction: Any) -> tuple[float, float]:

@@ -45,7 +45,7 @@ def describe_answer(problem: Problem, impulse: Any, threshold: float) -> dict[st
     """Return the entries of a line of `engine.jsonl` that follow from a problem and the engine's impulse (m,) [N s]."""
     judged = residual(problem, impulse, threshold=threshold)
     return {
-        "rows": problem.m, "relative": judged.relative, "velocity": judged.velocity, "worst": judged.worst_name,
+        "rows": problem.m, "relative": judged.relative, "velocity": judged.velocity, "worst": judged.worst_label,
         "floor": judged.roundoff_floor, "verdict": judged.verdict, "precision": problem.precision,
         "threshold": threshold,
     } | ({"lost_digits": judged.lost_digits} if judged.lost_digits else {}) | (

@@ -262,6 +262,16 @@ class Residual:
         return self._problem.row_name(self.worst_row) if self.worst_row >= 0 else ""
 
     @property
+    def velocity_unit(self) -> str:
+        """Unit of `velocity`: "m/s", or "rad/s" if the worst row is angular and its error is not converted."""
+        return self._problem.row_unit(self.worst_row) if self.worst_row >= 0 else "m/s"
+
+    @property
+    def worst_label(self) -> str:
+        """`worst_name`, followed by " [rad/s]" if that is the unit of `velocity`: for tables of errors in m/s."""
+        return self.worst_name + (" [rad/s]" if self.velocity_unit == "rad/s" else "")
+
+    @property
     def velocity_by_row(self) -> FloatArray:
         """Velocity error sqrt(nu d) |e| of each row (m,) [m/s]; the tangents of a pair are separate."""
         p = self._problem
@@ -288,12 +298,16 @@ class Residual:
         return {
             "relative residual": f"{self.relative:.2e}",
             "energy": f"{self.energy:.2e} √J",
-            "worst row": f"{self.worst_name}, {self.velocity:.2g} m/s",
+            "worst row": f"{self.worst_name}, {self.velocity:.2g} {self.velocity_unit}",
             f"floor of {self.precision}": f"{self.roundoff_floor:.1e}",
         }
 
     def __str__(self) -> str:
-        worst = f", worst {self.worst_name} ({self.velocity:.2g} m/s)" if self.worst_row >= 0 else ""
+        worst = (
+            f", worst {self.worst_name} ({self.velocity:.2g} {self.velocity_unit})"
+            if self.worst_row >= 0
+            else ""
+        )
         text = f"relative {self.relative:.2e}, energy {self.energy:.2e} sqrt(J){worst}, floor {self.roundoff_floor:.1e}"
         if self.moved_by == "acceleration":
             text += "; judged by its acceleration, which moves the bodies"

@@ -422,8 +422,10 @@ class Solution:
         figure, axes = _make_figure("Solution.plot", 1 if self.history is None else 2)
         error = self.residual.velocity_by_row
         worst = np.argsort(-error, kind="stable")[: check_int("rows", rows, 1)][::-1]
-        axes[0].barh([self.residual._problem.row_name(int(i)) for i in worst], error[worst])
-        axes[0].set(xlabel="velocity error [m/s]", title=f"{self.solver.name}: {self.status.name}")
+        problem = self.residual._problem
+        names = [f"{problem.row_name(int(i))} [{problem.row_unit(int(i))}]" for i in worst]
+        axes[0].barh(names, error[worst])
+        axes[0].set(xlabel="velocity error", title=f"{self.solver.name}: {self.status.name}")
         if self.history is not None:
             self.history._draw(axes[1])
         return figure

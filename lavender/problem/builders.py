@@ -37,6 +37,7 @@ class NewProblemOptions(TypedDict, total=False):
     guess: ArrayLike | None
     precision: str
     copy: bool
+    angular: ArrayLike | None
 
 
 class ProblemOptions(NewProblemOptions, total=False):
@@ -342,7 +343,7 @@ class Builders(Operators):
         names, dof_names : sequence of str (k,), (nv,), optional
             Names of blocks and of velocities.
         **more
-            Keywords of `Problem`: name, guess, ...
+            Keywords of `Problem`: name, guess, angular (which rows are in rad/s), ...
 
         Examples
         --------

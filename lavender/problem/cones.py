@@ -398,6 +398,15 @@ class Cones:
         mask[self.ptr[:-1]] = False
         return mask
 
+    @cached_property
+    def angular_rows(self) -> npt.NDArray[np.bool_]:
+        """Whether each row (m,) is a spin or rolling row, so that its velocity is angular."""
+        mask = np.zeros(self.n_rows, bool)
+        rolling = self.rolling_rows[self.rolling_rows >= 0]
+        mask[np.concatenate([self.spin_rows[self.spin_rows >= 0], rolling, rolling + 1])] = True
+        mask.setflags(write=False)
+        return mask
+
     @property
     def normal_rows(self) -> IntArray:
         """Normal row of each contact (c,)."""

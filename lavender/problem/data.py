@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from lavender.base.arrays import (
     ArrayLike,
@@ -99,13 +100,14 @@ class ProblemData:
     generalized: Generalized | None = None
     precision: str = ""
     qp: Any = field(default=None, repr=False, compare=False)
+    angular: Any = None
     derived: Derived = field(init=False, repr=False)
 
     def __init__(
         self, b: ArrayLike, cones: Cones, matrix: Any = None, rows: Rows | None = None, friction: str = "coulomb",
         compliance: ArrayLike | None = None, guess: ArrayLike | None = None, key: Any = None,
         names: Sequence[str] | None = None, name: str = "", copy: bool = True, generalized: Generalized | None = None,
-        precision: str = "", qp: Any = None,
+        precision: str = "", qp: Any = None, angular: ArrayLike | None = None,
     ) -> None:  # fmt: skip
         if not isinstance(cones, Cones):
             raise InputError(
@@ -139,7 +141,8 @@ class ProblemData:
         fields.update({
             "b": rhs, "cones": cones, "matrix": matrix, "rows": rows, "friction": friction, "compliance": None,
             "guess": None, "key": None, "names": names, "name": str(name), "copy": True, "generalized": generalized,
-            "precision": precision, "qp": qp, "derived": Derived(), "law": _find_law(cones, friction),
+            "precision": precision, "qp": qp, "angular": angular, "derived": Derived(),
+            "law": _find_law(cones, friction),
         })  # fmt: skip
         if matrix is None:
             fields["compliance"] = _convert_compliance(compliance, m, copy)
@@ -166,6 +169,8 @@ class ProblemData:
             check_finite("guess [N s]", fields["guess"])
         if key is not None:
             fields["key"] = _convert_keys(key, k)
+        if angular is not None:
+            fields["angular"] = _convert_flags(angular, m)
         if names is not None and not (isinstance(names, Names) and len(names) == k):
             fields["names"] = as_names("blocks", names, k)
         self._check_magnitudes()
@@ -313,6 +318,35 @@ class ProblemData:
             return f"{name}, roll {row - roll + 1}"
         return f"{name}, spin" if row == spin else f"{name}, tangent {offset}"
 
+    @cached_property
+    def angular_rows(self) -> npt.NDArray[np.bool_]:
+        """Whether the velocity of each row (m,) is angular [rad/s].
+
+        Spin and rolling rows are, rows of joints without a linear part, and the rows that the field `angular` declares.
+        """
+        mask = np.zeros(self.m, bool) if self.angular is None else self.angular.copy()
+        mask |= self.cones.angular_rows
+        if self.rows is not None:
+            linear = self.rows.jac.reshape(-1, 4, 3)[:, ::2]
+            mask[: len(linear)] |= ~linear.any(axis=(1, 2)) & self.rows.jac.any(axis=1)
+        mask.setflags(write=False)
+        return mask
+
+    def row_unit(self, row: int) -> str:
+        """Return the unit of a row's velocity error: "m/s", or "rad/s" on an angular row with nu = d.
+
+        Raises
+        ------
+        InputError
+            The problem has no such row.
+        """
+        block = self.block_of(row)
+        is_converted = bool(self.cones.is_contact[block])
+        if self.rows is not None and block < self.rows.n_joints:
+            bodies = self.rows.joint_body[block]
+            is_converted = bool(self.rows.inv_mass[bodies[bodies >= 0]].any())
+        return "rad/s" if self.angular_rows[row] and not is_converted else "m/s"
+
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, ProblemData):
             return NotImplemented
@@ -379,6 +413,18 @@ def _convert_keys(key: Any, k: int) -> np.ndarray:
     return mark_read_only(array.astype(np.uint64))
 
 
+def _convert_flags(angular: ArrayLike, m: int) -> npt.NDArray[np.bool_]:
+    """Convert the flags of angular rows to bool, read-only; raise InputError for other numbers than 0 and 1."""
+    values = as_array("angular", angular, (m,))
+    if not np.isin(values, (0.0, 1.0)).all():
+        raise InputError(
+            f"angular holds {values[~np.isin(values, (0.0, 1.0))][0]:g}; True or False is needed for each row"
+        )
+    mask = values.astype(bool)
+    mask.setflags(write=False)
+    return mask
+
+
 def check_rhs(b: FloatArray) -> None:
     """Raise InputError unless b [m/s] is finite and in range, and max |b_i| is 0 or at least MIN_MAGNITUDE."""
     if not is_rhs_valid(b):
@@ -390,7 +436,7 @@ def check_rhs(b: FloatArray) -> None:
         )
 
 
-for _name in ("b", "cones", "generalized", "compliance", "key", "names"):
+for _name in ("b", "cones", "generalized", "compliance", "key", "names", "angular"):
     setattr(ProblemData, _name, late_field(_name))  # Importers postpone these fields.
 ProblemData.__init__.__qualname__ = "Problem.__init__"  # Makes a TypeError name the class that users call.
 

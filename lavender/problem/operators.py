@@ -31,6 +31,7 @@ MAX_INDEXABLE_ENTRIES = 2**31  # A with this many entries or more is not formed:
 SHARED_ARRAYS = ("csr", "jacobian", "whitened", "bandwidth", "_compressed", "_couplings", "_matrix_asymmetry")
 FIELDS_BESIDES_RHS = (
     "cones", "matrix", "rows", "friction", "compliance", "key", "names", "name", "copy", "precision", "law",
+    "angular",
 )  # fmt: skip
 # Key in `Derived.cache` of the values of FIELDS_BESIDES_RHS, for the next problem with another b.
 BESIDES_RHS_KEY = "lavender.problem.operators: fields besides b"

@@ -84,6 +84,9 @@ class Problem(Builders):
     precision : {"float64", "float32"}, optional
         Precision in which an engine computed these numbers and its answers. `lavender.residual` derives from it the
         error that rounding alone can cause. Default: the precision of `rows`. Problems are always solved in float64.
+    angular : (m,) bool, optional
+        Rows whose velocity is angular [rad/s], such as those of hinges, for the units of texts: see `row_unit`. Bodies
+        and contacts show it themselves; it is needed for bounded rows of J and M.
     qp : QuadraticProgram, optional
         Quadratic program from which `Problem.from_qp` built this problem; files contain it only if P is singular.
 
@@ -221,7 +224,7 @@ class Problem(Builders):
         s, cones = self.cones.stretch, self.cones.ellipses_replaced_by_disks
         guess = None if self.guess is None else self.on_disk(self.guess)
         more: dict[str, Any] = {"guess": guess, "key": self.key, "names": self.names, "name": self.name}
-        more |= {"friction": self.friction, "precision": self.precision}
+        more |= {"friction": self.friction, "precision": self.precision, "angular": self.angular}
         if self.generalized is None:
             indptr, indices, data = self._compressed
             data = np.repeat(s, np.diff(indptr)) * data * s[indices]
@@ -275,6 +278,7 @@ class Problem(Builders):
             name=self.name,
             copy=False,
             precision=self.precision,
+            angular=self.angular_rows,
             **more,
         )
 

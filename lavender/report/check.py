@@ -358,7 +358,7 @@ def compare_with_reference(
     elif solution.status is Status.INFEASIBLE:
         verdict = PROVED if solution.impulse_bound == np.inf else NEAR_NONE
     elif r.nothing_to_do and r.verdict != WRONG:
-        units = f"{format_residual(r.velocity)} m/s, {format_residual(r.energy)} sqrt(J)"
+        units = f"{format_residual(r.velocity)} {r.velocity_unit}, {format_residual(r.energy)} sqrt(J)"
         verdict, note = NOTHING_TO_DO, f"{units}; {note}".rstrip("; ")
     elif not (solution.success or r.at_floor):
         verdict = NOT_SOLVED

@@ -272,7 +272,7 @@ def make_row(
         times, status=s.status.name, relative=float(r.relative), error_energy=float(r.energy),
         velocity=float(r.velocity), roundoff_floor=float(r.roundoff_floor),
         energy_change=problem.energy_change(s.impulse) if is_known else math.nan, worst_row=int(r.worst_row),
-        worst_name=r.worst_name, success=bool(s.success) and task.mode == "tol", claim_check=s.claim_check,
+        worst_name=r.worst_label, success=bool(s.success) and task.mode == "tol", claim_check=s.claim_check,
         status_conflict="; ".join(filter(None, (s.status_conflict, observed))),
         claims=s.status in CLAIM_STATUSES, iterations=int(s.iterations),
         work=json.dumps({k: int(v) for k, v in s.work.items()}), form=s.solver.form, message=s.message[:500],

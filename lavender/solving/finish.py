@@ -342,5 +342,6 @@ def decide_empty_rows(
     y[worst] = math.copysign(1.0, b)
     if prove_infeasibility(problem, y, tol).reason:
         return None  # b of these rows is negligible, so that the answer can meet tol.
-    message = f"{problem.row_name(worst)}: its row of A is zero, so nothing can meet b = {b:.3g} m/s"
+    unit = "rad/s" if problem.angular_rows[worst] else "m/s"
+    message = f"{problem.row_name(worst)}: its row of A is zero, so nothing can meet b = {b:.3g} {unit}"
     return message, y, impossible

@@ -56,6 +56,9 @@ def test_from_kamino_problems_equal_the_matrix_of_the_engine(model):
         assert problem.cones.is_contact.sum() == contacts
         assert (problem.cones.mu[problem.cones.is_contact] > 0.0).all()
         assert len(problem.names) == problem.cones.n_blocks
+        linear = problem.jacobian[:, np.arange(problem.generalized.nv) % 6 < 3]  # Velocities of bodies.
+        is_angular = [problem.row_unit(k) == "rad/s" for k in range(problem.m)]
+        assert is_angular == [not x.any() for x in linear.toarray()]
 
 
 @pytest.mark.parametrize("model", ["mixed", "dvi"])

@@ -109,6 +109,20 @@ def test_from_pinocchio_measures_joint_limits_at_q():
         np.testing.assert_allclose(problem.jacobian.toarray()[:, k], (ahead - behind) / 2e-6, atol=1e-7)
 
 
+@pytest.mark.parametrize(
+    ("kind", "units"), [("RX", "r"), ("PZ", "m"), ("RUBX", "r"), ("Spherical", "rrr"), ("FreeFlyer", "mmmrrr")]
+)
+def test_from_pinocchio_rows_of_joints_and_anchors_have_the_unit_of_their_velocity(kind, units):
+    model = pin.Model()
+    joint = model.addJoint(0, getattr(pin, f"JointModel{kind}")(), pin.SE3.Identity(), "joint")
+    model.appendBodyToJoint(joint, pin.Inertia(1.0, np.zeros(3), np.eye(3)), pin.SE3.Identity())
+    model.lowerDryFrictionLimit[:], model.upperDryFrictionLimit[:] = -1.0, 1.0
+    friction = pin.JointFrictionConstraintModel(model, [joint])
+    frame = pin.FrameAnchorConstraintModel(model, 0, pin.SE3.Identity(), joint, pin.SE3.Identity())
+    problem = problem_of(model, [friction, frame], pin.neutral(model), np.zeros(model.nv))
+    assert "".join(problem.row_unit(i)[0] for i in range(problem.m)) == units + "mmmrrr"
+
+
 KINDS = (
     "RX", "PZ", "RUBX", "Spherical", "SphericalZYX", "Planar", "Translation", "FreeFlyer", "RevoluteUnaligned",
 )  # fmt: skip
