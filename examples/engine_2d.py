@@ -58,7 +58,7 @@ def simulate():
             if gap < MAX_GAP:
                 builder.contact(*contact, gap=gap, mu=FRICTION, feature=feature)
         problem = builder.problem()
-        solution = lv.solve(problem, impulse=problem.carry(solution) if solution else None)
+        solution = lv.solve(problem, impulse=solution)
         velocity = builder.velocity_after(problem, solution.impulse)
         position, angle = position + DT * velocity[:, :2], angle + DT * velocity[:, 2]
         frames.append(position)

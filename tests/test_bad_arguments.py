@@ -126,7 +126,7 @@ OF_LCP = LIMITS | {
 }  # fmt: skip
 
 add(OF_LCP, lv.Problem.linear, lv.Problem.lcp, LCP.block_of, LCP.row_name, LCP.row_unit, LCP.block_name, LCP.carry,
-    LCP.impulse_array, LCP.slack, LCP.updated, lv.solve, lv.prepare, lv.explain, lv.known, lv.available,
+    LCP.make_start, LCP.slack, LCP.updated, lv.solve, lv.prepare, lv.explain, lv.known, lv.available,
     lv.get("pgs").refuses, lv.get("gauss_seidel").standing_in, lv.redundancy, lv.motion_error,
     lv.solve(LCP, tol=1e-12).motion_error, report.carry_impulses, report.classify_structure)  # fmt: skip
 add(LIMITS | {"problem": LCP, "impulse": B}, ("solve", lv.solve), lv.prepare(LCP, "pgs").solve)

@@ -296,8 +296,11 @@ class Batch(Sequence[Problem]):
         return clip_zero_to_bounds(self.cones.lower[rows], self.cones.upper[rows])
 
     def flatten_impulses(self, name: str, value: Any) -> FloatArray:
-        """Convert impulses [N s] of the batch's shape to a new flat array; numbers need not be finite."""
-        array = as_array(name, value, self.shape, finite=False, unit="N s")
+        """Convert impulses [N s] of the batch's shape, or a result for such a batch, to a new flat array.
+
+        Numbers need not be finite.
+        """
+        array = as_array(name, getattr(value, "impulse", value), self.shape, finite=False, unit="N s")
         return array.reshape(-1).copy()
 
     def make_kernel_worlds(self, impulse: FloatArray, velocity: FloatArray, cold: bool) -> Worlds:

@@ -16,7 +16,6 @@ import numpy as np
 from lavender.base.array_libraries import find_converter
 from lavender.base.arrays import (
     FloatArray,
-    as_array,
     check_choice,
     check_float,
     check_int,
@@ -385,6 +384,6 @@ def convert_impulses_or_guesses(problems: Any, impulses: Any) -> list[Any]:
             "is needed"
         )
     return [
-        p.guess if x is None else as_array(f"impulses of world {i}", x, (p.m,), finite=False, unit="N s")
+        p.guess if x is None else p.make_start(x, f"impulses of world {i}", finite=False)
         for i, (p, x) in enumerate(zip(problems, impulses, strict=True))
     ]

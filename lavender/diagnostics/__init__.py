@@ -78,7 +78,7 @@ def diagnose(
     """
     check_problem(problem)
     state = motion.check_state_arguments(problem, velocity, gap, dt)
-    solution = problem.guess if impulse is None else problem.impulse_array(impulse)
+    solution = problem.guess if impulse is None else problem.make_start(impulse)
     with np.errstate(all="ignore"):  # Comparisons with numbers beyond float64 are false.
         cached = problem.derived.cache.get(__name__)
         if cached is None:

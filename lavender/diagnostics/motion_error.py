@@ -16,7 +16,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, mark_read_only
 from lavender.judge.residuals import Residual, residual
-from lavender.judge.solution import Solution, raise_if_interrupted
+from lavender.judge.solution import raise_if_interrupted
 from lavender.problem import Problem, check_problem
 from lavender.solving.solve import solve
 
@@ -138,12 +138,10 @@ def motion_error(problem: Problem, impulse: Any, reference: Any = None) -> Motio
         An impulse or reference has a wrong length or is not finite.
     """
     check_problem(problem)
-    x = problem.impulse_array(impulse)
+    x = problem.make_start(impulse)
     if reference is None:
         reference = _solve_reference(problem, x)
-    elif isinstance(reference, Solution):
-        reference = reference.impulse
-    reference = mark_read_only(np.array(problem.impulse_array(reference, "reference")))
+    reference = mark_read_only(np.array(problem.make_start(reference, "reference")))
     # Numbers that are not finite are None; `note` names them.
     with np.errstate(over="ignore", invalid="ignore"):
         return _compute_error(problem, x, reference)

@@ -612,7 +612,7 @@ def derivative(problem: Problem, solution: Any) -> Derivative:
     [-1.0]
     """
     check_problem(problem)
-    impulse = problem.impulse_array(getattr(solution, "impulse", solution))
+    impulse = problem.make_start(getattr(solution, "impulse", solution))
     linear = judge_and_linearise_impulse(problem, impulse, MAX_KERNEL_ROWS)
     if not linear.above_floor <= MAX_ACCEPTED_RESIDUAL:
         error = residual(problem, impulse, "float64")

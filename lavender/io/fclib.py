@@ -186,7 +186,7 @@ def read(path: str | os.PathLike[str]) -> Stored:
         ) from None
     try:
         problem = file.build_problem(Path(path).stem)
-        guesses = tuple(problem.impulse_array(_join_impulse(g), "guess") for g in file.guesses)
+        guesses = tuple(problem.make_start(_join_impulse(g), "guess") for g in file.guesses)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     point = file.solution
@@ -334,7 +334,7 @@ def _write_file(out: Any, problem: Problem, impulse: Any) -> None:
 
 def _write_point(out: Any, name: str, problem: Problem, impulse: Any) -> None:
     """Write a group with an impulse and its slack."""
-    lam = problem.impulse_array(impulse)
+    lam = problem.make_start(impulse)
     _write_arrays(out.create_group(name), {"r": lam, "u": problem.slack(lam)})
 
 

@@ -124,7 +124,7 @@ def write_npz(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = 
     if problem.angular is not None:
         arrays["angular"] = problem.angular.astype(np.int8)
     if impulse is not None:
-        arrays["impulse"] = problem.impulse_array(impulse)
+        arrays["impulse"] = problem.make_start(impulse)
     names = None if problem.names is None else list(problem.names)
     meta: dict[str, Any] = {
         "operator": operator,
@@ -297,7 +297,7 @@ def _build_box_cones(archive: Arrays, m: int) -> Cones:
 
 
 def _read_vector(archive: Arrays, name: str, problem: Problem) -> FloatArray | None:
-    return problem.impulse_array(archive[name], f"entry {name!r}") if name in archive else None
+    return problem.make_start(archive[name], f"entry {name!r}") if name in archive else None
 
 
 def _read_matrix(archive: Arrays) -> Any:

@@ -57,7 +57,6 @@ from lavender.base.arrays import (
     ArrayLike,
     FloatArray,
     IntArray,
-    as_array,
     check_choice,
     check_float,
     format_html_table,
@@ -475,8 +474,8 @@ def residual(
     Parameters
     ----------
     problem : Problem
-    impulse : (m,), N s
-        Entries that are not finite are allowed and give an infinite relative residual.
+    impulse : (m,), N s, Solution, or (Problem, impulse)
+        See `Problem.make_start`. Entries that are not finite are allowed and give an infinite relative residual.
     precision : {"float64", "float32"}, optional
         Precision in which the impulse was computed. It determines the floor and therefore the verdict. Default:
         `problem.precision`. The error itself is always measured in float64.
@@ -509,7 +508,7 @@ def residual(
     check_problem(problem)
     precision = problem.precision if precision is None else check_choice("precision", precision, PRECISIONS)
     if type(impulse) is not np.ndarray or impulse.dtype != float or not impulse.flags.c_contiguous:
-        impulse = as_array("impulse", impulse, (None,), finite=False, unit="N s")
+        impulse = problem.make_start(impulse, finite=False)
     if impulse.shape != (problem.m,):
         raise InputError(f"impulse has shape {impulse.shape}; ({problem.m},) is needed")
     if problem.cones.has_ellipse:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -245,25 +245,43 @@ class ProblemData:
         """Problem class, determined by the blocks: "linear", "lcp", "coulomb" or "cone"."""
         return _find_law(self.cones, self.friction)
 
-    def impulse_array(self, impulse: ArrayLike, name: str = "impulse") -> FloatArray:
-        """Return a writable copy of `impulse` (m,) [N s]; raise InputError if it has a wrong shape or is not finite."""
+    if TYPE_CHECKING:
+
+        def carry(self, previous: Any, keys: Any = None) -> FloatArray: ...  # noqa: D102
+
+    def make_start(self, impulse: Any, name: str = "impulse", finite: bool = True) -> FloatArray:
+        """Return the impulse (m,) [N s] that an argument `impulse=` of any function means, as a writable array.
+
+        Parameters
+        ----------
+        impulse : (m,) N s, Solution, or (Problem, impulse)
+            Impulses of an earlier problem are assigned to the blocks by their keys (`carry`).
+        name : str
+            Name of the argument in messages.
+        finite : bool
+            Whether to reject numbers that are not finite.
+
+        Raises
+        ------
+        InputError
+            The array has a wrong shape or is not finite, or the impulses cannot be assigned to the blocks.
+        """
         if type(impulse) is np.ndarray and impulse.dtype == np.float64 and impulse.shape == self.b.shape:
             copied = impulse.copy()
-            if measure.all_finite(copied):
+            if not finite or measure.all_finite(copied):
                 return copied
-        if hasattr(impulse, "impulse"):
-            raise InputError(
-                f"{name} is a {type(impulse).__name__}; an array (m,) in N s is needed: give its .impulse, or "
-                "problem.carry(solution) if the problem has keys"
-            )
+        is_pair = isinstance(impulse, tuple) and len(impulse) == 2 and isinstance(impulse[0], ProblemData)
+        if is_pair or (hasattr(impulse, "impulse") and hasattr(impulse, "residual")):
+            return self.carry(impulse)
         shape = get_shape(name, impulse)
         if len(shape) == 1 and shape != self.b.shape and name == "impulse":
             raise InputError(
                 f"impulse [N s] has shape {shape}; {self.b.shape} is needed. If it is from a step with other contacts, "
-                "give problem.carry(solution), which assigns impulses to blocks by their keys"
+                "give the solution of that step, whose impulses are then assigned to blocks by their keys"
             )
         array = as_array(name, impulse, (self.m,), finite=False, unit="N s")
-        check_finite(f"{name} [N s]", array)
+        if finite:
+            check_finite(f"{name} [N s]", array)
         return array.copy()
 
     # -- names -----------------------------------------------------------------------------------

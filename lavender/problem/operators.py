@@ -343,7 +343,7 @@ class Operators(ProblemData):
     def slack(self, impulse: ArrayLike) -> FloatArray:
         """Compute w = A lambda - b (m,) [m/s] from the problem's data, for `impulse` (m,) [N s]."""
         w = np.empty(self.m)
-        measure.compute_slack(self.metric, self.impulse_array(impulse), w)
+        measure.compute_slack(self.metric, self.make_start(impulse), w)
         return w
 
     def velocity(self, impulse: ArrayLike) -> FloatArray:
@@ -362,7 +362,7 @@ class Operators(ProblemData):
                 "this problem was given as a matrix; velocities need J and M (make it with "
                 "Problem.from_rows or Problem.from_jacobian)"
             )
-        return general.v_free + self.compute_velocity_change(self.impulse_array(impulse))
+        return general.v_free + self.compute_velocity_change(self.make_start(impulse))
 
     def compute_velocity_change(self, impulse: FloatArray) -> FloatArray:
         """Compute M^-1 J^T x of impulses x (m,), in the shape of `velocity`; the problem is not given as a matrix."""
@@ -391,7 +391,7 @@ class Operators(ProblemData):
             relative = np.empty(self.m)
             multiply_body_jacobian(self.data, velocity, relative)
         with np.errstate(over="ignore", invalid="ignore"):  # Large impulses may overflow without a warning.
-            return float(0.5 * (self.impulse_array(impulse) @ relative))
+            return float(0.5 * (self.make_start(impulse) @ relative))
 
     def start(self) -> FloatArray:
         """Return Pi(0) (m,) [N s], the zero impulse clipped to the bounds, as a new array."""

@@ -100,6 +100,8 @@ class Problem(Builders):
     def carry(self, previous: Any, keys: Any = None) -> FloatArray:
         """Build a start (m,) [N s] from the impulses of the previous step, which are assigned to blocks by their keys.
 
+        `lavender.solve(problem, impulse=previous)` does the same.
+
         Blocks without a previous impulse, or with another kind or number of rows, start at Pi(0). Problems without keys
         must have the same blocks. Tangent impulses are not rotated: use the same tangent directions of a contact in
         every step.
@@ -130,11 +132,11 @@ class Problem(Builders):
         >>> second = lv.Problem.lcp(np.eye(2), [3.1, 5.0], key=np.array([9, 4]))  # one stays, one is new
         >>> second.carry(solution).tolist()
         [3.0, 0.0]
-        >>> lv.solve(second, impulse=second.carry(solution)).success
+        >>> lv.solve(second, impulse=solution).success
         True
         """
         if isinstance(previous, tuple) and len(previous) == 2 and isinstance(previous[0], Problem):
-            before, impulse = previous[0], previous[0].impulse_array(previous[1])
+            before, impulse = previous[0], previous[0].make_start(previous[1])
         elif hasattr(previous, "residual") and hasattr(previous, "impulse"):
             before, impulse = previous.residual._problem, previous.impulse  # pyright: ignore[reportAttributeAccessIssue]
         else:

@@ -188,7 +188,7 @@ class RowBuilder:
     >>> after = builder.velocity_after(problem, solution.impulse)  # (n, 3): v_x, v_y, omega
     >>> bool(abs(after[0, 1] - after[0, 2]) < 1e-8)  # the pendulum rotates about its hinge: v_y = omega x 1 m
     True
-    >>> again = lv.solve(problem, impulse=problem.carry(solution), tol=1e-10)  # warm start of the next step, by keys
+    >>> again = lv.solve(problem, impulse=solution, tol=1e-10)  # warm start of the next step, by keys
     >>> again.success
     True
     """
@@ -553,7 +553,7 @@ class RowBuilder:
         Returns
         -------
         Problem
-            `lv.solve(problem, impulse=problem.carry(previous))` starts from the solution of the step before.
+            `lv.solve(problem, impulse=previous)` starts from the solution of the step before.
         """
         is_box = check_shape("shape", shape) == "box"
         blocks, rows, b, compliance, keys = self._blocks.export(is_box)

@@ -195,7 +195,7 @@ class _Task:
         self.problem, self.spec, self.tol, self.deadline = problem, spec, tol, deadline
         self.max_iter, self.options = max_iter, options
         self.qp = problem.qp
-        self.start = None if start is None else problem.impulse_array(start)
+        self.start = None if start is None else problem.make_start(start)
         self.initial_x: FloatArray | None = None
         self.program = get_program(self.qp)
         self.judge = ProgramJudge(self.program, max(tol, MIN_TOL), deadline)

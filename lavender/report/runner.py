@@ -86,7 +86,7 @@ def carry_impulses(before: Problem, impulse: FloatArray, problem: Problem) -> Fl
     check_problem(problem)
     if not isinstance(before, Problem):
         raise InputError(f"before is a {type(before).__name__}; the problem of the previous step is needed")
-    start = problem._carry(before, before.impulse_array(impulse))[0]
+    start = problem._carry(before, before.make_start(impulse))[0]
     return problem.start() if start is None else start
 
 

@@ -107,7 +107,7 @@ def prepare(problem: Problem, solver: str = "auto", **options: Unpack[SolverOpti
 class SolveArguments(NamedTuple):
     """Checked arguments of one solve (`check_arguments`)."""
 
-    impulse: Any  # Start (m,) [N s] or None; it is checked with the problem that it belongs to.
+    impulse: Any  # None, or the argument of `Problem.make_start`.
     tol: float
     max_iter: int
     deadline: Deadline | None = None
@@ -284,8 +284,7 @@ class Prepared:
             check_problem(original)
         deadline, start = arguments.deadline, None
         if arguments.impulse is not None:
-            disk = original.disk
-            start = original.on_disk(disk.impulse_array(arguments.impulse))
+            start = original.on_disk(original.make_start(arguments.impulse))
         setup = self._setup
         if isinstance(setup, NotSetUp) or setup.is_used or original is not self._original:
             setup = self._set_up(original, deadline)

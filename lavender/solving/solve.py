@@ -47,8 +47,9 @@ def solve(
     problem : Problem
     solver : str
         A registered name; `available(problem)` lists the installed solvers that accept the problem.
-    impulse : (m,) N s, optional
-        Warm start. Default: `problem.guess`, otherwise zero clipped to the bounds.
+    impulse : (m,) N s, Solution, or (Problem, impulse); optional
+        Warm start; the solution of an earlier step is assigned to the blocks by their keys (`Problem.make_start`).
+        Default: `problem.guess`, otherwise zero clipped to the bounds.
     tol : float, default 1e-6
         Relative residual to reach: 0 for an exact solution, 1 for zero impulses (see `judge.residuals`). `tol=0` runs
         exactly `max_iter` iterations; `auto` and solvers that factor end earlier if nothing can be gained.
@@ -121,7 +122,7 @@ def _reject_solver(solver: Any) -> NoReturn:
     """Raise the error for a second argument that is not a name, with the keyword for which it is a value."""
     value = f"a {type(solver).__name__}"
     if isinstance(solver, Solution):
-        example = "impulse=problem.carry(solution)"
+        example = "impulse=solution"
     elif isinstance(solver, np.ndarray | list | tuple):
         example = "impulse=..."
     elif isinstance(solver, float):

@@ -491,7 +491,7 @@ def solve_compiled(problem, spec, impulse, tol, deadline=None):
     if impulse is None:
         first = problem.guess
     elif not is_plain_start(impulse, len(problem.b)):
-        first = problem.impulse_array(impulse)
+        first = problem.make_start(impulse)
     if view is not None and (<Data>view).blocks.n_rows:
         judged, counts = solve_new_generalized_problem(view, first, tol, small.limits, deadline)
         if judged is None and (<Data>view).reference_energy < 0.0:      # The reference of a row needs v*.
