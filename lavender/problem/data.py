@@ -277,7 +277,7 @@ class ProblemData:
         if len(shape) == 1 and shape != self.b.shape and name == "impulse":
             raise InputError(
                 f"impulse [N s] has shape {shape}; {self.b.shape} is needed. If it is from a step with other contacts, "
-                "give the solution of that step, whose impulses are then assigned to blocks by their keys"
+                "give the solution of that step: its impulses are assigned to blocks by their keys"
             )
         array = as_array(name, impulse, (self.m,), finite=False, unit="N s")
         if finite:

@@ -23,7 +23,7 @@ from lavender.report.drawing import (
     mark_errors,
 )
 from lavender.report.page import make_table
-from lavender.report.tables import PLAIN_SWEEPS, Contents, read_own_answers
+from lavender.report.tables import Contents, list_plain_sweeps, read_own_answers
 from lavender.report.text import format_count, format_percent, format_speed, format_time
 
 EQUAL_RATIO = 1.1  # Solvers whose errors differ by a smaller factor at every number of sweeps are one line.
@@ -63,7 +63,8 @@ class SweepStudy:
             else:
                 same.append(solver)
         enough = [g for g in self.groups if self._find_smallest(g[0])]
-        plain = [g for g in enough if g[0] in PLAIN_SWEEPS]
+        names = list_plain_sweeps()
+        plain = [g for g in enough if g[0] in names]
         best = min(plain or enough, key=lambda g: self._find_smallest(g[0]) or 0, default=self.groups[0])
         self.groups.remove(best)
         self.groups.insert(0, best)
@@ -289,4 +290,5 @@ class SweepStudy:
 
 def _place_plain(solver: str) -> tuple[bool, int]:
     """Return a sort key that puts the methods of most engines first."""
-    return solver not in PLAIN_SWEEPS, PLAIN_SWEEPS.index(solver) if solver in PLAIN_SWEEPS else 0
+    plain = list_plain_sweeps()
+    return solver not in plain, plain.index(solver) if solver in plain else 0

@@ -56,8 +56,7 @@ MIN_NOISE, MAX_NOISE = 0.05, 0.25
 ANSWER_TEXTS = ("file", "verdict", "solver", "worst")
 ANSWER_NUMBERS = ("rows", "relative", "seconds", "velocity", "iterations")
 LEFT_OUT = "left out"  # The verdict on a step that could not be recorded.
-# Methods with the sweeps of most engines: they are listed first, and recommended if one of them is enough.
-PLAIN_SWEEPS = ("sequential_impulses", "pgs", "block_gauss_seidel", "gauss_seidel", "sor", "jacobi")
+ENGINE_SWEEPS = ("sequential_impulses", "pgs")  # Methods of most engines, listed before other plain sweeps.
 MAX_TIES = 3  # A cell names up to this many solvers.
 PREFERRED_SOLVER = "auto"  # Listed first among equally good solvers, as its users need not choose a method.
 STRUCTURE_ORDER = (
@@ -613,6 +612,12 @@ def tabulate_sequences(report: Contents) -> Frame:
     return out
 
 
+def list_plain_sweeps() -> list[str]:
+    """Return the names of the solvers that sweep without acceleration, the methods of most engines first."""
+    own = [name for name, spec in registry.specs().items() if spec.plain_sweeps]
+    return [*ENGINE_SWEEPS, *(name for name in own if name not in ENGINE_SWEEPS)]
+
+
 def tabulate_sweeps(report: Contents) -> Frame:
     """Tabulate the largest errors over the steps of each sequence after fixed numbers of sweeps, cold and carried.
 
@@ -620,8 +625,8 @@ def tabulate_sweeps(report: Contents) -> Frame:
     the largest difference of a body's velocity from that of a solution, over about 20 steps of a sequence. The first
     step, which has no step before it, does not count. `steps` is the number of steps with all of these runs.
     """
-    sweeps = [name for name, spec in registry.specs().items() if spec.order and name not in PLAIN_SWEEPS]
-    order = [*PLAIN_SWEEPS, *sorted(sweeps)]
+    plain = list_plain_sweeps()
+    order = [*plain, *sorted(name for name, x in registry.specs().items() if x.order and name not in plain)]
     runs = report.frame[(report.frame["mode"] == "budget") & (report.frame["step"] > 0)]
     runs = runs[(runs["order"] == "given") & runs["solver"].isin(order)]
     if not len(runs):

@@ -32,11 +32,13 @@ from lavender.solvers.sweeping import (
 class BlockGaussSeidel(Sweeping):
     """Block Gauss-Seidel; `order`, `ground` and `seed` as in `lavender.problem.ordering`."""
 
+    keeps_last = True
+
     def _sweeps_over_matrix(self, problem: Problem) -> bool:
         return problem.rows is None and not is_sweep_over_jacobian_cheaper(problem)
 
     def _build_state(self, problem: Problem, order: Order, before: SweepState | None) -> SweepState:
-        return SweepState(problem, choose_sweep_data(problem), order, keeps_last=True, exact=True)
+        return SweepState(problem, choose_sweep_data(problem), order, keeps_last=self.keeps_last, exact=True)
 
     def _add_work_to_claim(self, state: SweepState, claim: Claim, fallbacks: int) -> Claim:
         return replace(claim, work={**claim.work, "fallbacks": fallbacks}, form=form_name(state.data))
@@ -45,6 +47,7 @@ class BlockGaussSeidel(Sweeping):
 SPEC = replace(
     SWEEPS,
     name="block_gauss_seidel",
+    plain_sweeps=True,
     factory=BlockGaussSeidel,
     round_cones=True,
     summary="Gauss-Seidel over contacts and joints, each solved exactly",

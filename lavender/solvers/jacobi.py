@@ -43,6 +43,7 @@ class Jacobi(SweepSolver):
 SPEC = replace(
     SWEEPS,
     name="jacobi",
+    plain_sweeps=True,
     factory=Jacobi,
     laws=SWEEPS.laws - {"cone"},
     box_friction_laws=frozenset({"coulomb"}),

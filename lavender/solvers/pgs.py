@@ -36,6 +36,8 @@ _NO_ORDER = np.empty(0, np.int32)
 class PGS(Sweeping):
     """Projected Gauss-Seidel; `order`, `ground` and `seed` as in `lavender.problem.ordering`."""
 
+    keeps_last = True
+
     def _add_work_to_claim(self, state: SweepState, claim: Claim, count: int) -> Claim:
         return replace(claim, form=form_name(state.data)) if state.data.is_general else claim
 
@@ -44,17 +46,18 @@ class PGS(Sweeping):
 
     def _build_state(self, problem: Problem, order: Order, before: Any) -> SweepState:
         if is_sweep_over_jacobian_cheaper(problem):
-            return SweepState(problem, problem.metric, order, keeps_last=True)
+            return SweepState(problem, problem.metric, order, keeps_last=self.keeps_last)
         data, (blocks, *rest) = problem.csr_data, make_order_plan(order)
         # In the given order, pass no order to the kernel: it then skips two lookups per row. The bits do not change.
         row_by_row = data.single_rows and order.is_given
         sweeps = serial.Sweeps(data, _NO_ORDER if row_by_row else blocks, *rest)
-        return SweepState(problem, data, order, sweeps, keeps_last=True)
+        return SweepState(problem, data, order, sweeps, keeps_last=self.keeps_last)
 
 
 SPEC = replace(
     SWEEPS,
     name="pgs",
+    plain_sweeps=True,
     factory=PGS,
     laws=SWEEPS.laws - {"cone"},
     box_friction_laws=frozenset({"coulomb"}),

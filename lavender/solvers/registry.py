@@ -101,9 +101,10 @@ class Solver:
         """
         raise NotImplementedError
 
-    lazy_modules: tuple[
-        str, ...
-    ] = ()  # Modules that a solve may import; under a time limit before its clock starts.
+    # Modules that a solve may import; under a time limit before its clock starts.
+    lazy_modules: tuple[str, ...] = ()
+    # Whether a failed run returns its last iterate under Coulomb's law (`lavender_ext/judge/best.pxd`).
+    keeps_last = False
 
     def cost(self, problem: Problem) -> Cost:
         """Estimate the costs [ns] from the size of the problem.
@@ -171,6 +172,8 @@ class SolverSpec:
         Whether the solver records `history`; requires `resumable` or `delegates`.
     delegates : bool
         Whether the solver calls other solvers (only "auto" does).
+    plain_sweeps : bool
+        Whether an iteration is one sweep without acceleration, as engines run a fixed number of.
     round_cones : bool
         Whether the solver accepts contacts of more than two tangents in one cone.
     box_friction_laws : set of str
@@ -231,6 +234,7 @@ class SolverSpec:
     callback: bool = True
     history: bool = True
     delegates: bool = False
+    plain_sweeps: bool = False
     round_cones: bool = False
     box_friction_laws: frozenset[str] = frozenset()
     supports_rolling: bool = False

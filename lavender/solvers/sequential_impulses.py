@@ -67,6 +67,8 @@ class ImpulseState(SweepState):
 class SequentialImpulses(Sweeping):
     """Matrix-free projected Gauss-Seidel; `order`, `ground` and `seed` as in `lavender.problem.ordering`."""
 
+    keeps_last = True
+
     def _sweeps_over_matrix(self, problem: Problem) -> bool:
         return False
 

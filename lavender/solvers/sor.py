@@ -26,7 +26,6 @@ class SOR(Sweeping):
         Relaxation, 0 < omega < 2.
     """
 
-    keeps_last = False  # Whether a failed run returns its last iterate (`lavender_ext/judge/best.pxd`).
     omega: float = 1.5
 
     def __post_init__(self) -> None:
@@ -45,6 +44,7 @@ class SOR(Sweeping):
 SPEC = replace(
     SWEEPS,
     name="sor",
+    plain_sweeps=True,
     factory=SOR,
     laws=frozenset({"linear"}),
     box_friction_laws=frozenset(),

@@ -3,6 +3,7 @@
 import ctypes as ct
 import dataclasses
 import itertools
+import re
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import random_problems as rp
 from clib import METHODS, Motion, Refused, run
 from tower import self_test_hash, self_test_problem
 from vectors import OTHER_BITS, NotSupported, is_accepted_by_library, run_compiled_newton
+from worked import ROOT
 
 import lavender as lv
 
@@ -100,6 +102,8 @@ def test_methods_are_numbered_and_named_as_in_the_header(library):
     assert sorted(METHODS.values()) == list(range(1, 13))
     for name, number in METHODS.items():
         assert library.c.lav_name(number).decode() == name
+    row = next(line for line in (ROOT / "docs" / "c.md").read_text().splitlines() if line.startswith("| methods |"))
+    assert sorted(re.findall(r"`(\w+)`", row)) == sorted(METHODS)
 
 
 @pytest.mark.parametrize("at", range(len(SWEPT)))

@@ -35,7 +35,7 @@ vector = st.lists(real, min_size=3, max_size=3) | st.lists(st.floats(-4.0, 4.0),
 GALLERY = {"stack": {"n": 3}, "pyramid": {"base": 3}, "card_house": {}, "pile": {"n": 12}, "chain": {"n": 6},
            "bridge": {"n": 4}, "heavy_on_light": {}, "table": {"legs": 4}, "ramp": {}, "spinner": {},
            "newtons_cradle": {}, "four_bar": {}}  # fmt: skip
-SOLVERS = ("newton", "auto", "pgs", "block_gauss_seidel", "nncg", "admm", "anderson", "jacobi")
+SOLVERS = [name for name in lv.available(external=False) if {"coulomb"} <= lv.get(name).laws]
 ORDERS = ("given", "reverse", "symmetric", "random", "colored", "bottom_up", "top_down")
 PARAMETERS = st.fixed_dictionaries({}, optional={
     "seed": st.integers(0, 3), "dt": st.sampled_from((1e-60, 1e-9, 1e-3, 0.1, 1.0, 1e6, 1e60)),

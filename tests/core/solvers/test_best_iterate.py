@@ -10,7 +10,7 @@ from lavender.judge.residuals import choose_start, combine_best_islands
 from lavender.solvers.islands import find_islands
 
 DT = 1.0 / 60.0
-SWEEPS = ("pgs", "sequential_impulses", "block_gauss_seidel", "nncg", "anderson")
+SWEEPS = lv.available(order=True, external=False)
 
 
 def pendulum(torque, target=4.0):

@@ -15,7 +15,7 @@ from lavender.problem.cones import project_impulse
 
 OWN = lv.available(external=False)
 #: Under Coulomb's law these return their last iterate, as in an engine.
-LAST_ITERATE = ("pgs", "sequential_impulses", "block_gauss_seidel", "gauss_seidel")
+LAST_ITERATE = [name for name in OWN if registry.get(name).load().keeps_last]
 TOL = 1e-6
 
 
