@@ -11,7 +11,7 @@ OK, NEED_CAPACITY = 0, 1
 
 
 class NewtonSteps:
-    """`step` after `step`; how each solve ended is in `ended` (0: short of tol), the last one's answer in `told`."""
+    """`step` after `step`; how each solve ended is in `ended` (0: short of tol), the last answer in `told`."""
 
     def __init__(self, name, *, warm_start=True, tol=TOL, **parameters):
         scene = lv.Scene(name, solver="newton", warm_start=warm_start, solver_iterations=16, **parameters)

@@ -35,7 +35,7 @@ class Call:
         return self.function(**self.arguments | changed)
 
 
-#: Patterns of names in messages, where they differ from those of the arguments.
+#: Patterns of names in messages, if they differ from the names of the arguments.
 NAMES = {
     "jac": "J|jac", "mass": "M|mass", "matrix": "A", "i": "index of worlds|block|i", "given": "impulse",
     "keys": "keys?",

@@ -21,7 +21,7 @@ sys.path.append(str(ROOT / "examples"))  # where they find `panels`
 
 @functools.cache
 def example(name):
-    """The module of an example; what its numbers() gives is computed once, whoever asks."""
+    """The module of an example; what its numbers() gives is computed once."""
     spec = importlib.util.spec_from_file_location(name, ROOT / "examples" / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)

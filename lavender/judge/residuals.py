@@ -361,7 +361,7 @@ def compute_verdict(
 def divide_by_reference(data: Any, energy: float, velocity: float, rows: Any = None) -> float:
     """Compute the relative residual of two errors [sqrt J, m/s]; inf if one is not finite or has no reference.
 
-    The references are those of the islands with the given rows (indices), by default of all islands.
+    The references belong to the islands with the given rows (indices), by default of all islands.
     """
     references = data.reference_energy, data.reference_velocity
     if rows is not None:
@@ -475,7 +475,7 @@ def residual(
     ----------
     problem : Problem
     impulse : (m,), N s, Solution, or (Problem, impulse)
-        See `Problem.make_start`. Entries that are not finite are allowed and give an infinite relative residual.
+        As in `Problem.make_start`. Entries that are not finite are allowed and give an infinite relative residual.
     precision : {"float64", "float32"}, optional
         Precision in which the impulse was computed. It determines the floor and therefore the verdict. Default:
         `problem.precision`. The error itself is always measured in float64.

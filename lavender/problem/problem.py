@@ -85,7 +85,7 @@ class Problem(Builders):
         Precision in which an engine computed these numbers and its answers. `lavender.residual` derives from it the
         error that rounding alone can cause. Default: the precision of `rows`. Problems are always solved in float64.
     angular : (m,) bool, optional
-        Rows with an angular velocity [rad/s], such as rows of hinges, for the units of texts: see `row_unit`. Bodies
+        Rows with an angular velocity [rad/s], such as rows of hinges, for the units of texts (`row_unit`). Bodies
         and contacts show it themselves; it is needed for bounded rows of J and M.
     qp : QuadraticProgram, optional
         Quadratic program from which `Problem.from_qp` built this problem; files contain it only if P is singular.

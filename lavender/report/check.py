@@ -258,7 +258,7 @@ def _check_solver(
 ) -> CrossCheckRow:  # fmt: skip
     """Run one solver and compare its solution with `optimum`.
 
-    `reason` says why the solver does not accept the problem; its bounded variant runs instead, if it has one.
+    `reason` explains why the solver does not accept the problem; its bounded variant runs instead, if it has one.
     """
     other = None if reason is None else specs()[name].standing_in(problem)
     if reason is not None and other is None:

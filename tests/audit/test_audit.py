@@ -145,7 +145,7 @@ def test_audit_of_a_world_that_ends_in_a_mujoco_error_judges_only_steps_before(b
     )
     assert "4 steps not judged" in words_of(found)
     assert "out of memory" in found.divergences[0].cause
-    assert "outside" not in words_of(found)  # An error of MuJoCo says nothing about the solver.
+    assert "outside" not in words_of(found)  # An error of MuJoCo does not concern the solver.
 
 
 # A motor that drives itself: its force grows with the velocity, so that no answer of the constraint solver helps.
@@ -170,7 +170,7 @@ def test_audit_of_a_divergence_after_exact_solves_blames_the_model(tmp_path, mon
     exact = options == ""  # One sweep of PGS does not hold the box.
     assert found.is_unconverged.any() == (not exact and threshold < 1.0)
     assert ("outside the constraint solver" in words_of(found)) == exact
-    # Otherwise a sentence says how to separate the solver from the model.
+    # Otherwise a sentence explains how to separate the solver from the model.
     assert ('audit again with <option solver="Newton"' in words_of(found)) != exact
     assert found.diverged["solves until then"].tolist() == ["exact" if exact else "not exact"] * 3
 

@@ -15,7 +15,7 @@ MEASURES = ("kinetic", "energy", "speed", "spin", "rows")
 @pytest.mark.filterwarnings("error")
 @given(data=problem_data(), exponent=st.integers(-1070, 1020))
 def test_motion_errors_and_ranks_of_extreme_problems_are_numbers(data, exponent):
-    """A motion error is finite, or its `note` says why there is none."""
+    """A motion error is finite, or its `note` has the reason."""
     try:
         problem = build_problem(data)
     except lv.InputError:

@@ -110,4 +110,4 @@ def test_from_mujoco_rows_of_every_kind_have_the_unit_of_their_velocity():
         "limit of joint hinge": "r", "limit of joint slide": "m", "limit of joint ball": "r",
     }  # fmt: skip
     spin = [i for i in range(problem.m) if "spin" in problem.row_name(i) or "roll" in problem.row_name(i)]
-    assert len(spin) == 3 and {problem.row_unit(i) for i in spin} == {"m/s"}  # nu is that of the normal.
+    assert len(spin) == 3 and {problem.row_unit(i) for i in spin} == {"m/s"}  # nu of the normal.
