@@ -5,6 +5,9 @@ Needs Drake: pip install drake. SAP's contacts are softer than Coulomb's law; th
     python examples/drake_box.py
 """
 
+import importlib.util
+import sys
+
 import numpy as np
 
 import lavender as lv
@@ -68,4 +71,6 @@ def main():
 
 
 if __name__ == "__main__":
+    if importlib.util.find_spec("pydrake") is None:
+        sys.exit("pydrake is not installed: pip install drake")
     main()

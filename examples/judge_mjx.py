@@ -34,6 +34,8 @@ def judge(model, datas):
 
 def main():
     """Judge 64 worlds of a model with random velocities."""
+    if len(sys.argv) != 2:
+        sys.exit("usage: python examples/judge_mjx.py MODEL.xml")
     import mujoco
 
     model = mujoco.MjModel.from_xml_path(sys.argv[1])

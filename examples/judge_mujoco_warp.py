@@ -35,6 +35,8 @@ def judge(model, datas):
 
 def main():
     """Judge 64 worlds of a model with random velocities."""
+    if len(sys.argv) != 2:
+        sys.exit("usage: python examples/judge_mujoco_warp.py MODEL.xml")
     import mujoco
 
     model = mujoco.MjModel.from_xml_path(sys.argv[1])

@@ -5,6 +5,9 @@ Needs Pinocchio 4: pip install pin. Each step is one problem, which starts from 
     python examples/pinocchio_box.py
 """
 
+import importlib.util
+import sys
+
 import numpy as np
 
 import lavender as lv
@@ -65,4 +68,6 @@ def main():
 
 
 if __name__ == "__main__":
+    if importlib.util.find_spec("pinocchio") is None:
+        sys.exit("pinocchio is not installed: pip install pin")
     main()

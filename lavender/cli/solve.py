@@ -67,7 +67,8 @@ def solve(file: str, solver: str, tol: float, output: Path | None, as_json: bool
     if as_json:
         click.echo(format_json(_describe_solution(item.name, item.problem, solution), indent=1))
     else:
-        print_escaped(f"{item.name}: {item.problem.law}, {item.problem.m} rows")
+        start = "zero impulses" if item.problem.guess is None else "the stored impulses"
+        print_escaped(f"{item.name}: {item.problem.law}, {item.problem.m} rows, starts from {start}")
         print_escaped(str(solution))
         if output is not None:
             print_escaped(f"written: {output}")

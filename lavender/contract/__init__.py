@@ -1,4 +1,4 @@
-"""The requirements on every solver, as checks on twelve problems for built-in solvers and plug-ins."""
+"""The requirements on every solver, as checks on small problems for built-in solvers and plug-ins."""
 
 from lavender.contract.checks import CHECKS, Check, ContractError, list_checks
 from lavender.contract.problems import make_problems

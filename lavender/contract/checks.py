@@ -12,7 +12,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import CapabilityError, UnknownName
-from lavender.contract.problems import INFEASIBLE, SOLVABLE, make_problems
+from lavender.contract.problems import EMPTY, INFEASIBLE, change_numbers, make_large_problems, make_problems
 from lavender.judge.certificates import check_certificate
 from lavender.judge.solution import MATRIX_PASS_COUNTERS, OTHER_WORK_COUNTERS, Solution, Status
 from lavender.problem import Problem
@@ -42,22 +42,31 @@ class ContractError(AssertionError):
 
 @dataclass(frozen=True)
 class Check:
-    """One requirement: a name, a sentence, the solvers to which it applies, its code and its number of problems."""
+    """One requirement: a name, a sentence, the solvers to which it applies, its code and its problems.
+
+    `problems` are "all", those that are "solvable" and not large, "large", or the "first" that the solver accepts.
+    """
 
     name: str
     requirement: str
     applies_to: str
     applies: Callable[[SolverSpec], bool]
     function: Requirement
-    count: int
+    problems: str
 
     def run(self, spec: SolverSpec) -> None:
         """Raise ContractError if a solver does not meet the requirement on a problem that it accepts."""
-        problems = [*make_problems().items()][: max(self.count, SOLVABLE)]
-        accepted = {name: problem for name, problem in problems if not spec.refuses(problem)}
-        if missing := sorted(set(spec.laws) - {problem.law for problem in accepted.values()}):
-            raise ContractError(f"the spec lists the laws {missing}, but refuses every problem of them")
-        for name in [*accepted][: self.count]:
+        large = make_large_problems().keys()
+        accepted = {name: problem for name, problem in make_problems().items() if not spec.refuses(problem)}
+        if missing := find_unused_capabilities(spec, list(accepted.values())):
+            raise ContractError(f"the spec lists {', '.join(missing)}, but refuses every problem with it")
+        names = {
+            "all": [name for name in accepted if name not in large],
+            "solvable": [name for name in accepted if name not in {EMPTY, INFEASIBLE, *large}],
+            "large": [name for name in accepted if name in large],
+            "first": [*accepted][:1],
+        }  # fmt: skip
+        for name in names[self.problems]:
             if failure := self.function(spec, accepted[name]):
                 raise ContractError(f"for {name} (law {accepted[name].law}) {failure}", name)
 
@@ -66,14 +75,32 @@ class Check:
 CHECKS: dict[str, Check] = {}
 
 
-def check(applies_to: str, applies: Callable[..., bool], count: int = SOLVABLE) -> Callable[..., Requirement]:
-    """Return a decorator that adds a function to `CHECKS`, for the first `count` problems that a solver accepts."""
+def find_unused_capabilities(spec: SolverSpec, accepted: list[Problem]) -> list[str]:
+    """Return the capabilities of a spec that none of the accepted problems needs."""
+    needed: dict[str, Callable[[Problem], bool]] = {
+        **{f"the law {law}": lambda p, law=law: p.law == law for law in spec.laws},  # type: ignore[misc]
+        **{f"boxes under the law {law}": lambda p, law=law: p.law == law and p.cones.has_box  # type: ignore[misc]
+           for law in spec.box_friction_laws},
+        **{f"the form {form}": lambda p, form=form: p.operator == form for form in spec.operators},  # type: ignore[misc]
+    }  # fmt: skip
+    flags = {
+        "round_cones": lambda p: p.cones.has_round, "supports_rolling": lambda p: p.cones.has_rolling,
+        "singular_programs": lambda p: p.has_singular_program,
+    }  # fmt: skip
+    needed |= {name: is_needed for name, is_needed in flags.items() if getattr(spec, name)}
+    return sorted(name for name, is_needed in needed.items() if not any(map(is_needed, accepted)))
+
+
+def check(
+    applies_to: str, applies: Callable[..., bool], problems: str = "solvable"
+) -> Callable[..., Requirement]:
+    """Return a decorator that adds a function to `CHECKS`; `problems` as in `Check`."""
 
     def add(function: Requirement) -> Requirement:
         name = function.__name__.removeprefix("require_")
         text = (function.__doc__ or "").removeprefix("Require that ")
         CHECKS[name] = Check(
-            name, text[0].upper() + text[1:], applies_to, applies, function=function, count=count
+            name, text[0].upper() + text[1:], applies_to, applies, function=function, problems=problems
         )
         return function
 
@@ -97,7 +124,7 @@ def get_bits(solution: Solution) -> tuple[bytes, Status, int]:
     return solution.impulse.tobytes(), solution.status, solution.iterations
 
 
-@check("all solvers", lambda spec: True, count=12)
+@check("all solvers", lambda spec: True, problems="all")
 def require_problems_are_solved(spec: SolverSpec, problem: Problem) -> str:
     """Require that every problem that the spec accepts is solved, with counted work and true claims."""
     solution = solve_to_tolerance(spec, problem)
@@ -119,7 +146,18 @@ def require_problems_are_solved(spec: SolverSpec, problem: Problem) -> str:
     return "" if counted else f"{text}. Its work must count one of {', '.join(sorted(WORK_COUNTERS))}"
 
 
-@check("all solvers", lambda spec: True, count=1)
+@check("all solvers", lambda spec: True, problems="large")
+def require_claims_are_true_at_every_tolerance(spec: SolverSpec, problem: Problem) -> str:
+    """Require that larger problems are solved to tolerances from 1e-2 to 1e-10, and every claim is true."""
+    for tol in (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10):
+        solution = solve_to_tolerance(spec, problem, tol=tol)
+        is_false = solution.status is Status.CONVERGED and not (solution.success or solution.status_conflict)
+        if is_false or (not spec.external and (not solution.success or solution.claim_check != "confirmed")):
+            return f"to tol={tol:g} the result is: {solution}"
+    return ""
+
+
+@check("all solvers", lambda spec: True, problems="first")
 def require_options_match_the_spec(spec: SolverSpec, problem: Problem) -> str:
     """Require that the factory accepts the options of the spec, and other options raise an error."""
     wrong = sorted(set(inspect.signature(spec.load()).parameters) ^ spec.accepts)
@@ -152,6 +190,8 @@ def require_budgets_are_kept(spec: SolverSpec, problem: Problem) -> str:
         exact = solve(problem, spec.name, tol=0.0, max_iter=n)
         if exact.status is not Status.MAX_ITERATIONS or exact.iterations != n:
             return f"tol=0 and max_iter={n} must run exactly {n} iterations; the result is: {exact}"
+        if max(exact.work.get(word, 0) for word in WORK_COUNTERS) < n:
+            return f"{n} iterations count the work {dict(exact.work)}; at least {n} of one kind are required"
     return ""
 
 
@@ -160,10 +200,13 @@ def require_bits_are_reproducible(spec: SolverSpec, problem: Problem) -> str:
     """Require that threads, `update` instead of `prepare`, and 1 + 7 + 15 instead of 23 iterations change no bit."""
     options: dict[str, Any] = {"tol": 1e-7, "max_iter": 60 if spec.resumable else None}
     bits = get_bits(solve(problem, spec.name, **options))
-    prepared = prepare(replace(problem, b=problem.b * 1.25 + 0.01), spec.name)
-    prepared.solve(**options)
-    if get_bits(prepared.solve(problem, **options)) != bits:
-        return "`update` gives other bits than `prepare`"
+    for other in (replace(problem, b=problem.b * 1.25 + 0.01, qp=problem.qp), change_numbers(problem)):
+        if spec.refuses(other):
+            continue
+        prepared = prepare(other, spec.name)
+        prepared.solve(**options)
+        if get_bits(prepared.solve(problem, **options)) != bits:
+            return "`update` with another A, b, bounds or coefficients gives other bits than `prepare`"
     with ThreadPoolExecutor(4) as pool:
         if {*pool.map(lambda p: get_bits(solve(p, spec.name, **options)), [problem] * 4)} != {bits}:
             return "the same call gives other bits, from one of four threads"
@@ -195,7 +238,7 @@ def require_a_solution_as_start_is_kept(spec: SolverSpec, problem: Problem) -> s
     return "" if kept or not first.success else f"a solve from the solution changed it, or ended as: {again}"
 
 
-@check("solvers with `resumable`", lambda spec: spec.resumable, count=1)
+@check("solvers with `resumable`", lambda spec: spec.resumable, problems="first")
 def require_interruptions_return_the_iterate(spec: SolverSpec, problem: Problem) -> str:
     """Require that a time limit or a callback ends a solve with the last iterate, and a history changes no bit."""
     solve(problem, spec.name, max_iter=1)  # Solve once before, so that imports do not count.
@@ -222,7 +265,7 @@ def require_interruptions_return_the_iterate(spec: SolverSpec, problem: Problem)
     return ""
 
 
-@check("solvers with `order` or `seed`", lambda spec: spec.order or spec.seed, count=1)
+@check("solvers with `order` or `seed`", lambda spec: spec.order or spec.seed, problems="first")
 def require_orders_change_the_sweep(spec: SolverSpec, problem: Problem) -> str:
     """Require that orders and seeds change the bits of two sweeps, and all of them lead to the solution."""
     choices: list[dict[str, Any]] = [{"order": order} for order in ("given", "reverse", "random", "colored")]

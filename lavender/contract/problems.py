@@ -1,19 +1,28 @@
-"""The twelve problems on which a solver is checked. A solver has to solve each of them that it accepts."""
+"""The problems on which a solver is checked: one for each law, form and kind of block, and four larger ones.
+
+A solver has to solve each of them that it accepts.
+"""
 
 from __future__ import annotations
 
 import functools
 import itertools
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from lavender.base.arrays import FloatArray
+from lavender.base.lazy_import import sparse as sp
 from lavender.problem import Problem
 from lavender.problem.cones import Cones
+from lavender.problem.generalized import Generalized
 from lavender.problem.row_builder import RowBuilder
 
 INFEASIBLE = "a row that no impulse can satisfy"  # Name of the problem without a solution.
-SOLVABLE = 10  # The first ten problems have rows and a solution.
+EMPTY = "no rows"
+#: Number of contacts and of bounded rows of the larger problems.
+LARGE_CONTACTS, LARGE_ROWS = 20, 60
 
 
 def make_bodies(joints: bool, friction: str = "coulomb", mu: float = 0.0) -> Problem:
@@ -31,9 +40,116 @@ def make_bodies(joints: bool, friction: str = "coulomb", mu: float = 0.0) -> Pro
     return replace(problem, compliance=np.full(problem.m, 0.3))
 
 
+def make_matrix(rng: np.random.Generator, m: int) -> FloatArray:
+    """Draw a symmetric positive definite matrix (m, m) [1/kg]."""
+    g = rng.normal(size=(m, m + 2))
+    return g @ g.T / m + 0.5 * np.eye(m)
+
+
+def make_contacts(
+    rng: np.random.Generator, size: int, friction: str = "coulomb", count: int = 4, **options: Any
+) -> Problem:
+    """Draw contacts of `size` rows in a matrix: most are pressed on and slide, with coefficients below and above 1."""
+    b = 6.0 * rng.normal(size=(count, size))
+    b[:, 0] = np.where(np.arange(count) % 4 == 3, -1.0, 1.0) * rng.uniform(4.0, 9.0, count)
+    mu = np.resize([0.3, 1.7, 0.6, 0.9], count)
+    return Problem.contact(make_matrix(rng, count * size), b.ravel(), mu, friction=friction, **options)
+
+
+def make_kinds_of_blocks() -> dict[str, Problem]:
+    """Return a problem for each kind of block under each law that has it."""
+    rng = np.random.default_rng(2)
+    lower, upper = [0.5, -2.0, 0.3, -np.inf, -1.0, 0.4], [np.inf, -0.5, 0.8, 0.2, np.inf, 0.4]
+    problems = {
+        "bounds that exclude zero": Problem.lcp(make_matrix(rng, 6), 2.0 * rng.normal(size=6), lower, upper),
+    }  # fmt: skip
+    patch, rolling, four = [0.2, 0.5, 0.1, 0.3], [0.1, 0.05, 0.3, 0.1], np.array([0.3, 1.7, 0.6, 0.9])
+    for law in ("coulomb", "cone"):
+        kinds = {
+            "planar contacts": make_contacts(rng, 2, law, tangents=1),
+            "contacts with two tangents": make_contacts(rng, 3, law),
+            "contacts that turn": make_contacts(rng, 4, law, patch_radius=patch),
+            "contacts that roll": make_contacts(rng, 5, law, rolling=rolling),
+            "contacts that turn and roll": make_contacts(rng, 6, law, patch_radius=patch, rolling=rolling),
+        }
+        plain = make_contacts(rng, 3, law)
+        shapes = {
+            "contacts with friction boxes": Cones.contacts(np.stack([four, 0.4 * four], 1), shape="box"),
+            "contacts with friction ellipses": Cones.contacts(np.stack([four, 0.4 * four], 1)),
+            "a contact without friction and a free row": Cones.contacts([0.0, 0.5, 1.2]) + Cones.free(1)
+            + Cones.bounded([-0.1, 0.0], [0.1, np.inf]),
+        }  # fmt: skip
+        kinds |= {name: replace(plain, cones=cones) for name, cones in shapes.items()}
+        problems |= {f"{name}, law {law}": problem for name, problem in kinds.items()}
+    jac, mass, cones = rng.normal(size=(20, 12)), make_matrix(rng, 12), Cones.contacts(four, tangents=4)
+    problems["round cones of four tangents, law cone"] = Problem.from_jacobian(
+        jac, mass, -2.0 * rng.random(12), cones=cones, friction="cone", compliance=np.full(20, 0.3)
+    )
+    problems["contacts and bounded rows of J and M, law coulomb"] = Problem.from_jacobian(
+        jac[:12], mass, 3.0 * rng.normal(size=12), cones=Cones.bounded(lower, upper) + Cones.contacts([0.5, 1.5]),
+        compliance=np.full(12, 0.2),
+    )  # fmt: skip
+    bodies = make_bodies(joints=False, mu=0.5).rows
+    assert bodies is not None
+    for name, options in (
+        ("turn and roll", {"patch_radius": 0.1, "rolling": 0.05}), ("have friction boxes", {"shape": "box"})
+    ):  # fmt: skip
+        stack = Problem.from_rows(bodies, 0.0, mu=0.5, compliance=0.3, **options)
+        problems[f"contacts of bodies that {name}, law coulomb"] = stack
+    sparse = sp.csr_array(
+        np.kron(np.eye(3), make_matrix(rng, 4)) + 0.2 * (np.eye(12, k=4) + np.eye(12, k=-4))
+    )
+    problems["a sparse A"] = Problem.lcp(sparse, 3.0 * rng.normal(size=12), -1.0, 1.0)
+    problems["a singular quadratic program"] = Problem.from_qp(
+        np.diag([1.0, 0.0]), [-1.0, 1.0], np.array([[1.0, 1.0]]), [2.0], lb=[0.0, 0.0], ub=[3.0, 3.0]
+    )
+    return problems
+
+
+def make_large_problems() -> dict[str, Problem]:
+    """Return a larger problem of each law, for claims at several tolerances."""
+    rng = np.random.default_rng(3)
+    a, b = make_matrix(rng, LARGE_ROWS), rng.normal(size=LARGE_ROWS)
+    return {
+        f"{LARGE_ROWS} free rows": Problem.linear(a, b),
+        f"{LARGE_ROWS} bounded rows": Problem.lcp(
+            a, b, -0.5, np.where(np.arange(LARGE_ROWS) % 2, 0.5, np.inf)
+        ),
+        f"{LARGE_CONTACTS} contacts, law coulomb": make_contacts(rng, 3, "coulomb", LARGE_CONTACTS),
+        f"{LARGE_CONTACTS} contacts, law cone": make_contacts(rng, 3, "cone", LARGE_CONTACTS),
+    }
+
+
+def change_numbers(problem: Problem) -> Problem:
+    """Return a problem of the same structure with another A, b, bounds and coefficients."""
+    cones, m = problem.cones, problem.m
+    scale = 1.0 + 0.3 * np.sin(np.arange(1.0, m + 1.0))
+    is_ratio = cones.is_box | (cones.has_ellipse & (cones.spin_rows < 0))
+    cones = replace(
+        cones, lower=1.5 * cones.lower, upper=1.5 * cones.upper, mu=0.7 * cones.mu, rolling=0.7 * cones.rolling,
+        patch_radius=np.where(is_ratio, 1.0, 0.7) * cones.patch_radius,
+    )  # fmt: skip
+    more: dict[str, Any] = {"cones": cones, "b": 1.25 * problem.b + 0.01 * (problem.m > 0)}
+    if problem.generalized is not None:
+        general = problem.generalized
+        rows = sp.diags_array(scale) @ general.jac
+        more["generalized"] = Generalized(rows, 1.5 * general.mass, general.v_free, general.names)
+    elif problem.rows is not None:
+        bodies = problem.rows
+        weight = 1.0 + 0.3 * np.sin(np.arange(1.0, bodies.n_bodies + 1.0))
+        inertia = weight[:, None, None] * bodies.inv_inertia
+        more["rows"] = replace(bodies, inv_mass=1.5 * weight * bodies.inv_mass, inv_inertia=inertia)
+    else:
+        matrix = problem.csr
+        data = matrix.data * np.repeat(scale, np.diff(matrix.indptr)) * scale[matrix.indices]
+        changed = sp.csr_array((data, matrix.indices, matrix.indptr), shape=matrix.shape)
+        more["matrix"] = changed if isinstance(problem.matrix, sp.csr_array) else changed.toarray()
+    return replace(problem, qp=None, **more)
+
+
 @functools.cache
 def make_problems() -> dict[str, Problem]:
-    """Return the twelve problems by their description."""
+    """Return all problems by their description."""
     rng = np.random.default_rng(1)
     roots = (rng.normal(size=(m, m + 2)) for m in (6, 9))
     six, nine = (g @ g.T / len(g) + 0.5 * np.eye(len(g)) for g in roots)  # definite
@@ -60,6 +176,8 @@ def make_problems() -> dict[str, Problem]:
         "a stack of boxes, law coulomb": make_bodies(joints=False, mu=0.5),
         "a stack of boxes, law cone": make_bodies(joints=False, friction="cone", mu=0.5),
         "J and M of a robot, law cone": robot,
-        "no rows": Problem.lcp(np.zeros((0, 0)), []),
+        **make_kinds_of_blocks(),
+        EMPTY: Problem.lcp(np.zeros((0, 0)), []),
         INFEASIBLE: Problem.lcp(np.diag([1.0, 0.0]), [1.0, 1.0], name=INFEASIBLE),
+        **make_large_problems(),
     }
