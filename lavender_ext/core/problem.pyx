@@ -27,7 +27,7 @@ from lavender_ext.core.block_types cimport (CONE, COULOMB, MAX_FRICTION_COMPONEN
                                             count_angular_rows, get_friction_components, friction_components_t)
 from lavender_ext.core.rows cimport (compute_contact_delassus_block, dot12, largest_eigenvalue_2x2, multiply_inverse_mass,
                                      multiply_jacobian)
-from lavender_ext.core.steps cimport compute_block_steps, largest_eigenvalue_of_csr_pair, average_diagonal_of_pairs
+from lavender_ext.core.steps cimport finish_metric, largest_eigenvalue_of_csr_pair
 from lavender_ext.core.whiten cimport find_panel_pattern, whiten_panel
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.core.weights cimport compute_velocity_weights, set_angular_joint_weights
@@ -78,12 +78,11 @@ cdef public int32_t lav_compute_csr_diagonal(const blocks_t* p, const csr_t* a, 
     replace_empty_diagonal(p.n_rows, d)
     for i in range(p.n_blocks):
         j = p.ptr[i]
-        average_diagonal_of_pairs(p, i, d)
         get_friction_components(p, i, &part)
         for g in range(part.n):
             if part.size[g] == 2:
-                eigenvalue[g] = largest_eigenvalue_of_csr_pair(a, j + part.first[g], d, step)
-        compute_block_steps(p, i, &part, eigenvalue, d, step)
+                eigenvalue[g] = largest_eigenvalue_of_csr_pair(a, j + part.first[g], step)
+        finish_metric(p, i, eigenvalue, d, step)
     compute_velocity_weights(p, d, <double*>p.nu)
     return n_empty
 
@@ -133,11 +132,10 @@ cdef public int32_t lav_compute_body_diagonal(const blocks_t* p, const rows_t* r
     replace_empty_diagonal(p.n_rows, d)
     # steps
     for i in range(p.n_blocks):
-        average_diagonal_of_pairs(p, i, d)
         get_friction_components(p, i, &part)
         for g in range(part.n):
             eigenvalue[g] = step[p.ptr[i] + part.first[g]]
-        compute_block_steps(p, i, &part, eigenvalue, d, step)
+        finish_metric(p, i, eigenvalue, d, step)
     compute_velocity_weights(p, d, <double*>p.nu)
     set_angular_joint_weights(p, r, <double*>p.nu)
     return n_empty
@@ -197,8 +195,7 @@ cdef public int32_t lav_compute_generalized_diagonal(const blocks_t* p, const ge
                 j = p.ptr[i] + part.first[part_]
                 row = y + g.pval[b] + (j - g.prow[b]) * nc
                 eigenvalue[part_] = largest_eigenvalue_2x2(d[j], dot(row, row + nc, nc), d[j + 1])
-        average_diagonal_of_pairs(p, i, d)
-        compute_block_steps(p, i, &part, eigenvalue, d, <double*>p.step)
+        finish_metric(p, i, eigenvalue, d, <double*>p.step)
     compute_velocity_weights(p, d, <double*>p.nu)
     return n_empty
 

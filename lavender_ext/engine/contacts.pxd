@@ -28,6 +28,7 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, uint64_t
 
 from lavender_ext.core.block_types cimport choose_contact_kind
+from lavender_ext.core.steps cimport finish_pair
 from lavender_ext.core.rows cimport (compute_contact_delassus_block, compute_contact_velocity, cross, dot3,
                                      largest_eigenvalue_2x2, reciprocal_or_zero, compute_relative_velocity)
 from lavender_ext.core.view cimport rows_t
@@ -198,15 +199,11 @@ cdef inline void build_contact(engine_t* e, const rows_t* r, int32_t c, int32_t 
         e.step[row + 1] = reciprocal_or_zero(d[1])
         e.step[row + 2] = reciprocal_or_zero(d[2])
     elif nt > 0:
-        e.step[row + 1] = reciprocal_or_zero(largest_eigenvalue_2x2(d[1], off[0], d[2]))
-        e.step[row + 2] = e.step[row + 1]
-        d[1] = 0.5 * (d[1] + d[2])
-        d[2] = d[1]
+        finish_pair(largest_eigenvalue_2x2(d[1], off[0], d[2]), d + 1, e.step + row + 1)
     if n_angular & 1:
         e.step[row + 1 + nt] = reciprocal_or_zero(d[1 + nt])
     if n_angular & 2:
-        e.step[roll] = e.step[roll + 1] = reciprocal_or_zero(largest_eigenvalue_2x2(e.d[roll], off[1], e.d[roll + 1]))
-        e.d[roll] = e.d[roll + 1] = 0.5 * (e.d[roll] + e.d[roll + 1])
+        finish_pair(largest_eigenvalue_2x2(e.d[roll], off[1], e.d[roll + 1]), e.d + roll, e.step + roll)
     # right-hand side with target 0
     for k in range(1 + nt + n_angular):
         e.target[row + k] = 0.0
