@@ -48,6 +48,7 @@ from lavender.base.arrays import check_float, check_int
 from lavender.base.errors import InputError, check_name
 from lavender.io.efc import from_mujoco_many
 from lavender.io.engine_step import EngineStep
+from lavender.io.mujoco_memory import import_mujoco
 from lavender.io.start_states import VECTOR, Control, hash_model
 from lavender.judge.residuals import DEFAULT_THRESHOLD
 from lavender.problem import PRECISIONS
@@ -371,7 +372,7 @@ def judge_states(
 
     `after` (n, nv) are the velocities after the steps, with which the predicted ones are compared.
     """
-    judge = copy.copy(model)
+    judge, version = copy.copy(model), import_mujoco().__version__
     judge.opt.noslip_iterations = 0
     for i in range(0, len(states), MAX_PROBLEMS_IN_MEMORY):
         part = slice(i, i + MAX_PROBLEMS_IN_MEMORY)
@@ -381,7 +382,11 @@ def judge_states(
         batch, impulse = from_mujoco_many(judge, states[part], errors="status", velocity=velocity)
 
         def state_of(k: int, vectors: Any = states[part]) -> dict[str, Any]:
-            own = {VECTOR: vectors[k].copy(), "model": np.array(hash_model(judge))}
+            own = {
+                VECTOR: vectors[k].copy(),
+                "model": np.array(hash_model(judge)),
+                "mujoco": np.array(version),
+            }
             return split_state_vector(judge, vectors[k]) | own
 
         assert impulse is not None and batch.contact_counts is not None

@@ -51,6 +51,8 @@ class ResultPage:
         Sentences with advice and warnings; a terminal shows them below its tables.
     is_stopped : bool
         Whether the measurement ended early, so that all numbers describe only its completed part.
+    provenance : str
+        Last line: versions, settings, model, date and command.
     """
 
     title: str
@@ -59,6 +61,7 @@ class ResultPage:
     numbers: dict[str, Any]
     notes: Sequence[str] = ()
     is_stopped: bool = False
+    provenance: str = ""
 
     def write(self, folder: str | os.PathLike[str]) -> Path:
         """Write `index.html`, `numbers.json` and `figures/*`; return the path of the page."""
@@ -71,7 +74,7 @@ class ResultPage:
             frames = [tabulate_frame(frame, note=section.note) for frame in section.frames if len(frame)]
             if drawn or code or frames:
                 blocks.append({"folded": [*code, *frames, *drawn], "title": section.title, "open": True})
-        notes = [*self.notes, *([STOPPED_NOTE] if self.is_stopped else [])]
+        notes = [*self.notes, *([STOPPED_NOTE] if self.is_stopped else []), *filter(None, [self.provenance])]
         page = Page(self.title, "", self.headline[0], self.headline[1:], warnings=notes, blocks=blocks)
         numbers = format_json(self.numbers, indent=1) + "\n"
         return (
@@ -93,6 +96,8 @@ class ResultPage:
                 print_table(console, frame)
         for i, note in enumerate(self.notes):
             console.print(f"{'' if i else chr(10)}{note}", style="yellow", highlight=False, markup=False)
+        if self.provenance:
+            console.print(f"\n{self.provenance}", style="dim", highlight=False, markup=False)
 
 
 # If a smaller fraction of the judged steps has contact, `tune` recommends no setting and an audit warns: mean times,

@@ -24,6 +24,7 @@ from lavender.audit.pieces import (
     StepState,
     Worst,
 )
+from lavender.audit.provenance import describe_provenance, format_provenance
 from lavender.audit.simulated_worlds import Divergence, Runs
 from lavender.base.arrays import FloatArray, check_choice
 from lavender.io.npz import write_npz
@@ -118,6 +119,8 @@ class Audit:
     prediction : Prediction
     against : Audit, optional
         Result of another model on the same states.
+    provenance : dict
+        Result of `describe_provenance`.
     """
 
     runs: Runs
@@ -141,6 +144,7 @@ class Audit:
     lost_digits: LostDigits = field(default_factory=LostDigits)
     prediction: Prediction = field(default_factory=Prediction)
     against: Audit | None = None
+    provenance: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
     def with_size(cls, runs: Runs, engine: str, *, has_claims: bool = False, **more: Any) -> Audit:
@@ -150,7 +154,8 @@ class Audit:
         numbers = np.full((len(WORST_ROW_ERRORS), *shape), np.nan)
         claims = np.full(shape, -1, np.int8) if has_claims else None
         verdict = np.full(shape, -1, np.int8)
-        return cls(runs, engine, numbers, verdict, rows, contacts, converged=claims, **more)
+        found = describe_provenance(runs.model, runs.name, engine)
+        return cls(runs, engine, numbers, verdict, rows, contacts, converged=claims, provenance=found, **more)
 
     def add_piece(self, piece: Piece, keep: int | None) -> None:
         """Add the results of judged steps, and keep the worst (`Judging.keep`)."""
@@ -540,6 +545,7 @@ class Audit:
             "error_limit": self.error_limit, "above_limit": self.n_above_limit, "dropped_rows": self.n_dropped,
             "divergences": divergences, **self.judged_sizes.as_dict,
             "engine_warnings": dict(self.engine_warnings), "stopped": self.is_stopped,
+            "provenance": self.provenance,
             "prediction": self.prediction._asdict(), "lost_digits": self.lost_digits._asdict(),
         }  # fmt: skip
         if self.converged is not None:
@@ -564,6 +570,7 @@ class Audit:
                 Section("The worst worlds", [self.worst_steps], short=len(self.worst), note=FILES_NOTE),
             ],
             numbers=self.totals, notes=self.advice, is_stopped=self.is_stopped,
+            provenance=format_provenance(self.provenance),
         )  # fmt: skip
 
 

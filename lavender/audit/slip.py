@@ -26,6 +26,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -85,7 +86,9 @@ class SlipVariant:
 
 @dataclass(frozen=True)
 class Remedy:
-    """Slip of the fastest contact with a setting of MuJoCo, as means over `Remedies.states` states.
+    """Slip of the fastest contact with a setting of MuJoCo, simulated from several states.
+
+    Steps in which the geoms do not touch have no slip and do not count.
 
     Parameters
     ----------
@@ -94,17 +97,41 @@ class Remedy:
     slip : float, m/s
         Mean speed of the contact's points in the explained step, simulated with the setting.
     later : float, m/s
-        The same, as a mean of the next `REMEDY_STEPS` steps; nan if the geoms no longer touch after one of the runs, or
-        if a run diverges.
+        The same, as a mean of the steps with contact among the next `REMEDY_STEPS` steps of all states; nan if there is
+        none, or if a run diverges.
     diverged_step : int
         First step in which MuJoCo restarted one of the runs because it diverged; 0 is the explained step, -1 means that
         no run diverged.
+    touching : float
+        Fraction of these steps with contact.
+    kept : int
+        Number of states in which the geoms touch in the last of these steps.
+    speeds : (1 + REMEDY_STEPS,) tuple, m/s
+        Mean speed in each step, from the explained one on; nan without contact.
     """
 
     setting: str
     slip: float
     later: float
     diverged_step: int = -1
+    touching: float = 0.0
+    kept: int = 0
+    speeds: tuple[float, ...] = ()
+
+    @classmethod
+    def of_runs(cls, setting: str, speeds: FloatArray, diverged_step: int) -> Remedy:
+        """Average the speeds (states, 1 + REMEDY_STEPS) [m/s] of the runs with a setting."""
+
+        def compute_mean(values: FloatArray) -> float:
+            finite = values[np.isfinite(values)]
+            return float(finite.mean()) if len(finite) else np.nan
+
+        touches = np.isfinite(speeds[:, 1:])
+        later = np.nan if diverged_step >= 0 else compute_mean(speeds[:, 1:])
+        return cls(
+            setting, compute_mean(speeds[:, 0]), later, diverged_step, float(touches.mean()), int(touches[:, -1].sum()),
+            tuple(map(compute_mean, speeds.T)),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +165,9 @@ class SlipExplanation:
     state: int = 0
 
     def __str__(self) -> str:
-        return "\n".join([self.table.to_string(index=False), *self.sentences])
+        from lavender.report.render import format_cells
+
+        return "\n".join([format_cells(self.table).to_string(index=False), *self.sentences])
 
     @property
     def parts(self) -> dict[str, FloatArray]:
@@ -182,7 +211,42 @@ class SlipExplanation:
         texts = [[text.replace(NONE, "no contact") for text in column] for column in (slips, means)]
         settings = [r.setting for r in self.remedies]
         heads = ["setting", "slip [m/s]", f"mean of the next {REMEDY_STEPS} steps [m/s]"]
-        return pd.DataFrame(dict(zip(heads, [settings, *texts], strict=True)))
+        columns = dict(zip(heads, [settings, *texts], strict=True))
+        n = self.n_states * REMEDY_STEPS
+        columns["steps with contact"] = [f"{r.touching * n:.0f} of {n}" for r in self.remedies]
+        columns["states that keep contact"] = [f"{r.kept} of {self.n_states}" for r in self.remedies]
+        return pd.DataFrame(columns)
+
+    def draw_slip(self, folder: Path) -> str:
+        """Draw the slip of the fastest contact over time, as it is and with the settings that change it."""
+        from lavender.report.drawing import Label, draw_figure, label_ends, style_line
+
+        def fill(axes: Any) -> str:
+            labels: list[Label] = []
+            drawn: set[bytes] = set()
+            for remedy in self.remedies:
+                finite = np.array(remedy.speeds)[np.isfinite(remedy.speeds)]
+                if (
+                    len(finite) and finite.tobytes() not in drawn
+                ):  # Settings without an effect have the same line.
+                    style = style_line(len(drawn)) | {"marker": ""}
+                    drawn.add(finite.tobytes())
+                    axes.plot(remedy.speeds, **style)
+                    labels.append(
+                        Label(finite[-1], remedy.setting, style["color"], "normal" if labels else "bold")
+                    )
+            axes.set_xlim(0, REMEDY_STEPS)
+            axes.set_ylim(bottom=0.0)
+            axes.set_xlabel("step")
+            axes.set_ylabel("slip [m/s]")
+            label_ends(axes, labels)
+            return "Slip over time. " + "; ".join(
+                f"{label.text}: {label.y:.2g} m/s at the end" for label in labels
+            )
+
+        note = f"Means over {self.n_states} states. Steps without contact are gaps."
+        margins = {"left": 0.12, "right": 0.5}
+        return draw_figure("slip-over-time", fill, (7.5, 3.3), margins, note=note, folder=folder)
 
     @property
     def sentences(self) -> list[str]:
@@ -239,7 +303,14 @@ class SlipExplanation:
             return [f"None of these settings reduces the slip {time} by more than 10 %."]
         head = f"Settings that help (mean slip {time}, {format_size(before)} m/s as it is):"
         helpful.sort(key=get_slip)
-        return [head, *(f"  {r.setting}: {format_size(get_slip(r))} m/s" for r in helpful)]
+        lost = {
+            r.setting: f"; {r.kept} of {self.n_states} states keep contact, and {now.kept} as it is"
+            for r in helpful if r.kept < now.kept
+        }  # fmt: skip
+        return [
+            head,
+            *(f"  {r.setting}: {format_size(get_slip(r))} m/s{lost.get(r.setting, '')}" for r in helpful),
+        ]
 
 
 def explain_slip(

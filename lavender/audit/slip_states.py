@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lavender.audit.page import ResultPage, Section
+from lavender.audit.provenance import describe_provenance, format_provenance
 from lavender.audit.settings import MujocoSetting, get_option_value
 from lavender.audit.simulated_worlds import count_engine_warnings, has_diverged
 from lavender.audit.slip import (
@@ -27,7 +29,7 @@ from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.io import mujoco as adapter
 from lavender.io.mujoco_memory import import_mujoco
-from lavender.io.start_states import read_states, without_sleep
+from lavender.io.start_states import name_model, read_states, without_sleep
 from lavender.problem import Problem
 from lavender.report.runner import Event
 from lavender.report.text import format_count
@@ -55,12 +57,15 @@ class SlipOfStates:
         one: its numbers are not finite, or above 1e10.
     misfit : str
         Sentence on states that do not fit the model; else empty.
+    provenance : dict
+        Result of `describe_provenance`.
     """
 
     explanations: tuple[SlipExplanation, ...]
     n_states: int
     diverged: tuple[int, ...] = ()
     misfit: str = ""
+    provenance: dict[str, Any] = field(default_factory=dict)
 
     @property
     def worst(self) -> SlipExplanation:
@@ -85,6 +90,22 @@ class SlipOfStates:
             *notes,
             f"{left_out}: MuJoCo restarts the simulation, which diverges up to the explained step.",
         ]
+
+    @property
+    def page(self) -> ResultPage:
+        """Page with the slip of each pair of geoms, the settings simulated, and the slip over time."""
+        worst = self.worst
+        remedies = [r.__dict__ | {"speeds": list(r.speeds)} for r in worst.remedies]
+        sections = [Section("Slip by cause", [self.table])]
+        if remedies:
+            note = "\n".join(worst.advice)
+            sections.append(Section("Settings simulated", [worst.remedies_table], note, [worst.draw_slip]))
+        numbers = {
+            "states": self.n_states, "explained": len(self.explanations), "state": worst.state,
+            "slip": self.table.to_dict("records"), "remedies": remedies, "provenance": self.provenance,
+        }  # fmt: skip
+        last = format_provenance(self.provenance)
+        return ResultPage("lavender slip", worst.sentences, sections, numbers, self.notes, provenance=last)
 
 
 def explain_slip_of_states(
@@ -144,7 +165,8 @@ def explain_slip_of_states(
                 explained.append(_get_state(mj, model, data))
         if explanations:
             _simulate_remedies(mj, model, explanations, explained, watch)
-    return SlipOfStates(tuple(explanations), len(vectors), tuple(diverged), misfit)
+    found = describe_provenance(model, name_model(model))
+    return SlipOfStates(tuple(explanations), len(vectors), tuple(diverged), misfit, found)
 
 
 def _get_state(mj: Any, model: Any, data: Any) -> FloatArray:
@@ -219,15 +241,14 @@ def _simulate_remedies(
             states = format_count(len(chosen), "state")
             watch(Event(k, len(settings), states, "", phase="simulating settings"))
         results = [_simulate_slip(mj, changed, state, pair) for state in chosen]
-        steps = [step for *_, step in results]
+        steps = [step for _, step in results]
         if k == 0 and min(steps) < 0:
             # Compare settings only from the states from which the present setting does not diverge.
             chosen = [state for state, step in zip(chosen, steps, strict=True) if step < 0]
-            results = [result for result in results if result[2] < 0]
+            results = [result for result in results if result[1] < 0]
             steps = [-1]
         step = min((step for step in steps if step >= 0), default=-1)
-        slip, later = np.mean([result[:2] for result in results], axis=0).tolist()
-        remedies.append(Remedy(text, slip, later, step))
+        remedies.append(Remedy.of_runs(text, np.array([speeds for speeds, _ in results]), step))
     explanations[fastest] = replace(explanations[fastest], remedies=tuple(remedies), n_states=len(chosen))
 
 
@@ -278,8 +299,10 @@ def _change_settings(mj: Any, model: Any, geoms: str) -> Iterator[tuple[str, Any
     ]
     if get_option_value(mj, model, "cone") == "pyramidal":
         options += [{"cone": "elliptic", **x} for x in ({}, *options[1:])]
-    settings = [MujocoSetting.from_options(mj, model, **x) for x in options]
-    yield from ((s.option_line, s.apply_to(mj, model)) for s in settings if s.options)
+    settings = {
+        s.option_line: s for s in (MujocoSetting.from_options(mj, model, **x) for x in options) if s.options
+    }
+    yield from ((line, setting.apply_to(mj, model)) for line, setting in settings.items())
     shortest = 2.0 * model.opt.timestep  # MuJoCo uses no shorter time constant.
     if model.geom_solref[:, 0].max(initial=0.0) > shortest:  # Negative values are stiffnesses.
         changed = copy.deepcopy(model)
@@ -297,28 +320,28 @@ def _change_settings(mj: Any, model: Any, geoms: str) -> Iterator[tuple[str, Any
         yield f'friction="{friction:g}" of {" and ".join(geoms.split(", "))}', changed
 
 
-def _simulate_slip(mj: Any, model: Any, state: FloatArray, geoms: str) -> tuple[float, float, int]:
-    """Return the sliding speed [m/s] of two geoms in the step from a state, and its mean in the next `REMEDY_STEPS`.
+def _simulate_slip(mj: Any, model: Any, state: FloatArray, geoms: str) -> tuple[FloatArray, int]:
+    """Return the sliding speeds of two geoms (1 + REMEDY_STEPS,) [m/s] in the steps from a state.
 
-    Steps in which the geoms do not touch do not count. The first speed is nan if the geoms do not touch in its step,
-    the second one if they do not touch in the last step. The last result is the step in which the simulation diverges
-    (0 is the first), from which on no step counts, or -1.
+    A speed is nan if the geoms do not touch in this step. The second result is the step in which the simulation
+    diverges (0 is the first), from which on all speeds are nan, or -1.
     """
     data = mj.MjData(model)
-    means: list[float] = []
+    means = np.full(REMEDY_STEPS + 1, np.nan)
     mj.mj_setState(model, data, state, mj.mjtState.mjSTATE_INTEGRATION)
     for step in range(REMEDY_STEPS + 1):
         try:
             mj.mj_forward(model, data)
             if _is_diverging(mj, data):
-                return means[0] if means else np.nan, np.nan, step
+                return means, step
             problem, disk, surface = _read_step(mj, model, data)
             measured = problem if disk is None else disk
             sliding = np.flatnonzero(measured.cones.n_tangents > 0).tolist()
             blocks = [k for k in sliding if get_geoms(measured.block_name(k)) == geoms]
             mj.mj_step(model, data)
         except mj.FatalError:
-            return means[0] if means else np.nan, np.nan, step
+            return means, step
         speeds = [np.linalg.norm(v) for v in compute_slip(measured, blocks, data.qvel, surface)]
-        means.append(float(np.mean(speeds)) if speeds else np.nan)
-    return means[0], np.nan if np.isnan(means[-1]) else float(np.nanmean(means[1:])), -1
+        if speeds:
+            means[step] = np.mean(speeds)
+    return means, -1

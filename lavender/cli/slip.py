@@ -8,7 +8,8 @@ import click
 
 from lavender.base.exits import EXIT_UNMET
 from lavender.cli.measuring import show_progress
-from lavender.cli.options import FILE, limit_to_one_thread, make_console, print_escaped
+from lavender.cli.options import FILE, FOLDER, limit_to_one_thread, make_console, print_escaped
+from lavender.io.stored import check_writable
 
 
 @click.command()
@@ -19,7 +20,10 @@ from lavender.cli.options import FILE, limit_to_one_thread, make_console, print_
               help="Steps simulated from each state, with its controls; the last one is explained.")  # fmt: skip
 @click.option("--contact", "contacts", multiple=True, metavar="GEOM",
               help="Contacts of geoms whose names contain this; may be repeated. Default: all.")  # fmt: skip
-def slip(model: Path, states: str | None, steps: int, contacts: tuple[str, ...]) -> None:
+@click.option("--out", type=FOLDER, help="Folder of a page with the slip over time and of numbers.json.")
+def slip(
+    model: Path, states: str | None, steps: int, contacts: tuple[str, ...], out: Path | None
+) -> None:  # fmt: skip
     """Explain why contacts of a MuJoCo model slip.
 
     MODEL is an MJCF or .mjb file. The first table shows the speed of each contact along its surface after the step, and
@@ -31,6 +35,7 @@ def slip(model: Path, states: str | None, steps: int, contacts: tuple[str, ...])
 
     Exit code 1: no state has a contact with friction.
     """
+    from lavender.audit.provenance import format_provenance
     from lavender.audit.slip_states import explain_slip_of_states
     from lavender.base.arrays import check_int
     from lavender.io.start_states import can_sleep, load_model
@@ -38,6 +43,8 @@ def slip(model: Path, states: str | None, steps: int, contacts: tuple[str, ...])
     from lavender.report.text import format_count
 
     steps = check_int("steps", steps, 1)
+    if out is not None:
+        check_writable(out, folder=True)
     limit_to_one_thread()
     mj, loaded = load_model(model)
     with show_progress() as watch:
@@ -68,3 +75,6 @@ def slip(model: Path, states: str | None, steps: int, contacts: tuple[str, ...])
         print_escaped(f"\nSettings simulated from {format_count(worst.n_states, 'state')}, mean slip:")
         print_table(console, worst.remedies_table)
         print_escaped("\n".join(worst.advice))
+    if out is not None:
+        print_escaped(f"\nPage: {result.page.write(out)}")
+    print_escaped(f"\n{format_provenance(result.provenance | {'model': model.name})}")

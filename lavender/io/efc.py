@@ -306,7 +306,7 @@ def from_mujoco_many(
         Made once for `model`, it saves each call the time to make an MjData, more than that of 30 worlds. It needs
         threads=1. The results do not depend on it.
     velocity : (n, nv) array, optional
-        It receives the velocity after each step that MuJoCo's answer predicts; see `lavender.io.mujoco.engine_answer`.
+        It receives the velocity after each step that MuJoCo's answer predicts, as in `engine_answer`.
         It needs states of mjSTATE_INTEGRATION.
 
     Returns

@@ -209,7 +209,7 @@ def find_mover(step: Step, is_stepped: bool) -> str:
 
     They describe the same motion if the solver has converged, and with PGS. Euler's method with damping, `implicit` and
     `implicitfast` solve (M - h dF/dv) a = qfrc_smooth + qfrc_constraint; all other methods use qacc. RK4 uses the qacc
-    of each of its four passes: after a step, the rows are those of the last pass, and qacc is the mean of all.
+    of each of its four passes: after a step, the rows belong to the last pass, and qacc is the mean of all.
     """
     model, mj = step.model, step.cache.mj
     option, kinds = model.opt, mj.mjtIntegrator

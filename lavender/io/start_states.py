@@ -35,11 +35,8 @@ OPTIONAL = (
     "act", "ctrl", "qacc_warmstart", "time", "mocap_pos", "mocap_quat", "userdata", "eq_active", "qfrc_applied",
     "xfrc_applied",
 )  # fmt: skip
-LABELS = (
-    "world",
-    "step",
-    "model",
-)  # Additional arrays in the files of `lavender audit`: the origin of each state.
+# Additional arrays in the files of `lavender audit`: the origin of each state.
+LABELS = ("world", "step", "model", "mujoco")
 # Arrays of a model with these prefixes determine the motion; together with a state they define a step's problem.
 MODEL_ARRAYS = (
     "body_", "jnt_", "dof_", "geom_", "eq_", "tendon_", "wrap_", "actuator_", "pair_", "flex_", "qpos",
@@ -247,8 +244,23 @@ def read_states(mj: Any, model: Any, source: Any) -> StartStates:
     if isinstance(source, (str, os.PathLike)):
         label = f"states {os.fspath(source)}"
         arrays = read_arrays(source)
-    states = _read_arrays(mj, model, arrays, label)
+    try:
+        states = _read_arrays(mj, model, arrays, label)
+    except InputError as error:
+        other = _describe_other_version(mj, arrays)
+        raise InputError(f"{error}. {other}" if other else str(error)) from None
     return dataclasses.replace(states, misfit=_describe_misfit(mj, model, arrays, states))
+
+
+def _describe_other_version(mj: Any, arrays: Mapping[str, Any]) -> str:
+    """Return a sentence on states that another version of MuJoCo wrote; else empty."""
+    versions = {*np.atleast_1d(arrays.get("mujoco", mj.__version__)).tolist()} - {mj.__version__}
+    if not versions:
+        return ""
+    return (
+        f"The start states are of MuJoCo {', '.join(sorted(versions))}, and {mj.__version__} is installed: versions "
+        "differ in inertias of meshes, in defaults and in the contents of a state, so that errors differ."
+    )
 
 
 def _describe_misfit(mj: Any, model: Any, arrays: Mapping[str, Any], states: StartStates) -> str:
@@ -257,6 +269,8 @@ def _describe_misfit(mj: Any, model: Any, arrays: Mapping[str, Any], states: Sta
         "If the model was changed after loading, as environments and domain randomisation do, the errors are those of "
         "another problem: give the changed model as a mujoco.MjModel or as .mjb (mujoco.mj_saveModel)."
     )
+    if other := _describe_other_version(mj, arrays):
+        return other
     if "model" in arrays and {*np.atleast_1d(arrays["model"]).tolist()} != {hash_model(model)}:
         return f"The start states are of a model with other bodies, geoms, joints or equalities. {advice}"
     data, largest, name = mj.MjData(model), 0.0, ""

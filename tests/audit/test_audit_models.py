@@ -278,3 +278,27 @@ def test_audit_compares_the_next_velocities_with_the_predicted_ones(integrator, 
     found = audit(Hooked(), policy=lambda observation: None, worlds=1, steps=5)
     assert (found.prediction.steps, found.prediction.different, found.prediction.first) == (5, 1, (0, 2))
     assert "did not move as the judged answer predicts" in " ".join(found.advice)
+
+
+def test_audit_names_versions_settings_model_and_date():
+    model = mj.MjModel.from_xml_string(BOXES.format(options=EARLY))
+    found = audit(model, worlds=1, steps=5, workers=1).totals["provenance"]
+    assert (found["engine"], found["engine_version"], found["mujoco"]) == ("mujoco", mj.__version__, mj.__version__)
+    assert found["lavender"] == lv.__version__
+    assert found["model_hash"] == hash_model(model, options=True)[:12]
+    assert found["integrator"] == "Euler" and found["timestep"] == model.opt.timestep
+    assert found["command"] is None or found["command"].startswith("lavender")
+    assert found["date"].endswith("+00:00")
+
+
+def test_read_states_of_another_version_of_mujoco_names_the_versions():
+    model = mj.MjModel.from_xml_string(
+        "<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
+    )
+    arrays = {"qpos": np.array([model.qpos0]), "qvel": np.zeros((1, 6)), "model": np.array(["other"])}
+    assert "other bodies" in read_states(mj, model, arrays).misfit
+    arrays["mujoco"] = np.array(["3.8.1"])
+    misfit = read_states(mj, model, arrays).misfit
+    assert "MuJoCo 3.8.1" in misfit and mj.__version__ in misfit and "other bodies" not in misfit
+    with pytest.raises(lv.InputError, match=r"qvel.*MuJoCo 3\.8\.1"):
+        read_states(mj, model, arrays | {"qvel": np.zeros((1, 7))})

@@ -45,6 +45,7 @@ def test_audit_steps_counts_each_outcome_of_claims(tmp_path):
     result.write(tmp_path)
     stored = lv.io.read(tmp_path / "worst" / "worst_1.npz")
     assert lv.residual(stored.problem, stored.impulse).velocity == pytest.approx(0.3)
+    result.provenance |= {"date": "2026-01-01T00:00:00+00:00", "lavender": "0.1.0", "command": None}
     terminal = io.StringIO()
     result.page.print_short(Console(file=terminal, width=100))
     check_text("audit.txt", "terminal", terminal.getvalue())

@@ -304,3 +304,58 @@ def test_slip_of_round_cones_names_the_undefined_law():
     explanations = explain_slip_of_states(block(0.3, option='cone="elliptic"', condim=4), steps=100).explanations
     assert "Variant 'coulomb': Coulomb's law is not defined for its round cones." in explanations[0].sentences
     assert explanations[0].parts["convex relaxation"] == pytest.approx([0.0] * len(explanations[0].contacts))
+
+
+def falling_states(model, velocities):
+    """Return the states of a box that has settled, with these velocities along x and upwards [m/s]."""
+    kind, data = mujoco.mjtState.mjSTATE_INTEGRATION, mujoco.MjData(model)
+    for _ in range(300):
+        mujoco.mj_step(model, data)
+    states = []
+    for x, up in velocities:
+        data.qvel[:] = 0.0
+        data.qvel[0], data.qvel[2] = x, up
+        states.append(np.empty(mujoco.mj_stateSize(model, kind)))
+        mujoco.mj_getState(model, data, states[-1], kind)
+    return np.array(states)
+
+
+def test_slip_over_time_counts_steps_with_contact_of_all_states():
+    model = block(0.0, friction=0.1)
+    states = falling_states(model, [(0.5, 0.0), (0.2, 1.0)])
+    touches, speeds = np.zeros((2, 1 + REMEDY_STEPS), bool), np.zeros((2, 1 + REMEDY_STEPS))
+    for own, speed, state in zip(touches, speeds, states, strict=True):
+        data = mujoco.MjData(model)
+        mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
+        for step in range(len(own)):
+            mujoco.mj_forward(model, data)
+            own[step] = data.ncon > 0
+            mujoco.mj_step(model, data)
+            speed[step] = abs(data.qvel[0])
+    n = int(touches[:, 1:].sum())
+    assert 0 < n < 2 * REMEDY_STEPS
+    both = explain_slip_of_states(model, {"state": states}).worst
+    now = both.remedies[0]
+    assert (now.touching, now.kept) == (n / (2 * REMEDY_STEPS), int(touches[:, -1].sum()))
+    np.testing.assert_array_equal(np.isfinite(now.speeds), touches.any(axis=0))
+    # The box turns by less than 1e-3 rad.
+    assert now.later == pytest.approx(speeds[:, 1:][touches[:, 1:]].mean(), rel=1e-2)
+    assert both.remedies_table.iloc[0].tolist()[3:] == [f"{n} of 50", f"{now.kept} of 2"]
+
+
+def test_slip_names_no_setting_twice():
+    options = 'noslip_iterations="20" tolerance="1e-12" iterations="10" impratio="2"'
+    model = block(0.2, option=options)
+    settings = [r.setting for r in explain_slip_of_states(model, steps=5).worst.remedies]
+    assert len(settings) == len(set(settings)) >= 4
+
+
+def test_slip_explanation_prints_the_digits_of_the_command(tmp_path):
+    from lavender.report.render import format_cells
+
+    result = explain_slip_of_states(block(0.2), steps=20)
+    explanation = result.explanations[0]
+    assert format_cells(explanation.table).to_string(index=False) in str(explanation)
+    page = result.page.write(tmp_path / "slip")
+    assert "slip-over-time" in page.read_text(encoding="utf-8")
+    assert mujoco.__version__ in (tmp_path / "slip" / "numbers.json").read_text(encoding="utf-8")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lavender.audit.page import ResultPage, Section, StepSizes, describe_exceedance
+from lavender.audit.provenance import format_provenance
 from lavender.audit.settings import MERGE_NOTE, MujocoSetting
 from lavender.audit.tune.measured import Measured
 from lavender.base.deadline import format_seconds
@@ -54,6 +55,8 @@ class Tuning:
         The fastest setting whose error does not exceed this number in any step is also recommended.
     held_errors : dict
         Largest error [m/s] on the worlds held back, of the settings that were judged there.
+    provenance : dict
+        Result of `describe_provenance`.
     """
 
     model: str
@@ -68,6 +71,7 @@ class Tuning:
     n_held_worlds: int = 0
     error_limit: float | None = None
     held_errors: Mapping[MujocoSetting, float] = field(default_factory=dict)
+    provenance: dict[str, Any] = field(default_factory=dict)
 
     @property
     def present_result(self) -> Measured:
@@ -352,7 +356,8 @@ class Tuning:
                 Section("Every setting", [self._tabulate_settings(every)],
                         note="Settings with which a world diverges are left out."),
             ],
-            numbers=numbers, notes=list(filter(None, (*self.notes, self.busy))), is_stopped=self.stopped,
+            numbers=numbers | {"provenance": self.provenance}, notes=list(filter(None, (*self.notes, self.busy))),
+            is_stopped=self.stopped, provenance=format_provenance(self.provenance) if self.provenance else "",
         )  # fmt: skip
 
 

@@ -24,6 +24,7 @@ import numpy as np
 from lavender.audit.audit import hash_parameters
 from lavender.audit.page import StepSizes
 from lavender.audit.pieces import Judging
+from lavender.audit.provenance import describe_provenance
 from lavender.audit.settings import MujocoSetting
 from lavender.audit.simulated_worlds import Runs, can_any_geoms_collide, count_engine_warnings
 from lavender.audit.tune.measured import Measured, make_unmeasured
@@ -179,6 +180,7 @@ def _run_tuning(
             runs.name, horizon, timed, held, threshold=threshold, stopped=stopped, sizes=sizes, busy=busy,
             n_held_worlds=runs.worlds // 2, error_limit=error_limit, held_errors=dict(held_errors),
             notes=tuple(filter(None, (*runs.notes, note, judged.note))),
+            provenance=describe_provenance(runs.model, runs.name),
         )  # fmt: skip
 
     def judge(stage: Stage, settings: list[MujocoSetting]) -> list[Measured]:
