@@ -3,7 +3,7 @@
 PYTHON ?= .venv/bin/python
 BIN := $(dir $(PYTHON))
 
-.PHONY: help setup kernels test quick lint format types coverage docs wasm fingerprint ci nightly release clean
+.PHONY: help setup kernels gates test quick lint format types coverage docs wasm fingerprint ci nightly release clean
 
 help:  ## list the commands
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -17,6 +17,9 @@ kernels:  ## build the changed modules of lavender_ext/
 
 test: kernels  ## run all tests
 	$(PYTHON) -m pytest -q -n auto --dist worksteal
+
+gates:  ## run linters, layers, language, the table of calls, contracts of changed solvers, sizes (under a minute)
+	.ci/gates
 
 quick: kernels  ## run all tests except slow ones, stop at the first failure
 	$(PYTHON) -m pytest -q -x -m "not slow"

@@ -1,4 +1,8 @@
-"""`solve`: check the arguments, try the compiled call for small problems, else prepare a solver and run it."""
+"""`solve`: check the arguments, try the compiled call for small problems, else prepare a solver and run it.
+
+The last line replaces `solve` by a compiled function of `lavender_ext/small/call.pyx`, which tries the compiled call
+for plain arguments itself, and calls the function below for all others.
+"""
 
 from __future__ import annotations
 
