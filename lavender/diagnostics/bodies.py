@@ -150,11 +150,6 @@ def diagnose_masses(p: Problem) -> Iterator[Diagnostic]:
     r = reconstruct_bodies(p)
     if r is None or not r.n_bodies:
         return
-    turning = np.abs(r.inv_inertia).max(axis=(1, 2)) > 0.0
-    still = np.flatnonzero((r.inv_mass == 0.0) & turning)
-    if len(still):
-        reason = f"body {still[0]} has a finite inertia and an infinite mass (inv_mass 0): it turns and never moves"
-        yield make_diagnostic(p, "masses", reason, bodies=still.tolist())
     eigen = np.linalg.eigvalsh(r.inv_inertia)
     size = _compute_longest_arms(r)
     known = np.flatnonzero((r.inv_mass > 0.0) & (eigen[:, 0] > 1e-9 * eigen[:, -1]) & (size > 0.0))

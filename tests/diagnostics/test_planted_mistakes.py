@@ -204,13 +204,11 @@ def test_diagnose_of_a_kinematic_tree_does_not_assume_rigid_bodies(scenes, has_r
     assert kinds(replace(flipped, jac=jac, mass=with_joint, v_free=None, **more).problem) == set()
 
 
-def test_diagnose_of_a_conveyor_or_another_unit_of_speed_reports_nothing(scenes):
+def test_diagnose_of_a_conveyor_reports_nothing(scenes):
     step = replace(scenes["ramp 11 2"], rows=None)
     target = step.target.copy()
     target[step.contacts[:, 0]], target[step.contacts[:, 1]] = 0.0, 0.8
     assert kinds(replace(step, target=target).problem) == set()
-    target[step.contacts[0, 1]] = 0.7
-    assert "tangents first" in kinds(replace(step, target=target).problem)
 
 
 @pytest.mark.parametrize(("offset", "kinds"), [(0.5, []), (5.0, ["joint targets"])])  # m, at 60 steps per second

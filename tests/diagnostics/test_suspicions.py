@@ -67,15 +67,6 @@ def test_diagnose_of_targets_in_wrong_order_reports_them():
     assert kinds(made(problem, rows, np.roll(target, -mj))) == {"targets"}
 
 
-def test_diagnose_of_a_depth_of_wrong_sign_reports_targets():
-    rows, _ = given(SCENES["stack"])
-    rows["v_free"][:] = (0.0, 0.0, -9.81 / 60, 0.0, 0.0, 0.0)
-    target = np.zeros(SCENES["stack"].m)
-    for depth, wanted in ((0.01, set()), (-0.01, {"targets"})):
-        target[::3] = depth * 60
-        assert kinds(made(SCENES["stack"], rows, target)) == wanted
-
-
 def test_diagnose_of_duplicate_keys_forces_and_large_friction_reports_them():
     problem = SCENES["stack"]
     doubled = np.array(problem.key)
