@@ -115,7 +115,7 @@ def make_folder(path: str | os.PathLike[str]) -> Path:
 
 
 def write_atomically(path: str | os.PathLike[str], write: Callable[[Path], Any]) -> None:
-    """Write a file atomically, so that readers see the old file or the complete new file.
+    """Write a file atomically, so that readers get the old file or the complete new file.
 
     `write` is called with a temporary path in the folder of the file, which is then renamed. If `path` is a symbolic
     link, the target of the link is replaced. The permissions of an existing file are kept.

@@ -201,7 +201,7 @@ def build(
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Write a file atomically: concurrent readers see the old file or the new one."""
+    """Write a file atomically: concurrent readers get the old file or the new one."""
     part = path.with_name(f".{path.name}.{os.getpid()}.{get_native_id()}.part")
     try:
         part.write_bytes(data)
