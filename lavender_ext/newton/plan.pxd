@@ -13,12 +13,12 @@
                                               that there is no solution
     Coulomb's       START_FLOW                Euler steps, if the start solves the convex law     START_DAMPED_NEWTON
                     START_DAMPED_NEWTON       proximal damped Newton from the start               FIRST_DE_SAXCE
-                    FIRST_DE_SAXCE            De Saxce's interior point, 0.95 of phi's derivative FIRST_FLOW
-                    FIRST_FLOW                Euler steps, if this point is near a solution       CONVEX_POINT
+                    FIRST_DE_SAXCE            De Saxce's interior point, 0.95 of phi's derivative CONVEX_POINT
                     CONVEX_POINT              interior point of the convex law, judged under      CONVEX_FLOW
                                               Coulomb's law, unless the start solves it; ends
                                               if many contacts slide
-                    CONVEX_FLOW               Euler steps from it, if few contacts slide          FIRST_PATH
+                    CONVEX_FLOW               Euler steps from it, if few contacts slide          FIRST_FLOW
+                    FIRST_FLOW                Euler steps, if the best point is near a solution   FIRST_PATH
                     FIRST_PATH                path of smoothed problems, unless joints are rigid  SECOND_DE_SAXCE
                     SECOND_DE_SAXCE           De Saxce's interior point with 0.7 of it            AUGMENTED_DE_SAXCE
                     AUGMENTED_DE_SAXCE        the same on the augmented system, if joints are     LAST_PATH
@@ -26,6 +26,10 @@
                     LAST_PATH                 the path of smoothed problems, if joints are rigid  LAST_FLOW
                     LAST_FLOW                 Euler steps from the best point                     COULOMB_DAMPED_NEWTON
                     COULOMB_DAMPED_NEWTON     proximal damped Newton from the best point          COULOMB_END
+
+A large problem is at rest if the impulse that holds all contacts puts little load on contacts whose friction exceeds its
+bound. De Saxce's interior point, which computes this impulse, then takes fewer steps, and the steps of LAST_FLOW come before
+the path.
 
 Each state with a problem that needs it: without the state the problem is lost, or takes this many times as long. `python -m
 benchmarks scale --without STATE` measures this, except for states of DE_SAXCE. A problem is a structure of
@@ -43,9 +47,9 @@ tol is 1e-6 unless the line names another one.
     START_FLOW                granularF(n=6, sliding=2, seed=2) from the solution of the cone law: 2.4
     START_DAMPED_NEWTON       engine/balls_step_0030: 4.6
     FIRST_DE_SAXCE            cards 3000 0.1 0: 20
-    FIRST_FLOW                cards 900 0.1 0: 5.0
     CONVEX_POINT              pile 3000 0.5 0
     CONVEX_FLOW               granularF(n=4, sliding=2, seed=10): 9
+    FIRST_FLOW                cards 900 0.1 0: 5.0
     FIRST_PATH                wall 3000 0.5 1
     SECOND_DE_SAXCE           ragdolls 300 0.5 0: 1.9
     DE_SAXCE_SECOND_END       ragdolls 3000 0.5 1, seed 31: 3.2
@@ -73,8 +77,8 @@ from lavender_ext.newton.active_set cimport begin_active_set, step_active_set
 from lavender_ext.newton.damped_newton cimport (begin_damped_newton, begin_damped_newton_stretches,
                                                 continue_damped_newton_stretches, push_damped_newton, step_damped_newton)
 from lavender_ext.newton.interior_phases cimport (augmented_shift, begin_interior_steps, begin_interior_with_newton,
-                                                  compute_sliding_fraction, step_augmented_newton, step_interior_point,
-                                                  step_interior_with_newton)
+                                                  compute_overloaded_fraction, compute_sliding_fraction, step_augmented_newton,
+                                                  step_interior_point, step_interior_with_newton)
 from lavender_ext.newton.run cimport (ACTIVE_SET, AUGMENTED_NEWTON, DAMPED_NEWTON, DAMPED_STRETCHES, DE_SAXCE, FLOW,
                                       INTERIOR_POINT, INTERIOR_WITH_NEWTON, MAX_INNER_STEPS, N_COUNTED, N_REFINEMENTS,
                                       UNLIMITED, PLAN_CONVEX, PLAN_COULOMB, begin_separate_best, convex_residual,
@@ -101,9 +105,9 @@ cdef enum:                      # states of PLAN_COULOMB
     START_FLOW = 0
     START_DAMPED_NEWTON = 1
     FIRST_DE_SAXCE = 2
-    FIRST_FLOW = 3
-    CONVEX_POINT = 4
-    CONVEX_FLOW = 5
+    CONVEX_POINT = 3
+    CONVEX_FLOW = 4
+    FIRST_FLOW = 5
     FIRST_PATH = 6
     SECOND_DE_SAXCE = 7
     AUGMENTED_DE_SAXCE = 8
@@ -157,6 +161,14 @@ cdef inline double max_sliding_fraction() noexcept nogil:
     Of piles of balls that it solves up to 4 % slide at the convex point; of towers, walls and pyramids 7 % to 80 %.
     """
     return 0.05
+
+
+cdef inline double max_overload_at_rest() noexcept nogil:
+    """Return the part of the load that the impulse which holds all contacts may put on contacts that must slide at rest.
+
+    At rest it is 0 to 0.1 (nine structures), sliding at 0.05 m/s 0.03 to 0.29, at 0.5 m/s 0.41 and more.
+    """
+    return 0.15
 
 
 cdef inline double max_start_residual() noexcept nogil:
@@ -342,6 +354,8 @@ cdef inline void enter_next_de_saxce_state(newton_t* n) noexcept nogil:
     x.stage = state + 1
     if state == DE_SAXCE_INTERIOR:
         begin_interior_point(n, compute_proximal_weight(), x.derivative_fraction)
+        n.is_at_rest = (n.s.e.m >= MIN_FLOW_ROWS
+                        and compute_overloaded_fraction(n.s.e, n.ip.unbounded_z) < max_overload_at_rest())
         begin_interior_with_newton(n, 0)
     elif state == DE_SAXCE_END and n.progress.lowest <= x.max_residual and not is_over(n):
         begin_damped_newton_after_de_saxce(n, min(n.progress.lowest, 1e-3), END_INNER_STEPS, END_FACTORISATIONS)
@@ -387,9 +401,6 @@ cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
             begin_damped_newton_stretches(n, START_FACTORISATIONS, 2.0 * max_start_residual_ratio() * n.best)
     elif state == FIRST_DE_SAXCE:
         begin_de_saxce(n, first_derivative_fraction(), far_from_end())
-    elif state == FIRST_FLOW:
-        if n.s.e.m >= MIN_FLOW_ROWS and n.best < max_flow_residual() and not n.flow.has_run:
-            begin_flow(n, n.best_z, FIRST_FLOW_FACTORISATIONS, FLOW_PATIENCE)
     elif state == CONVEX_POINT:
         if not n.has_convex_start and has_convex_law(n):
             begin_interior_point(n, compute_proximal_weight(), 0.0)
@@ -401,8 +412,13 @@ cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
             n.mostly_slides = n.mostly_slides or slides_mostly(n, n.convex_z)
         if n.has_convex_start and not n.mostly_slides:
             begin_flow(n, n.convex_z, CONVEX_FLOW_FACTORISATIONS, CONVEX_FLOW_FACTORISATIONS)
+    elif state == FIRST_FLOW:
+        if n.s.e.m >= MIN_FLOW_ROWS and n.best < max_flow_residual() and not n.flow.has_run:
+            begin_flow(n, n.best_z, FIRST_FLOW_FACTORISATIONS, FLOW_PATIENCE)
     elif state == FIRST_PATH:
-        if not has_rigid_joints(n):
+        if n.is_at_rest:
+            begin_flow(n, n.best_z, LAST_FLOW_FACTORISATIONS, LAST_FLOW_PATIENCE)
+        elif not has_rigid_joints(n):
             begin_path(n)
     elif state == SECOND_DE_SAXCE:
         begin_de_saxce(n, second_derivative_fraction(), 1.0 / 0.0)
@@ -410,10 +426,11 @@ cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
         if n.has_augmented and has_rigid_joints(n):
             begin_augmented_interior_point(n, second_derivative_fraction())
     elif state == LAST_PATH:
-        if has_rigid_joints(n):
+        if has_rigid_joints(n) or n.is_at_rest:
             begin_path(n)
     elif state == LAST_FLOW:
-        begin_flow(n, n.best_z, LAST_FLOW_FACTORISATIONS, LAST_FLOW_PATIENCE)
+        if not n.is_at_rest:
+            begin_flow(n, n.best_z, LAST_FLOW_FACTORISATIONS, LAST_FLOW_PATIENCE)
     elif state == COULOMB_DAMPED_NEWTON:
         begin_damped_newton(n, n.best_z, COULOMB, start_alpha(), MAX_INNER_STEPS)
         push_damped_newton(n, UNLIMITED)
@@ -456,7 +473,7 @@ cdef inline void start_newton_solve(newton_t* n, const double* lam) noexcept nog
     cdef int32_t i
     cdef bint has_cones = n.s.e.n < n.s.e.m
     n.stop = n.needs_check = n.proven = n.depth = 0
-    n.has_convex_start = n.mostly_slides = 0
+    n.has_convex_start = n.mostly_slides = n.is_at_rest = 0
     n.flow.has_run = 0
     n.s.augmented = n.s.factorisations = 0
     for i in range(N_COUNTED):
