@@ -6,14 +6,13 @@
     large problems   under Coulomb's law, from `relaxed_rows` rows on (of J and M, if the velocities belong to free
                      bodies). The convex relaxation has the same solution if no contact slips, so it comes first, and
                      every iterate is judged under Coulomb's law. Islands that a stage has solved do not continue. If
-                     bodies touch at several points and Newton's method costs few sweeps, 1 to 3 do not run
+                     bodies touch at several points and Newton's method costs few sweeps, 1 and 2 do not run
                      1. `anderson` under the cone law, while the sweeps that it predicts cost less than Newton's method
                      2. the same after an analysis of Newton's matrix, for at least `sweep_fraction` of its cost
-                     3. `admm` from zero, up to 0.4 times that cost, if this pays for 150 iterations
-                     4. interior points of `newton` on the relaxation. Contacts slip if their residual of it falls below
+                     3. interior points of `newton` on the relaxation. Contacts slip if their residual of it falls below
                         `slip_ratio` times Coulomb's. They then end if Coulomb's is above `trial_residual`, or if few
                         contacts are near sliding
-                     5. `admm` from the relaxation's solution, `trial_iterations` at a time while it is predicted to end
+                     4. `admm` from the relaxation's solution, `trial_iterations` at a time while it is predicted to end
                      The alternation follows
     sweeps           `anderson`, unless the problem is linear or large: `first_sweeps` sweeps. Sweeping continues up to
                      the cost of the cheapest factorising solver, unless more sweeps are predicted to be needed

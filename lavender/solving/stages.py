@@ -21,13 +21,6 @@ from lavender.solvers.registry import get
 from lavender.solving.log import get_relaxation
 from lavender.solving.steps import Newton, RelaxedNewton, Step, estimate_cost, starts_relaxed
 
-RELAXED_BUDGET_RATIO = 2.0  # The relaxation may take this multiple of the expected number of factorisations.
-# On large problems with friction, `admm` may cost this fraction of Newton's method before that runs, up to the largest
-# number of iterations, if it pays for the smallest. Without a factor, an iteration costs about as much as three sweeps.
-ADMM_FRACTION, SWEEPS_PER_ADMM_ITERATION = 0.4, 3.0
-MIN_ADMM_ITERATIONS, MAX_ADMM_ITERATIONS = 150.0, 600.0
-MAX_TRIALS = 2  # `admm` continues from the relaxation while this number of turns is predicted to suffice.
-
 
 @dataclass(frozen=True)
 class Stage:
@@ -245,24 +238,15 @@ class DecisionTree:
         state = self.newton_state
         if state is None:
             return
-        cost = ADMM_FRACTION * state.cost
-        iterations = min(cost / (SWEEPS_PER_ADMM_ITERATION * self.relaxed_sweep), MAX_ADMM_ITERATIONS)
-        runs_admm = iterations >= MIN_ADMM_ITERATIONS and not self.has_cheap_newton
         if self.first_stage <= 2 and not self.has_cheap_newton:
             why = f"up to {format_seconds(1e-9 * state.cost)}, as much as newton costs"
-            least = state.cost / self.relaxed_sweep
-            if runs_admm:
-                least = min(least, SWEEPS_PER_ADMM_ITERATION * iterations)
-            yield Stage("anderson", inf, state.cost, why, least=least, position=2)
-        if self.first_stage <= 3 and runs_admm:
-            why = f"up to {ADMM_FRACTION:g} times newton's cost"
-            yield Stage("admm from zero", iterations, cost, why, position=3)
-        if self.first_stage <= 4:
-            n, why = RELAXED_BUDGET_RATIO * state.steps, "exact if no contact slips"
-            yield Stage("newton on the relaxation", n, state.cost, why, position=4)
+            yield Stage("anderson", inf, state.cost, why, least=state.cost / self.relaxed_sweep, position=2)
+        if self.first_stage <= 3:
+            n, why = DECISIONS.relaxed_ratio * state.steps, "exact if no contact slips"
+            yield Stage("newton on the relaxation", n, state.cost, why, position=3)
         if self.log is None or self.log.relaxed is not None:
             n, why = DECISIONS.trial_iterations, "from the relaxation, while it is predicted to end soon"
-            yield from self.repeat_while_converging(Stage("admm", n, n * self.relaxed_sweep, why), MAX_TRIALS)
+            yield from self.repeat_while_converging(Stage("admm", n, n * self.relaxed_sweep, why), 2)
 
     def iterate_factorising_stages(self, times: float) -> Iterator[Stage]:
         """Yield stages of the factorising solvers; each may cost `times` the estimated cost of the cheapest of them."""
@@ -296,8 +280,8 @@ class DecisionTree:
         if starts_relaxed(p):
             yield from (self.factorisation(name, cost, why) for name in self.solver_costs)
             # An iteration costs as much as a sweep under the cone law.
-            n = ADMM_FRACTION * cost / self.relaxed_sweep
-            yield from self.repeat_while_converging(Stage("admm", n, ADMM_FRACTION * cost, why))
+            n = DECISIONS.admm_fraction * cost / self.relaxed_sweep
+            yield from self.repeat_while_converging(Stage("admm", n, DECISIONS.admm_fraction * cost, why))
             return
         n = 0.5 * cost / self.sweep  # An iteration of `admm` costs as much as two sweeps.
         if p.generalized is not None:

@@ -25,10 +25,7 @@ from lavender.solving.log import SolveLog, get_relaxation
 from lavender.solving.loop import Loop
 from lavender_ext.judge.measure import all_finite, residuals_by_island
 
-# With fewer contacts near sliding, `newton` follows at once. Heaps, which it solves soon, have 0.01, pyramids 0.03.
-MIN_NEAR_SLIDING = 0.02
 MAX_CALL_ITERATIONS = 2**30  # Largest number of iterations in one call.
-SOLVED_RELAXATION_RATIO = 1e-5  # The relaxation is solved below this multiple of Coulomb's residual.
 MIN_PREDICTED_RESIDUAL = 1e-16  # Predictions of remaining sweeps replace a smaller tol by this one.
 FIRST_SWEEPS_OF_LARGE_PROBLEM = 8  # Sweeps of `is_large` problems before the first prediction.
 FIRST_RELAXED_FACTORISATIONS = 6  # Interior points on the relaxation need at least as many factorisations.
@@ -194,10 +191,10 @@ class RelaxedNewton(Step):
             log.judge_and_store_best(trial)
             ratio, residual = log.compare_with_relaxation(trial)
             slips = slips or ratio < DECISIONS.slip_ratio
-            few_slide = slips and system.solve.fraction_near_sliding < MIN_NEAR_SLIDING
+            few_slide = slips and system.solve.fraction_near_sliding < DECISIONS.near_sliding
             if log.best <= log.tol or few_slide or (slips and residual > DECISIONS.trial_residual):
                 break
-            if ratio < SOLVED_RELAXATION_RATIO:
+            if ratio < DECISIONS.relaxed_solved:
                 log.relaxed = trial
                 break
         return replace(claim, iterations=done, work=work)

@@ -34,7 +34,6 @@ def asymmetric():
 
 SWEPT = ["anderson", "anderson"]
 RELAXED = ["anderson", "anderson", "newton on the relaxation", "admm", "newton"]
-RELAXED_OVER_A = [*SWEPT, "admm from zero", *RELAXED[2:]]
 # The first stages of `auto` for a problem of each kind.
 FIRST = {
     "linear, a matrix": (lambda: as_matrix(suite.hang(n=24).problem), ["direct"]),
@@ -51,7 +50,7 @@ FIRST = {
         [*SWEPT, "newton"],
     ),
     "a loose pile": (lambda: suite.granular(n=4, friction="coulomb").problem, [*SWEPT, "newton"]),
-    "a loose pile, a matrix": (lambda: as_matrix(suite.case("granularF(n=6, seed=2)").problem), RELAXED_OVER_A),
+    "a loose pile, a matrix": (lambda: as_matrix(suite.case("granularF(n=6, seed=2)").problem), RELAXED),
     "a loose pile, J and M": (lambda: general(suite.case("granularF(n=6, seed=2)").problem), RELAXED),
     "a pile that rolls": (lambda: drawn(seed=98103, part="rolling").problem, RELAXED),
     "a pile that rolls, a matrix": (lambda: as_matrix(drawn(seed=98103, part="rolling").problem), RELAXED),
