@@ -216,10 +216,10 @@ def read_arrays(path: str | os.PathLike[str]) -> Arrays:
     """
     name, arrays = "", Arrays()
     try:
-        archive = np.load(as_path(path), allow_pickle=False)
-        if isinstance(archive, np.ndarray):
-            raise ValueError("it is a single array")
-        with archive:
+        with as_path(path).open("rb") as stream:  # NumPy leaves a damaged file open.
+            archive = np.load(stream, allow_pickle=False)
+            if isinstance(archive, np.ndarray):
+                raise ValueError("it is a single array")
             for name in archive:
                 arrays[name] = archive[name]
                 if not isinstance(arrays[name], np.ndarray):
