@@ -42,10 +42,9 @@ DEFINITE_SHIFTS = 1e-7, 1e-5
 MAX_CLAIM_ERROR = (
     1e-3  # [-] A claim "infeasible" with a larger error of its proof is followed by a second call.
 )
-# A J of at most this many dense entries is converted before its rows are selected.
-MAX_CONVERTED_ENTRIES = 10**5
-# The matrix of the Newton step is dense up to this many variables and active rows, and with this share of nonzeros.
-MAX_DENSE_STEP_SIZE, MIN_DENSE_FILL = 300, 0.2
+# P and J are dense with at most this many entries together, and with more than this share of nonzeros.
+MAX_CONVERTED_ENTRIES, MIN_DENSE_FILL = 10**5, 0.2
+MAX_DENSE_STEP_SIZE = 300  # The matrix of the step is dense up to this many variables and active rows.
 MAX_STEP_SIZE = 20_000  # No step is done with more variables and active rows.
 MAX_FIT_SIZE = 300  # Largest number of variables and of active rows for `fit_multipliers`.
 NEAR_SLACK = 1e-8  # [-] Rows with a smaller slack in scaled units may be active with a multiplier of 0.
@@ -187,21 +186,20 @@ class ConvexProgram:
         size = len(free) + len(rows)
         if self.cones or size > MAX_STEP_SIZE:
             return None
-        nonzeros = len(scaled.P[2]) + 2 * len(scaled.J[2])
-        is_dense = size <= MAX_DENSE_STEP_SIZE or nonzeros > MIN_DENSE_FILL * size * size
-        P, J, t = scaled.get_hessian(is_dense), scaled.select_rows(rows, 1.0, is_dense), scaled.t[rows]
-        largest = abs(P).max() if n else 0.0
+        (P, J), t = scaled.matrices, scaled.t[rows]
+        J = J[rows]
+        largest = np.abs(scaled.P[2]).max(initial=0.0)
         weight = 1.0 / float(largest) if 0.0 < largest < np.inf else 1.0
         x, lam = self.scale_point(x, lam)
         sign = scaled.J[2][scaled.J[0][at_bound]]
         x[fixed] = sign * scaled.t[at_bound]
         multipliers = lam[rows]
         if size:
-            part = P[np.ix_(free, free)] if is_dense else P[:, free][free]
+            parts = weight * P[:, free][free], J[:, free]
+            if size <= MAX_DENSE_STEP_SIZE and sp.issparse(P):
+                parts = parts[0].toarray(), parts[1].toarray()
             try:
-                solve, refinements = (_factor_dense if is_dense else _factor_sparse)(
-                    weight * part, J[:, free]
-                )
+                solve, refinements = (_factor_sparse if sp.issparse(parts[0]) else _factor_dense)(*parts)
             except RuntimeError:  # The sparse matrix is singular in spite of its shift.
                 return None
             for _ in range(refinements):
@@ -221,7 +219,7 @@ class ConvexProgram:
         0 and no other terms, which `judge_program` compares with its own slack.
         """
         x, lam = self.scale_point(x, lam)
-        active: npt.NDArray[np.bool_] = lam > self.scaled.jacobian @ x - self.scaled.t
+        active: npt.NDArray[np.bool_] = lam > self.scaled.matrices[1] @ x - self.scaled.t
         active[: self.free] = True
         return active
 
@@ -259,7 +257,7 @@ class ConvexProgram:
         """Return the equations, and the inequalities with a slack of almost 0 in scaled units."""
         x = x / (self.scales[0] * self.scales[2])
         size = np.abs(x).max(initial=1.0) + np.abs(self.scaled.t)
-        near: npt.NDArray[np.bool_] = self.scaled.jacobian @ x - self.scaled.t <= NEAR_SLACK * size
+        near: npt.NDArray[np.bool_] = self.scaled.matrices[1] @ x - self.scaled.t <= NEAR_SLACK * size
         near[: self.free] = True
         return near
 
@@ -267,8 +265,8 @@ class ConvexProgram:
         self, x: FloatArray, lam: FloatArray, active: npt.NDArray[np.bool_], tol: float
     ) -> npt.NDArray[np.bool_]:
         """Return the active rows after a step: without negative multipliers, with rows that are violated by tol."""
-        J = self.jacobian
-        active = (active & (lam > 0.0)) | (J @ x - self.t < -tol * (abs(J) @ np.abs(x) + np.abs(self.t)))
+        x, (_, J), t = x / (self.scales[0] * self.scales[2]), self.scaled.matrices, self.scaled.t
+        active = (active & (lam > 0.0)) | (J @ x - t < -tol * (abs(J) @ np.abs(x) + np.abs(t)))
         active[: self.free] = True
         return active
 
@@ -372,8 +370,8 @@ class ScaledProgram(ConvexProgram):
     def select_rows(self, rows: Any, sign: float, dense: bool) -> Any:
         """Return sign J of these rows, dense or as `csc_matrix`."""
         if dense:
-            is_small = self.n * len(self.t) <= MAX_CONVERTED_ENTRIES
-            return sign * (self._dense_jacobian[rows] if is_small else self.jacobian[rows].toarray())
+            J = self.matrices[1]
+            return sign * (J[rows].toarray() if sp.issparse(J) else J[rows])
         ptr, idx, value = self.J
         first, last = (int(rows[0]), int(rows[-1])) if len(rows) else (0, -1)
         if last - first + 1 != len(rows):
@@ -383,13 +381,17 @@ class ScaledProgram(ConvexProgram):
         return sp.csr_matrix(arrays, (len(rows), self.n)).tocsc()
 
     @cached_property
-    def _dense_jacobian(self) -> FloatArray:
-        """J as a dense matrix."""
-        return np.asarray(self.jacobian.toarray())
+    def matrices(self) -> tuple[Any, Any]:
+        """P and J, dense if they are small or full, otherwise sparse."""
+        entries = self.n * (self.n + len(self.t))
+        nonzeros = len(self.P[2]) + len(self.J[2])
+        if entries <= MAX_CONVERTED_ENTRIES or nonzeros > MIN_DENSE_FILL * entries:
+            return _make_dense(self.P, self.n), _make_dense(self.J, self.n)
+        return self.hessian, self.jacobian
 
     def get_hessian(self, dense: bool) -> Any:
-        """Return P, dense or as `csc_matrix` with sorted indices."""
-        return self.hessian.toarray() if dense else self.hessian
+        """Return a new dense P, or P as `csc_matrix` with sorted indices."""
+        return _make_dense(self.P, self.n) if dense else self.hessian
 
     def join_multipliers(self, y: Any, z: Any, box: Any) -> FloatArray:
         """Return lambda (m,) of multipliers with the signs of qpsolvers; missing ones (None) count as 0."""
@@ -413,6 +415,14 @@ class ScaledProgram(ConvexProgram):
         np.add.at(box, self.variable[low], -lam[low])
         np.add.at(box, self.variable[high[inequality]], lam[high[inequality]])
         return -lam[a], lam[g], box
+
+
+def _make_dense(compressed: Compressed, n: int) -> FloatArray:
+    """Return compressed rows of n columns as a new dense matrix."""
+    ptr, idx, value = compressed
+    matrix = np.zeros((len(ptr) - 1, n))
+    matrix[np.repeat(np.arange(len(ptr) - 1), np.diff(ptr)), idx] = value
+    return matrix
 
 
 def _factor_dense(hessian: FloatArray, jac: FloatArray) -> tuple[Callable[[FloatArray], FloatArray], int]:

@@ -67,9 +67,9 @@ class ProgramJudge:
 
     def accepts(self, x: FloatArray, lam: FloatArray) -> bool:
         """Judge a point and its Newton steps; return whether the best point meets tol."""
-        error, active, complementary = self.keep(x, lam)
+        _, active, complementary = self.keep(x, lam)
         size = len(x) + len(lam)
-        if error > (STEP_ERROR if size <= MAX_FREE_STEP_SIZE else max(self.tol, STEP_ERROR)):
+        if self.strict_error > (STEP_ERROR if size <= MAX_FREE_STEP_SIZE else max(self.tol, STEP_ERROR)):
             first = self._polish(x, lam, self.program.compare_multipliers_with_slacks(x, lam))
             near = None
             if self.error > self.tol:  # Rows of almost no slack may be active with a multiplier of 0.

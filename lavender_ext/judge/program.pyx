@@ -382,7 +382,7 @@ def equilibrate_program(hessian, q_, jac, t_, variable_, int32_t free):
             if p.idx[k] == j and p.val[k] > 0.0:
                 curvature[j] = fabs(q[j]) / (p.val[k] * d[j])
     positive = curvature_[curvature_ > 0.0]
-    sigma = choose_size(t, e, m, free, float(np.median(positive)) if len(positive) else INFINITY)
+    sigma = choose_size(t, e, m, free, float(np.sort(positive)[len(positive) // 2]) if len(positive) else INFINITY)
     for j in range(n):
         for k in range(p.ptr[j], p.ptr[j + 1]):
             largest = max(largest, fabs(p.val[k]) * d[j] * d[p.idx[k]] * sigma * sigma)
