@@ -13,6 +13,7 @@ import numpy as np
 from lavender.audit.simulated_worlds import Divergence, Frame
 from lavender.base.arrays import FloatArray
 from lavender.batch.residuals import residual_many
+from lavender.io.mujoco import PREDICTION_TOLERANCE
 from lavender.judge.residuals import UNCONVERGED, VERDICTS, WRONG
 from lavender.problem import Problem
 
@@ -20,9 +21,6 @@ AUDIT_VERDICTS = (*VERDICTS, "not judged")
 NOT_JUDGED = len(VERDICTS)
 WORST_ROW_ERRORS = ("velocity", "impulse", "relative", "floor")  # Errors of the worst row [m/s, N s, -, -].
 N_WORST_WORLDS = 3  # Number of worlds for which the worst step is written to a file.
-# [-] Largest difference of a velocity after a step from the predicted one, relative to the largest velocity and to
-# 1 m/s: the rounding of a solve with a mass matrix of a condition of up to 1e6.
-PREDICTION_TOLERANCE = 1e-9
 # Numbers of contacts differ between steps and are removed from the names of rows.
 CONTACT_NUMBER = re.compile(r"^(contact|limit) \d+\b ?")
 

@@ -466,6 +466,11 @@ def _make_mjx_stepper(mj: Any, model: Any, start_arrays: dict[str, Any]) -> Any:
     from mujoco import mjx
 
     device_model = mjx.put_model(model)
+    # Its Euler's method without the flag eulerdamp, and RK4. MuJoCo Warp uses M qacc with every integrator.
+    is_explicit = bool(int(model.opt.disableflags) & int(mj.mjtDisableBit.mjDSBL_EULERDAMP))
+    uses_acceleration = int(model.opt.integrator) == int(mj.mjtIntegrator.mjINT_RK4) or (
+        int(model.opt.integrator) == int(mj.mjtIntegrator.mjINT_EULER) and is_explicit
+    )
     first = mjx.make_data(model)
     data = jax.vmap(lambda own: first.replace(**own))(start_arrays)
 
@@ -491,7 +496,8 @@ def _make_mjx_stepper(mj: Any, model: Any, start_arrays: dict[str, Any]) -> Any:
             _concatenate_worlds(c.geom, n, size, 2),
         )  # fmt: skip
         state = {name: np.asarray(getattr(before, name)) for name in STEP_FIELDS}
-        extra = {name: np.asarray(getattr(now, name)) for name in ACCELERATION_FIELDS}
+        extra: dict[str, Any] = {name: np.asarray(getattr(now, name)) for name in ACCELERATION_FIELDS}
+        extra["moved_by"] = "acceleration" if uses_acceleration else "forces"
         return state, efc, np.asarray(e.M), contact, extra
 
     return step

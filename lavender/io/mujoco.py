@@ -26,6 +26,7 @@ the error of `impulse`.
 
 from __future__ import annotations
 
+import weakref
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -52,6 +53,9 @@ COMPLIANCE_TOLERANCE = 1e-9  # Largest accepted |R D - 1| [-].
 # Largest accepted difference of a product with J from MuJoCo's stored result, relative to the size of its terms.
 # Adding 1,000 terms in another order stays below it; data that were changed exceed it by far.
 SUM_TOLERANCE = 2.0**-40
+# [-] Largest difference of a velocity after a step from the predicted one, relative to the largest velocity and to
+# 1 m/s: the rounding of a solve with a mass matrix of a condition of up to 1e6.
+PREDICTION_TOLERANCE = 1e-9
 # The velocity before the step is recovered from the velocities of bodies only if each joint's axis has at least this
 # fraction that is independent of the joints before it in the same body [-].
 MIN_INDEPENDENT_AXIS_FRACTION = 1e-10
@@ -129,6 +133,8 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
         if raised is not None:
             problem = replace(problem, compliance=raised)
     moved_by = find_mover(step, before is not None)
+    if before is not None:
+        problem.__dict__["engine_step"] = weakref.ref(data), model, np.array(data.qvel)
     if step.m and (moved_by == "acceleration" or is_stiff) and not step.has_noslip:
         lam = _scale_force(step, data, get_row_scales(blocks))
         smooth = data.qacc_smooth if change is None else data.qacc_smooth + change
@@ -187,6 +193,20 @@ def engine_answer(model: Any, data: Any) -> EngineAnswer:
     scratch.qvel[:] = start
     velocity = integrate_forces(mj, model, scratch, jacobian(model, data), scale * impulse / dt)
     return EngineAnswer(moved_by, impulse, velocity)
+
+
+def compute_prediction_gap(problem: Problem) -> float:
+    """Return the largest difference of qvel after `mj_step` from the velocity that the answer predicts [m/s, rad/s].
+
+    It is 0 up to rounding, 1e-9 of the largest velocity; and NaN if the problem was made before the step, if the data
+    were stepped since, or if the velocity cannot be predicted.
+    """
+    get_data, model, after = problem.__dict__.get("engine_step", (lambda: None, None, None))
+    data = get_data()
+    if data is None or not np.array_equal(data.qvel, after):
+        return float("nan")
+    gap = float(np.abs(engine_answer(model, data).velocity - after).max(initial=0.0))
+    return gap if not gap <= PREDICTION_TOLERANCE * max(1.0, float(np.abs(after).max(initial=0.0))) else 0.0
 
 
 def integrate_forces(mj: Any, model: Any, data: Any, jac: Any, force: FloatArray) -> FloatArray:

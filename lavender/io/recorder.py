@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import heapq
 import os
+import warnings
 import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ from lavender.base.errors import InputError, LavenderError
 from lavender.batch.data import Batch
 from lavender.batch.residuals import residual_many
 from lavender.io.engine_step import Claims, EngineStep
+from lavender.io.mujoco import compute_prediction_gap
 from lavender.io.npz import write_npz
 from lavender.io.stored import (
     ENGINE,
@@ -70,6 +72,9 @@ class StepVerdict:
         As `Residual.verdict`; "" if the world cannot be judged.
     claimed : bool or None
         Whether the engine reports convergence; None if it makes no claim.
+    prediction_gap : float, m/s or rad/s
+        Largest difference of MuJoCo's velocity after `mj_step` from the one that the judged answer predicts; 0 up to
+        rounding, NaN if it is not compared.
     """
 
     step: int
@@ -79,6 +84,7 @@ class StepVerdict:
     relative: float
     verdict: str
     claimed: bool | None = None
+    prediction_gap: float = float("nan")
 
 
 class Recorder:
@@ -139,6 +145,7 @@ class Recorder:
         self._unjudged: set[int] = set()  # Worlds with a line about their first step that cannot be judged.
         self._removed: list[str] = []  # Files without a line, to be deleted after the lines are written.
         self._is_closed = False
+        self._has_warned = False  # Of a step that differs from its prediction.
 
     def __repr__(self) -> str:
         return f"<Recorder of {self.folder}: {self.n_steps} steps, {len(self.files)} files>"
@@ -259,9 +266,19 @@ class Recorder:
             raise InputError(
                 f"problems is a {type(problems).__name__}; a Problem, a Batch or the result of an importer is needed"
             )
+        gap = compute_prediction_gap(problems) if isinstance(problems, Problem) else float("nan")
+        if gap > 0.0 and not self._has_warned:
+            self._has_warned = True
+            warnings.warn(
+                f"step {self.n_steps}: MuJoCo's velocity after the step differs by {gap:.1e} m/s or rad/s from the one "
+                "that its answer predicts: the model or the state was changed within or after mj_step, for example by "
+                "a callback. The verdict is that of another step",
+                stacklevel=3,
+            )
         claimed = [None] * len(rows) if claims is None else claims.converged.tolist()
         verdicts = [
-            StepVerdict(self.n_steps, i, rows[i], *numbers[i], claimed=claimed[i]) for i in range(len(rows))
+            StepVerdict(self.n_steps, i, rows[i], *numbers[i], claimed=claimed[i], prediction_gap=gap)
+            for i in range(len(rows))
         ]
         return verdicts, reasons
 
@@ -329,6 +346,8 @@ class Recorder:
             if claims is not None:
                 facts["claimed"], facts["iterations"] = bool(claims.converged[i]), int(claims.iterations[i])
                 facts["claimed_residuals"] = {key: float(x[i]) for key, x in claims.residuals.items()}
+            if verdict.prediction_gap > 0.0:
+                facts["prediction_gap"] = verdict.prediction_gap
             if is_selected:
                 facts["selected"] = True
             if self.every is not None and verdict.step % self.every == 0:

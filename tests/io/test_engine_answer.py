@@ -159,3 +159,29 @@ def test_a_saved_problem_keeps_the_motion_of_the_engine(tmp_path):
         # Without the engine's impulse, no motion is stored.
         lv.io.save(problem, tmp_path / "step.npz")
         assert lv.residual(lv.io.read(tmp_path / "step.npz").problem, impulse).moved_by == "impulse"
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+def test_recorder_warns_of_a_step_that_its_answer_does_not_predict(integrator, tmp_path):
+    model = make_model(integrator, "pyramidal", "Newton", "armature", iterations=2)
+    data = mj.MjData(model)
+    with lv.io.Recorder(tmp_path / "steps", every=1) as recorder:
+
+        def record():
+            mj.mj_step(model, data)
+            return recorder.add(lv.io.from_mujoco(model, data), adapter.impulse(model, data))[0].prediction_gap
+
+        assert [record() for _ in range(3)] == [0.0, 0.0, 0.0]
+        problem, impulse = lv.io.from_mujoco(model, data), adapter.impulse(model, data)
+        mj.mj_step(model, data)  # The data no longer belong to the problem.
+        assert np.isnan(recorder.add(problem, impulse)[0].prediction_gap)
+        mj.set_mjcb_control(lambda model, data: data.qfrc_applied.__setitem__(0, 5.0))
+        try:
+            data.qfrc_applied[:] = 0.0
+            mj.mj_step(model, data)
+        finally:
+            mj.set_mjcb_control(None)
+        data.qvel[0] += 0.5  # A push of the user after the step.
+        problem, impulse = lv.io.from_mujoco(model, data), adapter.impulse(model, data)
+        with pytest.warns(UserWarning, match="differs by 5.0e-01"):
+            assert recorder.add(problem, impulse)[0].prediction_gap == pytest.approx(0.5)
