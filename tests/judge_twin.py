@@ -144,9 +144,10 @@ class Problem:
             self.b, self.b_size = target - jac @ v, np.abs(target) + np.abs(jac) @ np.abs(v)
             if "b" in spec:  # of an update
                 self.b, self.b_size = np.array(spec["b"], L), np.abs(np.array(spec["b"], L))
+            self.terms = np.abs(self.b + jac @ v) + np.abs(jac) @ np.abs(v)
         else:
             self.b = np.array(spec["b"], L)
-            self.b_size = np.abs(self.b)
+            self.b_size = self.terms = np.abs(self.b)
         self.cones = {key: np.array(value) for key, value in spec["cones"].items()}
         self.cones.setdefault("rolling", np.zeros(len(self.cones["kind"])))
         self.law = spec["friction"]
@@ -183,7 +184,8 @@ class Problem:
     def _of_matrix(self):
         diag, big = np.diag(self.A).copy(), self.size.max(axis=1, initial=ZERO)
         d = np.where(diag > L(1e-10) * big, diag, big)
-        self.d = self._filled(d, big >= LEAST)
+        self.empty = big < LEAST
+        self.d = self._filled(d, ~self.empty)
         self.nu = self.d.copy()
         self.d_edge = bool(np.any(np.abs(diag - L(1e-10) * big) <= L(1e-14) * big)) or self._at_least(big)
 
@@ -235,6 +237,8 @@ class Problem:
                         reach = np.sqrt(arm @ arm)
                         size[row, body, :3] = 1.0
                         size[row, body, 3:] = reach
+        free = np.array(r["v_free"], L).ravel()
+        self.terms = np.abs(self.b + jac.reshape(m, 6 * n) @ free) + np.abs(jac.reshape(m, 6 * n)) @ np.abs(free)
         self.touches = np.zeros((m, n), bool)  # bodies of each row
         for k, pair in enumerate([*r["joint_body"].reshape(-1, 2), *r["contact_body"].reshape(-1, 2)]):
             moving = [i for i in pair if i >= 0 and (r["inv_mass"][i] != 0 or np.any(r["inv_inertia"][i] != 0))]
@@ -254,7 +258,8 @@ class Problem:
         self.A *= np.outer(self.stretch, self.stretch)
         self.size *= np.outer(self.stretch, self.stretch)
         d = np.diag(self.A).copy()
-        self.d = self._filled(d, d >= LEAST)
+        self.empty = d < LEAST
+        self.d = self._filled(d, ~self.empty)
         self.d_edge = bool(np.any((d > 0) & (d < L(1e-12) * np.diag(self.size)))) or self._at_least(d)
         self.nu = self.d.copy()
         for j in range(joints):
@@ -288,7 +293,8 @@ class Problem:
         self.A = inner + np.diag(soft)
         self.size = np.abs(y) @ np.abs(y.T) + np.diag(soft)
         d = np.diag(self.A).copy()
-        self.d = self._filled(d, d >= LEAST)
+        self.empty = d < LEAST
+        self.d = self._filled(d, ~self.empty)
         self.nu = self.d.copy()
         self.d_edge = not np.isfinite(self.A).all() or bool(
             np.any((d > 0) & (d < L(1e-12) * np.diag(self.size))) or self._at_least(d)
@@ -478,9 +484,14 @@ class Problem:
             max((y for _, y in filter(None, references)), default=ZERO),
         )
         relatives, floors, allows, losses = [], [], [], []
+        scale, is_edge = self._scale_of_unmoved_rows(error0)
+        nothing |= is_edge
         for rows, reference in zip(self.islands, references, strict=True):
-            if not self.touches[rows].any():
-                reference = whole  # nothing moves it: it has no scale of its own
+            if not np.isnan(scale[rows]).any():
+                relatives.append(self._by_scale(rows, error, scale))
+                for out in (floors, allows, losses):
+                    out.append(self._by_scale(rows, f / self.d, scale))
+                continue
             if reference is None:  # no row acts: each is compared with its own terms
                 own = (self._own_floor(~held * f, k, row, whole[0]) for k, row in self._rows_of(rows))
                 relatives.append(self._by_rows(rows, error, whole[0]))
@@ -492,6 +503,8 @@ class Problem:
             nothing |= bool(0 < reference[1] <= LEAST * np.sqrt(self.nu * self.d).max(initial=ZERO))
             floor = self._ratio(*self._floor(rows * ~held * f), *reference)
             relative = self._ratio(*self.norms(rows * error), *reference)
+            shares = (self.d * np.abs(error) / scale)[rows & ~np.isnan(scale)]
+            relative = max(relative, min(L(1.0), shares.max(initial=ZERO)))
             if floor > max(relative, 1e-3) and np.isfinite(floor):
                 relative = floor  # rounding hides a thousandth of the zero impulse's error
             relatives.append(relative)
@@ -527,6 +540,47 @@ class Problem:
         found = self.norms(acts * self.b / self.d)
         return found if found[0] > 0 else None
 
+    def _scale_of_unmoved_rows(self, error0):
+        """(m,) s of rows that no impulse moves, NaN on others; and whether one is near a line between two cases.
+
+        A row: its error at the zero impulse above 2^-48 of its terms, otherwise its terms. A contact: likewise, of all
+        rows together. With tangents that move, b of the normal, if that approaches.
+        """
+        c, out, is_edge = self.cones, np.full(self.m, np.nan, L), False
+        tiny = L(2.0) ** -51 * np.abs(self.b).max(initial=ZERO)
+        for k in range(len(c["kind"])):
+            part = slice(c["ptr"][k], c["ptr"][k + 1])
+            own = self.d[part] * np.abs(error0[part])
+            terms, empty = self.terms[part].copy(), self.empty[part].copy()
+            if c["kind"][k] != ROW and not empty[0]:
+                continue
+            if c["kind"][k] != ROW and empty.all():
+                own[:] = np.sqrt(self.d[part][0] * (self.d[part] * error0[part] ** 2).sum())
+                terms[:] = terms.max()
+            elif c["kind"][k] != ROW:
+                empty[1:], empty[0] = False, self.b[part][0] > 0
+                own[0] = self.b[part][0]
+            line = L(2.0) ** -48 * np.where(np.isfinite(terms), terms, ZERO)
+            is_edge |= bool(np.any(empty & (line > 0) & (own > line / 16) & (own < 16 * line)))
+            s = np.where(own > line, own, terms)
+            is_edge |= bool(np.any(empty & (np.abs(self.b[part]) > tiny / 4) & (np.abs(self.b[part]) < 4 * tiny)))
+            out[part] = np.where(empty, np.where(np.abs(self.b[part]) <= tiny, L(np.inf), s), np.nan)
+        return out, is_edge
+
+    def _by_scale(self, rows, error, scale):
+        """Largest error of the rows of an island over their scale, of a contact all rows together."""
+        ptr, kind, worst = self.cones["ptr"], self.cones["kind"], ZERO
+        for k in range(len(kind)):
+            part = slice(ptr[k], ptr[k + 1])
+            if not rows[ptr[k]]:
+                continue
+            size = self.d[part] * np.abs(error[part])
+            if kind[k] != ROW:
+                size = np.sqrt(self.d[part][0] * (self.d[part] * error[part] ** 2).sum())[None]
+            for x, y in zip(size, scale[part], strict=False):
+                worst = max(worst, ZERO if x == 0 else x / y if y > 0 else L(np.inf))
+        return worst
+
     def _rows_of(self, rows):
         """(row whose b counts, row) of the rows of an island: of a contact b of its normal."""
         ptr, kind = self.cones["ptr"], self.cones["kind"]
@@ -535,9 +589,10 @@ class Problem:
                 yield (row if kind[k] == ROW else ptr[k]), row
 
     def _own_floor(self, f, first, row, whole):
-        if self.b[first] != 0:
-            return f[row] * np.sqrt(self.d[first] / self.d[row]) / np.abs(self.b[first])
-        return ZERO if f[row] == 0 else f[row] / np.sqrt(self.d[row]) / whole if whole > 0 else L(np.inf)
+        own = np.abs(self.b[first]) if self.b[first] != 0 else self.terms[first]
+        if own > 0:
+            return f[row] * np.sqrt(self.d[first] / self.d[row]) / own
+        return ZERO if f[row] == 0 else f[row] / np.sqrt(self.d[row]) / (4 * U * whole) if whole > 0 else L(np.inf)
 
     def _held(self, lam, w, rounding):
         """(m,) rows whose slack holds them at their bound, a contact at zero impulse, by more than its rounding."""
@@ -563,7 +618,7 @@ class Problem:
     def _by_rows(self, rows, error, whole):
         """Largest error of the rows of an island, each over its own b, a contact's over that of its normal.
 
-        Without b sqrt(d) |e| over E0 of all rows.
+        Without b over the terms of b, and without these over 2^-51 of E0 of all rows.
         """
         ptr, kind, worst = self.cones["ptr"], self.cones["kind"], ZERO
         for k in range(len(kind)):
@@ -571,10 +626,10 @@ class Problem:
             if not rows[ptr[k]]:
                 continue
             size = np.sqrt(self.d[part]) * np.abs(error[part])
-            own = np.abs(self.b[part]) / np.sqrt(self.d[part])
+            own = np.where(self.b[part] != 0, np.abs(self.b[part]), self.terms[part]) / np.sqrt(self.d[part])
             if kind[k] != ROW:
                 size, own = np.sqrt((size**2).sum())[None], own[:1]
-            for x, y in zip(size, np.where(own > 0, own, whole), strict=True):
+            for x, y in zip(size, np.where(own > 0, own, 4 * U * whole), strict=True):
                 worst = max(worst, ZERO if x == 0 else x / y if y > 0 else L(np.inf))
         return worst
 

@@ -455,7 +455,8 @@ class Prepared:
     def _solve_with_zero_b(self, loop: Loop, claim: Claim, rows: Any, max_iter: int) -> Claim:
         """Solve with b = 0 on rows that cannot be met, so that other islands get an impulse; return the same claim."""
         deadline = loop.deadline
-        if loop.tol == 0.0 or (deadline is not None and deadline.has_passed()):
+        max_iter -= claim.iterations
+        if loop.tol == 0.0 or max_iter < 0 or (deadline is not None and deadline.has_passed()):
             return claim
         b, start = self.problem.b.copy(), loop.impulse.copy()
         b[rows] = start[rows] = 0.0

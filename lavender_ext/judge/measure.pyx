@@ -119,7 +119,7 @@ cdef bint judge_zero_impulse(view_t* v, int32_t* index, islands_t* islands, doub
         return False
     if terms == NULL:
         return True
-    compute_terms(v, empty, free, out[0], terms)
+    compute_terms(v, empty, free, out[0], e, terms)
     islands.terms = terms
     compute_reference(&v.p, x, w, e, out)
     return False

@@ -16,15 +16,18 @@ If (2) is zero, no row acts: each row is compared with its own terms, a contact 
 
     relative = max d_k |e_k| / s_k,   of a contact sqrt(d_n sum d_k e_k^2) / s_n       (3) `relative_residual_by_rows`
 
-A row that does not act therefore does not change the residual of rows that do, however large its b is. In two kinds of rows
-s_k is the sum of the terms of b = target - J v*, because b may be their rounding:
+A row that does not act therefore does not change the residual of rows that do, however large its b is. A row with b = 0 has
 
-    s_k = |target_k| + sum_j |J_kj v*_j|, or |b_k| if A is given      rows that no impulse moves, and in (3) rows with b = 0     (4)
+    s_k = |target_k| + sum_j |J_kj v*_j|, or |b_k| if A is given,   of b = target - J v*                                 (4)
 
-A row that impulses move, and for which (4) is 0, has s_k = 2^-51 sqrt(d_k) sqrt(sum E0_i^2), so that an error far below rounding
-counts as 0.
-The residual of an island is at least max d_k |e_k| / s_k over its rows that no impulse moves; (3) applies if it has no others.
-A b of such a row of at most 2^-51 max |b| is the rounding of a computation that ended in 0 (s_k = infinity).
+or, if impulses move it and (4) is 0, 2^-51 sqrt(d_k) sqrt(sum E0_i^2), so that an error far below rounding counts as 0.
+
+A row that no impulse moves has w = -b, whatever the impulse is. Its s_k is its error d_k |e_k| at the zero impulse if this exceeds
+2^-48 of (4), so that a row that its bounds do not satisfy has the residual 1. Otherwise s_k is (4). The rows of a contact share
+one s: the error (3) at the zero impulse, or the largest (4). If impulses move its tangents but not its normal, only an
+approaching normal counts as a row that no impulse moves, with s_n = b_n. The residual of an island is at least
+max min(1, d_k |e_k| / s_k) over its rows that no impulse moves; (3) applies if it has no others. A b of such a row of at most
+2^-51 max |b| is the rounding of a computation that ended in 0 (s_k = infinity).
 """
 from libc.math cimport INFINITY, fabs, sqrt
 from libc.stdint cimport int32_t
@@ -235,15 +238,32 @@ cdef inline double compute_row_terms(const view_t* v, const double* free, int32_
     return fabs(v.p.b[k] + velocity) + size
 
 
-cdef inline void compute_terms(const view_t* v, const int32_t* empty, const double* free, double energy,
-                               double* terms) noexcept nogil:
-    """Compute `islands_t.terms` (m): (4) on rows with b = 0 and, negative, on rows that no impulse moves, otherwise |b|.
+cdef inline double unmoved_error_at_zero(const blocks_t* p, const int32_t* empty, int32_t i, int32_t k,
+                                         const double* e) noexcept nogil:
+    """Return the error at the zero impulse, with errors e (m), of row k of block i, which no impulse moves [m/s].
 
-    Rows of a contact that no impulse moves share their largest terms. energy is E0 of all rows.
+    Of a contact it is (3); if impulses move its tangents, b of the normal, or -1 if that is satisfied.
+    """
+    cdef int32_t q, j = p.ptr[i]
+    cdef double total = 0.0
+    if has_independent_rows(p, i):
+        return p.d[k] * fabs(e[k])
+    for q in range(j, p.ptr[i + 1]):
+        if not empty[q]:
+            return p.b[j] if k == j and p.b[j] > 0.0 else -1.0
+        total += (p.d[q] * e[q]) * e[q]
+    return sqrt(p.d[j]) * sqrt(total)
+
+
+cdef inline void compute_terms(const view_t* v, const int32_t* empty, const double* free, double energy, const double* e,
+                               double* terms) noexcept nogil:
+    """Compute `islands_t.terms` (m): s_k, negative on rows that no impulse moves.
+
+    energy is E0 of all rows, e (m) are the errors of the zero impulse.
     """
     cdef const blocks_t* p = &v.p
     cdef int32_t i, k
-    cdef double largest, all_rows = 0.0
+    cdef double largest, error, all_rows = 0.0
     for k in range(p.n_rows):
         all_rows = max(all_rows, fabs(p.b[k]))
     for i in range(p.n_blocks):
@@ -254,10 +274,16 @@ cdef inline void compute_terms(const view_t* v, const int32_t* empty, const doub
                 terms[k] = compute_row_terms(v, free, i, k)
                 if terms[k] == 0.0 and not is_row_unmoved(p, empty, i, k):
                     terms[k] = 4.0 * unit_roundoff() * sqrt(p.d[k]) * energy
-            largest = max(largest, terms[k])
+            if is_row_unmoved(p, empty, i, k):
+                largest = max(largest, terms[k])
         for k in range(p.ptr[i], p.ptr[i + 1]):
             if is_row_unmoved(p, empty, i, k):
-                terms[k] = -terms[k] if has_independent_rows(p, i) else -largest
+                error = unmoved_error_at_zero(p, empty, i, k, e)
+                if error < 0.0:
+                    terms[k] = max(terms[k], 4.0 * unit_roundoff() * sqrt(p.d[k]) * energy) if p.b[k] == 0.0 else fabs(p.b[k])
+                    continue
+                largest = terms[k] if has_independent_rows(p, i) else largest
+                terms[k] = -error if error > max_rounding_ratio() * largest else -largest
                 if fabs(p.b[k]) <= 4.0 * unit_roundoff() * all_rows:
                     terms[k] = -INFINITY
 

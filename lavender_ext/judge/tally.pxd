@@ -33,7 +33,7 @@ cdef inline double get_row_terms(const blocks_t* p, int32_t k) noexcept nogil:
 
 cdef inline double relative_residual_of_unmoved_rows(const blocks_t* p, const int32_t* order, int32_t first, int32_t end,
                                                      const double* e) noexcept nogil:
-    """Return the largest d_k |e_k| / s_k over the rows of blocks order[first:end] that no impulse moves; 0 without such rows."""
+    """Return the largest d_k |e_k| / s_k, at most 1, over the rows of blocks order[first:end] that no impulse moves, or 0."""
     cdef int32_t a, i, k
     cdef double r, worst = 0.0
     if p.islands == NULL or p.islands.terms == NULL:
@@ -44,7 +44,7 @@ cdef inline double relative_residual_of_unmoved_rows(const blocks_t* p, const in
             if p.islands.terms[k] < 0.0:
                 r = ratio_to_reference(p.d[k] * fabs(e[k]), -p.islands.terms[k])
                 worst = r if r > worst else worst
-    return worst
+    return min(worst, 1.0)
 
 
 cdef inline double relative_residual_by_rows(const blocks_t* p, const int32_t* order, int32_t first, int32_t end,
