@@ -131,6 +131,7 @@ add(OF_LCP, lv.Problem.linear, lv.Problem.lcp, LCP.block_of, LCP.row_name, LCP.r
     lv.solve(LCP, tol=1e-12).motion_error, report.carry_impulses, report.classify_structure)  # fmt: skip
 add(LIMITS | {"problem": LCP, "impulse": B}, ("solve", lv.solve), lv.prepare(LCP, "pgs").solve)
 add(LIMITS | {"problem": LCP, "solvers": ["pgs"], "reference": "direct"}, lv.cross_check)
+add({"problem": GENERAL, "velocity": B}, io.reconstruct)
 add({"b": B}, lv.prepare(LCP, "pgs").solve)
 add({"v_free": B}, lv.prepare(GENERAL).solve)
 add({"problem": LCP, "impulse": B, "precision": "float32", "threshold": 1e-6}, lv.residual, accepts_nan=True)
@@ -294,7 +295,8 @@ NOT_CALLED = [
     "Claim", "Derivative", "History", "Plan", "QPSolution", "QPSolution.is_optimal", "Residual",
     "Residuals", "Solution", "Solutions",
     "SolverStage", "Snapshot", "SolverSpec", "Status", "CrossCheck", "MotionError", "SlipExplanation", "Redundancy",
-    "Diagnostic", "Recording", "Stored", "Claims", "EngineStep", "StepVerdict", "Recorder", "Batch.make_kernel_worlds",
+    "Diagnostic", "Recording", "Stored", "Claims", "EngineStep", "StepVerdict", "Recorder", "Reconstruction",
+    "Batch.make_kernel_worlds", "SlipExplanation.draw_slip",
     "Batch.start", "Batch.rows_of", "Batch.count", "Batch.index", "Solutions.count", "Solutions.index",
     "Generalized.from_compressed_rows", "Generalized.from_operator", "Generalized.from_validated",
     "Generalized.with_diagonal_shift", "Generalized.restrict_to_rows_and_velocities", "Generalized.with_scaled_rows",

@@ -33,12 +33,14 @@ from lavender.io.pinocchio import from_pinocchio
 from lavender.io.recorder import Recorder, StepVerdict, read_recorded_state
 from lavender.io.recording import Recording, record
 from lavender.io.stored import HDF5, as_path, read_first_bytes
+from lavender.io.velocities import Reconstruction, reconstruct
 from lavender.problem import Problem
 
 __all__ = [
     "Claims",
     "EngineStep",
     "MujocoScratch",
+    "Reconstruction",
     "Recorder",
     "Recording",
     "StepVerdict",
@@ -58,6 +60,7 @@ __all__ = [
     "mujoco",
     "read",
     "read_recorded_state",
+    "reconstruct",
     "record",
     "save",
 ]

@@ -39,6 +39,7 @@ from lavender.io.stored import (
     write_arrays,
     write_text,
 )
+from lavender.io.velocities import reconstruct
 from lavender.judge.residuals import DEFAULT_THRESHOLD, residual
 from lavender.problem import Problem
 
@@ -170,6 +171,8 @@ class Recorder:
         problems: EngineStep | Batch | Problem | tuple[Any, Any],
         impulse: Any = None,
         *,
+        velocity: Any = None,
+        seconds: float | None = None,
         claims: Claims | None = None,
         state: Mapping[str, Any] | None = None,
     ) -> list[StepVerdict]:
@@ -181,6 +184,11 @@ class Recorder:
             Results of `from_kamino`, `from_genesis`, `from_efc`, `from_mujoco_many` and `from_mujoco`.
         impulse : array, N s
             The engine's answer, unless `problems` contains it.
+        velocity : (n, 6) or (nv,), m/s, rad/s, optional
+            Velocities after the engine's solve, in place of the impulses of a single problem, which `reconstruct`
+            computes. Its line has `reconstructed` and `left_over`, the largest velocity that no impulse explains.
+        seconds : float, s, optional
+            Time of the engine's solve of the step.
         claims : Claims, optional
             The engine's claims, unless `problems` contains them.
         state : dict of arrays, optional
@@ -208,14 +216,24 @@ class Recorder:
             problems, impulse, claims = problems[:3]
         elif isinstance(problems, tuple):
             problems, impulse = problems
+        facts: dict[str, Any] = {
+            "seconds": float("nan") if seconds is None else check_float("seconds", seconds, low=0.0)
+        }
+        if velocity is not None:
+            if impulse is not None or not isinstance(problems, Problem):
+                raise InputError(
+                    "velocity is given with impulse, or for a batch; it replaces the impulse of one problem"
+                )
+            impulse, left_over = reconstruct(problems, velocity)
+            facts |= {"reconstructed": True, "left_over": left_over}
         if impulse is None:
-            raise InputError("impulse is missing: give the engine's answer [N s] to judge")
+            raise InputError("impulse is missing: give the engine's answer [N s] to judge, or velocity=")
         verdicts, reasons = self._judge_worlds(problems, impulse, claims)
         states = self._split_states(state, len(verdicts), isinstance(problems, Problem))
         changed = False
         for verdict in verdicts:
             changed |= self._record_selected_world(
-                verdict, problems, impulse, claims, states, reasons.get(verdict.world, "")
+                verdict, problems, impulse, claims, states, reasons.get(verdict.world, ""), facts
             )
         if changed or self._removed:
             self.write_lines()
@@ -318,6 +336,7 @@ class Recorder:
         claims: Claims | None,
         states: Any,
         reason: str,
+        more: dict[str, Any],
     ) -> bool:
         """Record a world of this step if it is selected; return whether the records changed."""
         i, error = verdict.world, verdict.velocity_error
@@ -341,7 +360,7 @@ class Recorder:
         lam = to_numpy("impulse", impulse)
         own = lam if is_single else lam.reshape(-1)[problems.rows_of(i)]
         try:
-            facts: dict[str, Any] = {"solver": self.solver, "seconds": float("nan")}
+            facts: dict[str, Any] = {"solver": self.solver, **more}
             facts |= describe_answer(problem, own, self.threshold)
             if claims is not None:
                 facts["claimed"], facts["iterations"] = bool(claims.converged[i]), int(claims.iterations[i])
