@@ -145,6 +145,10 @@ class RowBuilder:
         0.001 or more if a stack is solved with a fixed number of sweeps: with 0, the error that the sweeps leave opens
         and closes the contacts in turn, and the stack rocks. After 5 s, six boxes of 1 m with 10 sweeps in each step of
         1/120 s move at 0.4 m/s with 0, and at 0.0001 m/s with 0.001.
+    velocity_before : array-like, m/s and rad/s, optional
+        Velocity before the step, without gravity, in the layout of `velocity`: restitution applies to its approach.
+        Default: `velocity`. Each bounce then also returns the velocity that gravity adds in the step, so that a ball
+        with e = 1 climbs.
 
     Raises
     ------
@@ -161,7 +165,7 @@ class RowBuilder:
         spring   target = -k C / (c + h k),  compliance = 1 / (h (c + h k))                        (2)
         motor    target = speed,  -h max_torque <= lambda <= h max_torque                          (3)
         limit    target = -g / h if g > 0, else -beta g / h,  lambda >= 0, g the remaining travel  (4)
-        contact  as a limit with g the gap, or -e u if the bodies approach at speed -u             (5)
+        contact  as a limit with g the gap, or -e u if u, of `velocity_before`, is an approach     (5)
 
     (1) is Baumgarte's correction (Baumgarte 1972); beta is the error reduction parameter `ERP` of the ODE manual,
     section 3.7. (2) is a spring of stiffness k with a damper c, integrated by implicit Euler (ODE manual, section 3.8;
@@ -195,7 +199,7 @@ class RowBuilder:
 
     def __init__(
         self, inv_mass: ArrayLike, inv_inertia: ArrayLike, velocity: ArrayLike, dt: float, position: ArrayLike,
-        *, baumgarte: float = 0.2, slop: float = 0.0,
+        *, baumgarte: float = 0.2, slop: float = 0.0, velocity_before: ArrayLike | None = None,
     ) -> None:  # fmt: skip
         shape = get_shape("position", position)
         _check_dimensions(shape, get_shape("velocity", velocity), get_shape("inv_inertia", inv_inertia))
@@ -208,22 +212,31 @@ class RowBuilder:
         if self._is_planar:
             self._inv_inertia = np.zeros((n, 3, 3))
             self._inv_inertia[:, 2, 2] = _as_inverses("inv_inertia", inv_inertia, n, "1/(kg m^2)")
-            self._velocity = np.zeros((n, 6))
-            self._velocity[:, PLANAR_VELOCITIES] = as_array("velocity", velocity, (n, 3), unit="m/s, rad/s")
         else:
             tensors = as_array("inv_inertia", inv_inertia, (n, 3, 3), unit="1/(kg m^2)")
             none, empty = np.zeros((0, 2), np.int32), np.zeros((0, 3))
             if find_body_fault(self._inv_mass, tensors, none, none, empty, empty, True)[0]:
                 tensors = check_and_symmetrise_inertia("inv_inertia", tensors)
             self._inv_inertia = tensors
-            self._velocity = as_array("velocity", velocity, (n, 6), unit="m/s, rad/s")
+        self._velocity = before = self._as_velocity("velocity", velocity)
+        if velocity_before is not None:
+            before = self._as_velocity("velocity_before", velocity_before)
         self._dt = check_float("dt", dt, above=0.0)
         self._baumgarte = check_float("baumgarte", baumgarte, low=0.0, high=1.0)
         self._slop = check_float("slop", slop, low=0.0)
         self._blocks = RowBlocks(
-            self._position, self._velocity, self._dimensions, self._dt, self._baumgarte, self._slop
+            self._position, self._velocity, before, self._dimensions, self._dt, self._baumgarte, self._slop
         )
         self._names: dict[int, str] = {}  # Names of blocks that were given, by key.
+
+    def _as_velocity(self, name: str, velocity: ArrayLike) -> FloatArray:
+        """Check velocities of the bodies, and return them as linear and angular velocities (n, 6)."""
+        n = len(self._position)
+        if not self._is_planar:
+            return as_array(name, velocity, (n, 6), unit="m/s, rad/s")
+        out = np.zeros((n, 6))
+        out[:, PLANAR_VELOCITIES] = as_array(name, velocity, (n, 3), unit="m/s, rad/s")
+        return out
 
     # -- joints --------------------------------------------------------------------------------------------------
 
@@ -447,7 +460,7 @@ class RowBuilder:
         mu : float, default 0
             Coefficient of friction. Without friction the contact has a normal row only.
         restitution : float, 0 to 1, default 0
-            Speed of separation divided by the speed of approach, which is measured on `velocity`.
+            Speed of separation divided by the speed of approach, which is measured on `velocity_before`.
         restitution_threshold : float, m/s, default 1
             Slower approaches do not bounce, so that resting bodies stay at rest. Box2D's default is 1 m/s.
         tangent : array-like (3,), optional

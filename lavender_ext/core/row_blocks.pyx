@@ -185,7 +185,7 @@ cdef class RowBlocks:
     Parameters
     ----------
     centres : ndarray (n, 3), m
-    velocity : ndarray (n, 6), m/s and rad/s
+    velocity, velocity_before : ndarray (n, 6), m/s and rad/s
     dimensions : int
         2 or 3.
     dt, baumgarte, slop : float
@@ -195,6 +195,7 @@ cdef class RowBlocks:
     cdef object keep                # the arrays of the next pointers
     cdef const double* centres
     cdef const double* velocity
+    cdef const double* velocity_before
     cdef int32_t n_bodies, dimensions
     cdef double dt, baumgarte, slop
     cdef row_t* rows
@@ -205,12 +206,13 @@ cdef class RowBlocks:
     cdef readonly set keys
     cdef readonly int32_t fault, argument   # fault of the last block, and the argument that it refers to
 
-    def __cinit__(self, centres, velocity, int32_t dimensions, double dt, double baumgarte, double slop):
+    def __cinit__(self, centres, velocity, velocity_before, int32_t dimensions, double dt, double baumgarte, double slop):
         self.n_bodies, self.dimensions = <int32_t>len(centres), dimensions
         self.dt, self.baumgarte, self.slop = dt, baumgarte, slop
-        self.keep = (centres, velocity)
+        self.keep = (centres, velocity, velocity_before)
         self.centres = as_double_pointer(centres, 3 * self.n_bodies)
         self.velocity = as_double_pointer(velocity, 6 * self.n_bodies)
+        self.velocity_before = as_double_pointer(velocity_before, 6 * self.n_bodies)
         self.next_feature, self.keys = {}, set()
 
     def __dealloc__(self):
@@ -435,13 +437,24 @@ cdef class RowBlocks:
             self.append_angular_row(x, first, second, number[1])
         return True
 
+    cdef double compute_normal_velocity(self, const contact_t* c, const double* velocity) noexcept:
+        """Return the normal velocity of b relative to a at a contact [m/s] if the bodies move at `velocity` (n, 6)."""
+        cdef double u = 0.0
+        cdef double[3] moment
+        if c.a >= 0:
+            cross(c.frame[2], c.frame[0], moment)
+            u -= dot3(velocity + 6 * c.a, c.frame[0]) + dot3(velocity + 6 * c.a + 3, moment)
+        if c.b >= 0:
+            cross(c.frame[3], c.frame[0], moment)
+            u += dot3(velocity + 6 * c.b, c.frame[0]) + dot3(velocity + 6 * c.b + 3, moment)
+        return u
+
     cdef bint append_contact(self, const arguments_t* x) noexcept:
         """Append a contact (eq. 5); return whether its arguments are valid."""
         cdef contact_t* c = self.contacts + self.n_contacts
-        cdef double gap = x.number[0], restitution = x.number[2], threshold = x.number[3], approach = 0.0, size, depth
+        cdef double gap = x.number[0], restitution = x.number[2], threshold = x.number[3], bounce, size, depth
         cdef double[3] moment, other
         cdef double* normal = c.frame[0]
-        cdef const double* v
         if not (x.given[0] and x.given[1] and x.number[1] >= 0.0 and 0.0 <= restitution <= 1.0 and threshold >= 0.0
                 and not isnan(gap)):
             return self.reject(NEEDS_CONVERSION)
@@ -468,18 +481,10 @@ cdef class RowBlocks:
         self.compute_arm(c.b, x.vector[0], c.frame[3])
         depth = -gap - self.slop
         c.target = (-gap if gap > 0.0 else self.baumgarte * (depth if depth > 0.0 else 0.0)) / self.dt
-        if restitution > 0.0:
-            if c.a >= 0:
-                v = self.velocity + 6 * c.a
-                cross(c.frame[2], normal, moment)
-                approach -= dot3(v, normal) + dot3(v + 3, moment)
-            if c.b >= 0:
-                v = self.velocity + 6 * c.b
-                cross(c.frame[3], normal, moment)
-                approach += dot3(v, normal) + dot3(v + 3, moment)
         # The contact bounces only if the bodies touch within the step.
-        if approach < -threshold and (c.target >= 0.0 or approach < c.target) and -restitution * approach > c.target:
-            c.target = -restitution * approach
+        bounce = self.compute_normal_velocity(c, self.velocity_before) if restitution > 0.0 else 0.0
+        if bounce < -threshold and (c.target >= 0.0 or self.compute_normal_velocity(c, self.velocity) < c.target):
+            c.target = max(c.target, -restitution * bounce)
         return True
 
     # -- blocks --------------------------------------------------------------------------------------------------

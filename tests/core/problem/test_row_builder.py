@@ -364,3 +364,23 @@ def test_row_builder_distance_of_length_zero_raises_and_recommends_ball(length, 
         builder.distance(-1, 0, point, point, length)
     with pytest.raises(lv.InputError, match=f"distance 1: .*{cause}"):
         builder.joints("distance", [(-1, 0)] * 2, anchor_a=[(1.0, 0.0, 0.0), point], anchor_b=[point] * 2, **lengths)
+
+
+@pytest.mark.parametrize("planar", [True, False])
+@pytest.mark.parametrize("e", [1.0, 0.5])
+def test_contact_restitution_on_the_velocity_before_the_step_bounces_as_the_closed_form(e, planar):
+    """Fifty bounces, each with the speed of the last: e^k of the first, whatever gravity adds in the step."""
+    h, speed, up, width, n = 1.0 / 60.0, 4.0, 1, 3 if planar else 6, 2 if planar else 3
+    for k in range(50):
+        before = np.zeros((1, width))
+        before[0, up] = -speed
+        free = before.copy()
+        free[0, up] -= 9.81 * h
+        normal = np.eye(n)[up]
+        builder = lv.RowBuilder(
+            [1.0], [6.0] if planar else [6.0 * np.eye(3)], free, h, position=[0.5 * normal], velocity_before=before
+        )
+        builder.contact(-1, 0, np.zeros(n), normal, restitution=e, restitution_threshold=0.0)
+        problem = builder.problem()
+        speed = float(builder.velocity_after(problem, lv.solve(problem, tol=1e-12).impulse)[0, up])
+        assert speed == pytest.approx(4.0 * e ** (k + 1), rel=1e-9)
