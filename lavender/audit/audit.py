@@ -52,7 +52,6 @@ from lavender.io.mujoco_memory import import_mujoco
 from lavender.io.start_states import VECTOR, Control, hash_model
 from lavender.judge.residuals import DEFAULT_THRESHOLD
 from lavender.problem import PRECISIONS
-from lavender.report import machine
 from lavender.report.runner import Event
 from lavender.report.text import format_count
 from lavender.report.workers import check_workers, connect_backend, map_unordered
@@ -71,7 +70,6 @@ MAX_CONTACT_STATES = 1000  # Up to about this many states before steps with cont
 # The states before a world diverges by less than this number of steps are not kept as states with contact: their speeds
 # belong to the divergence, and `slip` simulates settings for 25 steps.
 DIVERGENCE_MARGIN = 25
-AUDIT_BUSY_CONSEQUENCE = "The audit took longer than otherwise; its errors do not depend on the load."
 
 
 def audit(
@@ -243,7 +241,6 @@ def _audit_model(
 ) -> Audit:  # fmt: skip
     """Audit a model of MuJoCo: time its first world, choose the spread, and judge all worlds in worker processes."""
     processes = count_processes(workers)
-    loads: list[float | None] = []
     # Raise the error of an unsupported model once and before any worker starts.
     from_mujoco_many(one.model, np.concatenate([one.model.qpos0, np.zeros(one.model.nv)])[None])
     timed = one if worlds is None else replace(one, steps=min(TIMED_STEPS, one.steps))
@@ -262,13 +259,11 @@ def _audit_model(
         judging = judging._replace(contact_share=share)
     result = _make_empty_audit(runs, "mujoco", common, note)
     pieces = _audit_mujoco(runs, judging, range(worlds), workers, backend)
-    result = _collect(result, pieces, judging, watch, loads=loads)
+    result = _collect(result, pieces, judging, watch)
     if not result.n_processed:
         raise InputError(
             "no step was judged, because workers were lost; give fewer workers (--workers), which need less memory"
         )
-    busy = machine.make_busy_warning(loads, os.cpu_count() or 1, AUDIT_BUSY_CONSEQUENCE, own=processes + 1)
-    result.notes += [busy] if busy else []
     first_lost = {d.world: d.step for d in result.divergences}
     states = sorted(result.contact_states, key=lambda entry: entry[:2])
     result.contact_states[:] = [
@@ -278,8 +273,7 @@ def _audit_model(
 
 
 def _collect(
-    result: Audit, pieces: Iterable[Piece], judging: Judging, watch: Callable[[Event], None] | None, *,
-    loads: list[float | None] | None = None,
+    result: Audit, pieces: Iterable[Piece], judging: Judging, watch: Callable[[Event], None] | None
 ) -> Audit:  # fmt: skip
     """Add pieces to a result until their end or Ctrl-C, and show the progress."""
     if watch is not None:
@@ -288,8 +282,6 @@ def _collect(
     try:
         for piece in pieces:
             result.add_piece(piece, judging.keep)
-            if loads is not None:
-                loads.append(machine.count_runnable_processes())
             if watch is not None:
                 text = f"steps, {int(result.is_unconverged.sum())} unconverged"
                 watch(Event(result.n_processed, result.verdict.size, text, "", phase="judging"))

@@ -1,103 +1,424 @@
-"""Write the page of an audit or a tuning, print its short form, and describe the sizes of the judged steps."""
+"""Make the page of an audit, and describe the sizes of the judged steps."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lavender.base.arrays import FloatArray
 from lavender.io.stored import format_json
-from lavender.report.page import Page, tabulate_frame
+from lavender.judge.residuals import AT_FLOOR, UNCONVERGED, VERDICTS, WRONG
+from lavender.report.drawing import (
+    BLUE,
+    INK,
+    PINK,
+    Label,
+    draw_error_strip,
+    draw_figure,
+    label_ends,
+    mark_errors,
+)
+from lavender.report.page import Page, fold_table, make_table
 from lavender.report.render import print_table, write_files
-from lavender.report.text import format_count, format_percent
+from lavender.report.text import format_count, format_number, format_percent, format_power, format_speed
 
 if TYPE_CHECKING:
     import pandas as pd
     from rich.console import Console
 
-
-class Section(NamedTuple):
-    """A heading with tables, functions that draw figures into a folder, lines to copy, and rows for a terminal."""
-
-    title: str
-    frames: Sequence[pd.DataFrame] = ()
-    note: str = ""
-    figures: Sequence[Any] = ()
-    code: Sequence[str] = ()
-    short: int = 0
-    short_frame: pd.DataFrame | None = None
-
-
 STOPPED_NOTE = "Stopped before the end: the numbers contain only the completed part."
+QUANTILE_LINES = {"median": 0.5, "90 %": 0.9, "99 %": 0.99, "worst": 1.0}
+MAX_BINS = 50  # Largest number of bins of steps of the figure over time.
+MAX_STRIP_WORLDS, MAX_STRIP_STEPS = 240, 400  # A cell of more worlds or steps has their largest error.
+SHOWN_RATIO = 1e-6  # Errors below this fraction of the limit lie in the strip at the bottom of the figure.
+TREND_RATIO = 2.0  # Errors grow or fall if the 99 % quantile of the last quarter differs by this factor.
+MAX_NAMED_ROWS = 8  # Rows of the table of rows.
+CLASS_COLORS = ("var(--h4)", "var(--h3)", "var(--h1)", "var(--bad)", "var(--ink)")
+ERROR_DEFINITION = (
+    "The error of a step is that of its worst row: how far a row's velocity after the step is from one that the row's "
+    "law allows, in m/s, or rad/s on angular rows. Rounding only: rounding explains the error, in the engine's "
+    "precision. The errors are of the integrator's input for each step: the residual of forces, or the distance of an "
+    "acceleration's velocities from the exact ones (Euler's method without damping, discrete, RK4). They do not add up "
+    "over time. Growing: the error that 1 % of the steps exceed in the last quarter is more than twice that of the "
+    "second quarter."
+)
 
 
 @dataclass(frozen=True)
 class ResultPage:
-    """Contents of a page.
+    """Page of a result with its files.
 
     Parameters
     ----------
-    title : str
-    headline : list of str
-        Up to three sentences with the result, one on each line.
-    sections : list of Section
+    make_page : callable (folder of the figures or None) -> Page
+        Without a folder, no figure is drawn.
     numbers : dict
         Contents of `numbers.json`.
-    notes : list of str
-        Sentences with advice and warnings; a terminal shows them below its tables.
+    tables : list of DataFrame
+        Tables of a terminal.
     is_stopped : bool
         Whether the measurement ended early, so that all numbers describe only its completed part.
     provenance : str
         Last line: versions, settings, model, date and command.
     """
 
-    title: str
-    headline: Sequence[str]
-    sections: Sequence[Section]
+    make_page: Callable[[Path | None], Page]
     numbers: dict[str, Any]
-    notes: Sequence[str] = ()
+    tables: Sequence[pd.DataFrame] = ()
     is_stopped: bool = False
     provenance: str = ""
 
     def write(self, folder: str | os.PathLike[str]) -> Path:
         """Write `index.html`, `numbers.json` and `figures/*`; return the path of the page."""
-        from markupsafe import Markup
-
-        blocks: list[Any] = []
-        for section in self.sections:
-            drawn = [Markup(draw(Path(folder) / "figures")) for draw in section.figures]
-            code = [{"code": "\n".join(section.code)}] if section.code else []
-            frames = [tabulate_frame(frame, note=section.note) for frame in section.frames if len(frame)]
-            if drawn or code or frames:
-                blocks.append({"folded": [*code, *frames, *drawn], "title": section.title, "open": True})
-        notes = [*self.notes, *([STOPPED_NOTE] if self.is_stopped else []), *filter(None, [self.provenance])]
-        page = Page(self.title, "", self.headline[0], self.headline[1:], warnings=notes, blocks=blocks)
+        page = self.make_page(Path(folder) / "figures")
+        page.warnings = [*page.warnings, *([STOPPED_NOTE] if self.is_stopped else [])]
+        page.footer = [*filter(None, [self.provenance]), *page.footer]
         numbers = format_json(self.numbers, indent=1) + "\n"
         return (
             write_files(Path(folder), {"index.html": page.render(), "numbers.json": numbers}) / "index.html"
         )
 
     def print_short(self, console: Console) -> None:
-        """Print the headline, the first rows of each section's first table, and the notes."""
-        Page("", "", self.headline[0], self.headline[1:]).print_head(console)
-        for section in self.sections:
-            for line in section.code:
-                console.print(f"    {line}", highlight=False, markup=False, soft_wrap=True)
-            if section.code and section.note:
-                console.print(section.note, highlight=False, markup=False)
-            rows = section.frames[0].head(section.short) if section.frames else None
-            frame = rows if section.short_frame is None else section.short_frame
-            if frame is not None and len(frame):
+        """Print the head of the page and the tables."""
+        self.make_page(None).print_head(console)
+        for table in self.tables:
+            if len(table):
                 console.print()
-                print_table(console, frame)
-        for i, note in enumerate(self.notes):
-            console.print(f"{'' if i else chr(10)}{note}", style="yellow", highlight=False, markup=False)
+                print_table(console, table)
         if self.provenance:
             console.print(f"\n{self.provenance}", style="dim", highlight=False, markup=False)
+
+
+# -- audit -------------------------------------------------------------------------------------------------
+
+
+def split_row_unit(row: str) -> tuple[str, str]:
+    """Return the name of a row without its unit, and the unit of its velocity: rad/s if the name ends so, else m/s."""
+    name = row.removesuffix(" [rad/s]")
+    return name, "m/s" if name == row else "rad/s"
+
+
+def make_audit_page(audit: Any, folder: Path | None) -> Page:
+    """Make the page of an audit: size of the error, when and where, cause, next command."""
+    counts = AuditCounts(audit)
+    runs, model = audit.runs, audit.runs.name
+    blocks: list[Any] = []
+    if folder is not None and counts.n:
+        from markupsafe import Markup
+
+        tables = [counts.make_sizes_table(), counts.make_rows_table()]
+        if audit.worst:
+            rows: list[Any] = [
+                [
+                    f"worst_{i}.npz",
+                    (f"world {w.world}, step {w.step}", "q", ""),
+                    (split_row_unit(w.where)[0], "text", ""),
+                ]
+                for i, w in enumerate(audit.worst, 1)
+            ]
+            command = f"lavender check {folder.parent / 'worst' / 'worst_1.npz'}"
+            tables.append([make_table(rows, title="Look at the worst steps"), {"code": command}])
+        flat = [block for some in tables for block in (some if isinstance(some, list) else [some])]
+        blocks.append({"pair": [[Markup(counts.draw_errors(folder))], flat]})
+    sections = (
+        ("The same states", audit.comparison, "Both models solve the same steps from the same states."),
+        ("What the engine claims", audit.claims, "A wrong claim hides an error; a missing claim costs iterations."),
+        ("Quantiles of the errors", audit.errors, ""), ("Verdicts", audit.verdicts, ""),
+        ("Rows and contacts of a step", audit.judged_sizes.table, ""),
+        ("Worlds that diverged", audit.diverged, "The last step, and whether every solve until then was exact."),
+        ("Worst rows of steps that stopped early", audit.worst_rows, ""),
+    )  # fmt: skip
+    blocks += [fold_table(title, frame, note) for title, frame, note in sections if len(frame)]
+    blocks.append({"folded": [{"note": ERROR_DEFINITION}], "title": "How errors are defined", "open": False})
+    source = f"lavender audit · {model} · {audit.engine} · {runs.worlds} worlds × {runs.steps} steps"
+    code = []
+    if counts.above and audit.engine == "mujoco" and not audit.divergences:
+        states = "lavender-audit/states.npz" if folder is None else folder.parent / "states.npz"
+        code = [f"lavender tune {model} --max-velocity-error {counts.limit:g} --states {states}"]
+    starts = f"seed {runs.seed}, start velocities ± {runs.spread:g} m/s"
+    footer = [
+        f"{starts}. Files: records.npz (every step), numbers.json, states.npz, worst/, figures/ (PDF, SVG, PNG).",
+    ]
+    return Page("lavender audit", source, counts.verdict, counts.sentences, code, mark=counts.mark,
+                is_bad=counts.is_bad, warnings=audit.advice, blocks=blocks, footer=footer)  # fmt: skip
+
+
+class AuditCounts:
+    """Counts, sentences, figures and tables of an audit, compared with a limit.
+
+    Parameters
+    ----------
+    audit : Audit
+        `DEFAULT_ERROR_LIMIT` is compared with if it has no limit of its own.
+    """
+
+    def __init__(self, audit: Any) -> None:
+        self.audit, self.limit = audit, audit.shown_limit
+        self.errors = np.where(audit.is_judged, audit.numbers[0], np.nan)
+        at_floor = audit.verdict == VERDICTS.index(AT_FLOOR)
+        self.sizes = np.where(at_floor, 0.0, self.errors)  # Steps at their floor never count.
+        with np.errstate(invalid="ignore"):
+            self.is_above = self.sizes > self.limit
+        self.n, self.above = audit.n_judged, int(self.is_above.sum())
+        self.classes = [
+            ("rounding only", int((at_floor & audit.is_judged).sum())),
+            (f"up to {format_speed(audit.threshold)}", self._count(0.0, audit.threshold, at_floor)),
+            (f"up to {format_speed(self.limit)}: the limit", self._count(audit.threshold, self.limit, at_floor)),
+            (f"more than {format_speed(self.limit)}", self.above),
+        ]  # fmt: skip
+        self.largest = float(np.nanmax(self.sizes)) if self.n else 0.0
+        place = np.nanargmax(self.sizes) if self.n else 0
+        self.world, self.step = map(int, np.unravel_index(place, self.sizes.shape))
+        own = next((w for w in audit.worst if (w.world, w.step) == (self.world, self.step)), None)
+        self.row, self.unit = split_row_unit("" if own is None else own.where)
+
+    def _count(self, low: float, high: float, at_floor: Any) -> int:
+        """Count the steps that are not at their floor with an error in (low, high], or at 0 if low is 0."""
+        with np.errstate(invalid="ignore"):
+            inside = (self.errors <= high) & ((self.errors > low) | (low == 0.0))
+        return int((inside & ~at_floor).sum())
+
+    # -- sentences -----------------------------------------------------------------------------------------
+
+    @property
+    def verdict(self) -> str:
+        """The size of the error, with divergence first, and steps that were not judged."""
+        audit, limit = self.audit, format_speed(self.limit)
+        parts = []
+        if audit.divergences:
+            first = min(d.step for d in audit.divergences)
+            parts.append(f"{format_count(audit.n_diverged, 'world')} diverged, the first at step {first}")
+        if not self.n:
+            parts.append("no step was judged")
+        elif self.above:
+            n, share = format_number(self.n), format_percent(self.above, self.n)
+            worst = format_speed(self.largest, self.unit)
+            is_wrong = "is" if self.above == 1 else "are"
+            parts.append(
+                f"{format_number(self.above)} of {n} steps ({share}) {is_wrong} wrong by more than {limit}; "
+                f"the worst by {worst}"
+            )
+        else:
+            by = (
+                f"by more than {format_speed(self.largest, self.unit)}" if self.largest else "beyond rounding"
+            )
+            parts.append(f"no step is wrong {by}; the limit is {limit}")
+        if lost := int((audit.verdict == len(VERDICTS)).sum()):
+            parts.append(f"{format_count(lost, 'step')} not judged")
+        if audit.n_dropped:
+            parts.append(f"the engine dropped {format_count(audit.n_dropped, 'row')}")
+        text = "; ".join(parts)
+        return f"{text[0].upper()}{text[1:]}."
+
+    @property
+    def is_bad(self) -> bool:
+        """Whether a step exceeds the limit, was not judged, or lost rows."""
+        return bool(self.above or self.audit.n_unjudged or self.audit.n_dropped)
+
+    @property
+    def mark(self) -> str:
+        """Result of the comparison with the limit."""
+        if self.above:
+            return "✗ above the limit"
+        return "✗ not all judged" if self.is_bad else "✓ within the limit"
+
+    @property
+    def sentences(self) -> list[str]:
+        """When and where, then the cause."""
+        return [
+            *filter(None, (self._describe_place(), self._describe_cause(), self.audit.compare_in_words()))
+        ]
+
+    def _describe_place(self) -> str:
+        """Return the worst step and row, the worlds above the limit, and whether errors grow with time."""
+        if not self.largest:
+            return ""
+        row = f", {self.row}" if self.row else ""
+        text = f"Worst: step {self.step} of world {self.world}{row}."
+        steps = self.errors.shape[1]
+        if self.above:
+            worlds, first = int(self.is_above.any(axis=1).sum()), int(np.argmax(self.is_above.any(axis=0)))
+            text += f" Above the limit from step {first} on, in {worlds} of {format_count(len(self.errors), 'world')}."
+        quarter = steps // 4
+        if quarter < 5 or not self.n:
+            return text
+        parts = self.sizes[:, quarter : 2 * quarter], self.sizes[:, steps - quarter :]
+        known = [part[np.isfinite(part)] for part in parts]
+        if not all(map(len, known)):
+            return text
+        early, late = (float(np.quantile(part, 0.99, method="higher")) for part in known)
+        trend = (
+            "Growing" if late > TREND_RATIO * early else "Falling" if late < early / TREND_RATIO else "Steady"
+        )
+        return (
+            f"{text} {trend} with time: the error that 1 % of the steps exceed is {format_speed(early)} in steps "
+            f"{quarter} to {2 * quarter - 1} and {format_speed(late)} in the last {quarter}."
+        )
+
+    def _describe_cause(self) -> str:
+        """Return the cause of divergence or of errors above the limit, and claims of the engine that are false."""
+        audit, texts = self.audit, []
+        stopped, wrong = (audit.verdict == VERDICTS.index(word) for word in (UNCONVERGED, WRONG))
+        if audit.divergences:
+            texts.append(audit.describe_divergences())
+        elif self.above:
+            n = int((self.is_above & stopped).sum())
+            if n:
+                these = "All these" if n == self.above else f"{format_number(n)} of these"
+                texts.append(f"Cause: the solver. {these} solves stopped before convergence.")
+            if n_wrong := int((self.is_above & wrong).sum()):
+                count = format_count(n_wrong, "answer")
+                texts.append(
+                    f"{count} of the engine {'is' if n_wrong == 1 else 'are'} no solution of its own problem."
+                )
+        elif n := int((stopped | wrong).sum()):
+            share = format_percent(n, self.n, 1)
+            texts.append(
+                f"{format_count(n, 'solve')} ({share}) stopped before convergence, all within the limit."
+            )
+        elif self.n:
+            texts.append("Every solve converged.")
+        if audit.converged is not None:
+            counts = list(audit.claim_counts.values())
+            claimed, false = counts[0] + counts[1] + counts[4], counts[1] + counts[4]
+            is_wrong = f"{false} {'is' if false == 1 else 'are'} wrong"
+            texts.append(f"Of {format_count(claimed, 'solve')} that the engine calls converged, {is_wrong}.")
+        return " ".join(texts)
+
+    # -- figures and tables --------------------------------------------------------------------------------
+
+    def draw_errors(self, folder: Path) -> str:
+        """Draw quantiles of the errors with time, and below each world as a line of colours, the worst first."""
+        audit, low = self.audit, SHOWN_RATIO * self.limit
+        worlds, steps = self.errors.shape
+        bins = np.array_split(np.arange(steps), min(steps, MAX_BINS))
+        x = np.array([b[0] for b in bins] + [steps])
+        has_rows = audit.rows > 0
+
+        def compute_quantiles(errors: FloatArray, quantiles: Sequence[float]) -> FloatArray:
+            """Return the quantiles (quantiles, bins + 1) of the steps with rows, and low / 2 for smaller ones."""
+            lines = []
+            for b in bins:
+                some = errors[:, b][has_rows[:, b] & np.isfinite(errors[:, b])]
+                lines.append(
+                    np.quantile(some, quantiles, method="higher")
+                    if len(some)
+                    else np.full(len(quantiles), np.nan)
+                )
+            q = np.array([*lines, lines[-1]]).T
+            return np.where(q < low, low / 2.0, q)
+
+        q = compute_quantiles(self.errors, list(QUANTILE_LINES.values()))
+
+        def fill(axes: Any, strip: Any) -> str:
+            labels = mark_errors(axes, low, float(np.nanmax(q)) if np.isfinite(q).any() else 0.0, self.limit)
+            axes.set_xlim(0, steps)
+            for i, alpha in enumerate((0.38, 0.24, 0.12)):
+                axes.fill_between(x, q[i], q[i + 1], step="post", color=BLUE, alpha=alpha, lw=0)
+            for i, width in ((0, 1.2), (3, 0.7)):
+                axes.step(x, q[i], where="post", color=BLUE, lw=width)
+            labels += [
+                Label(y, name, BLUE) for name, y in zip(QUANTILE_LINES, q[:, -1], strict=True) if y == y
+            ]
+            if audit.against is not None:
+                other = np.where(audit.against.is_judged, audit.against.numbers[0], np.nan)
+                for y, name in zip(compute_quantiles(other, [0.99, 1.0]), ("99 %", "worst"), strict=True):
+                    axes.step(x, y, where="post", color=PINK, lw=1.0, ls="-" if name == "worst" else "--")
+                    labels += [Label(y[-1], f"against, {name}", PINK)] if y[-1] == y[-1] else []
+            axes.set_ylabel("velocity error [m/s]")
+            label_ends(axes, labels)
+            order = np.argsort(-np.nan_to_num(self.sizes).max(axis=1), kind="stable")
+            rows = np.array_split(order, min(worlds, MAX_STRIP_WORLDS))
+            columns = np.array_split(np.arange(steps), min(steps, MAX_STRIP_STEPS))
+            filled = np.where(np.isnan(self.sizes), -1.0, self.sizes)
+            errors = np.array([[filled[np.ix_(r, c)].max() for c in columns] for r in rows])
+            errors = np.where(errors < 0.0, np.nan, errors)
+            draw_error_strip(strip, errors, audit.threshold, self.limit, (0, steps, worlds, 0))
+            strip.set_ylabel(f"{worlds} worlds, worst first" if worlds > 1 else "one world")
+            strip.set_xlabel("step")
+            strip.set_yticks([])
+            if self.largest:
+                strip.plot(
+                    [self.step + 0.5],
+                    [max(worlds / 60.0, 0.5)],
+                    "v",
+                    ms=6,
+                    color=INK,
+                    mfc="none",
+                    mew=1.2,
+                    clip_on=False,
+                )
+            ends = ", ".join(
+                f"{name} {format_speed(float(y))}" for name, y in zip(QUANTILE_LINES, q[:, -1], strict=True)
+            )
+            return (
+                f"Velocity error against step of {worlds} worlds; in the last steps: {ends}. {self.verdict}"
+            )
+
+        note = (
+            "Above: errors of the steps that have rows, over all worlds: median, 90 %, 99 % and worst; below "
+            f"{format_power(low)} m/s rounding decides. Below: each line is a world, ▽ the worst step (records.npz)."
+        )
+        margins = {"left": 0.13, "right": 0.75, "top": 0.985, "bottom": 0.085, "hspace": 0.1}
+        return draw_figure("errors", fill, (4.9, 4.9), margins, note=note, folder=folder, nrows=2, sharex=True,
+                           height_ratios=[1.45, 1.0])  # fmt: skip
+
+    def make_sizes_table(self) -> list[Any]:
+        """Make the stacked bar and the table of the numbers of steps by the size of their error."""
+        from markupsafe import Markup
+
+        classes = [*self.classes]
+        if lost := int((self.audit.verdict == len(VERDICTS)).sum()):
+            classes.append(("not judged", lost))
+        total = max(self.n + lost, 1)
+        bar = [
+            (f"{100.0 * n / total:.2f}", color)
+            for (_, n), color in zip(classes, CLASS_COLORS, strict=False)
+            if n
+        ]
+        rows: list[Any] = []
+        for i, (name, n) in enumerate(classes):
+            swatch = Markup('<span class="swatch" style="background:{}"></span> {}').format(
+                CLASS_COLORS[i], name
+            )
+            css = "bad" if i >= 3 and n else "q" if i < 2 else ""
+            rows.append([(swatch, css, ""), (format_number(n), css, ""), (format_percent(n, total), css, "")])
+        alt = "Shares of the steps: " + ", ".join(f"{name} {format_percent(n, total)}" for name, n in classes)
+        small = f"{format_number(self.n)} steps by the error of their worst row"
+        return [make_table(rows, title="How wrong", small=small, classes="full"), {"bar": bar, "alt": alt}]
+
+    def make_rows_table(self) -> Any:
+        """Make the table of the rows with the largest errors, on a logarithmic scale with the limit."""
+        from markupsafe import Markup
+
+        where = sorted(self.audit.where.items(), key=lambda entry: -entry[1][1])
+        if not where:
+            return []
+        low = np.log10(max(self.audit.threshold, 1e-12))
+        high = np.log10(max(where[0][1][1], self.limit) * 1.3)
+
+        def place(x: float) -> float:
+            return float(np.clip(100.0 * (np.log10(max(x, 1e-15)) - low) / (high - low), 0.0, 100.0))
+
+        rows: list[Any] = []
+        for name, (n, largest) in where[:MAX_NAMED_ROWS]:
+            above = ' class="above"' if largest > self.limit else ""
+            dot = Markup(
+                f'<span class="dot"><b style="left:{place(self.limit):.1f}%"></b>'
+                f'<i{above} style="left:{place(largest):.1f}%"></i></span>'
+            )
+            row, unit = split_row_unit(name)
+            size = format_speed(largest, unit)
+            rows.append([(row, "text", ""), (format_number(n), "wide", ""), size, (dot, "bar", "")])
+        heads = ["row", ("steps¹", "wide", ""), "largest", ("", "bar", "")]
+        note = "Dashed: the limit. ¹ stopped before convergence with this worst row."
+        small = f"largest error of each, {format_count(len(where), 'row')} in all"
+        return make_table(rows, heads, title="Which row", small=small, note=note, classes="full")
 
 
 # If a smaller fraction of the judged steps has contact, `tune` recommends no setting and an audit warns: mean times,

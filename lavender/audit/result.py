@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lavender.audit.page import ResultPage, Section, StepSizes, describe_exceedance
+from lavender.audit.page import AuditCounts, ResultPage, StepSizes, make_audit_page, split_row_unit
 from lavender.audit.pieces import (
     AUDIT_VERDICTS,
     N_WORST_WORLDS,
@@ -30,7 +30,8 @@ from lavender.base.arrays import FloatArray, check_choice
 from lavender.io.npz import write_npz
 from lavender.io.stored import prepare_step_folder, write_arrays
 from lavender.judge.residuals import AT_FLOOR, CLOSE, DEFAULT_THRESHOLD, UNCONVERGED, WRONG
-from lavender.report.text import format_count, format_percent, format_size
+from lavender.report.page import DEFAULT_ERROR_LIMIT
+from lavender.report.text import format_count, format_percent, format_size, format_speed
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -44,32 +45,6 @@ OUTCOMES = (
     "claimed and right", "claimed and wrong", "not claimed but right", "not claimed and wrong",
     "claimed with numbers that are not finite", "not claimed, not finite",
 )  # fmt: skip
-ERRORS_NOTE = (
-    "Errors of the worst row of each judged step; in rad/s if its name ends so. At its floor: rounding explains the "
-    "error, in the engine's precision. Close enough: no row has a larger error than the threshold. Stopped before "
-    "convergence, or wrong: all others. Not judged: the engine's answer is not finite, or the world diverged before. "
-    "Shares are fractions of the steps judged. The errors are of the integrator's input: the "
-    "residual of forces, or the distance of an acceleration's velocities from the exact ones (Euler's method without "
-    "damping, discrete, RK4)."
-)
-SIZES_NOTE = "Rows and contacts of the steps judged."
-FILES_NOTE = (
-    "Problems with the engine's impulses, in the folder worst: lavender check reads it. states.npz holds the states "
-    "before these steps (--states starts from them again)."
-)
-ROWS_NOTE = "Rows that were the worst of a step that stopped before convergence or is wrong."
-CLAIMS_NOTE = (
-    "Right: no row has a velocity error above the threshold, or rounding explains it in the engine's precision. A "
-    "wrong claim hides an error; a missing claim for a right answer costs iterations, or a needless warning."
-)
-AGAINST_NOTE = (
-    "Both models solve the same steps: the states, controls and warm starts before each step of the first model's "
-    "worlds. Errors of the worst row of each step."
-)
-DIVERGED_NOTE = (
-    "The step in which each world diverged, the quantity that was not finite or above 1e10, and whether every solve of "
-    "the world until then was exact. If so, the cause lies outside the constraint solver."
-)
 ENGINE_ADVICE = "To find out whether the engine is the cause, audit again with --engine mujoco."
 OUTSIDE_SOLVER = "outside the constraint solver (time step, integrator, actuators or the model itself)"
 DIVERGENCE_ADVICE = (
@@ -281,59 +256,23 @@ class Audit:
     # -- sentences -----------------------------------------------------------------------------------------
 
     @property
+    def shown_limit(self) -> float:
+        """Velocity error with which the page compares [m/s, rad/s]: `error_limit`, or else the default of all pages."""
+        return DEFAULT_ERROR_LIMIT if self.error_limit is None else self.error_limit
+
+    @property
     def headline(self) -> list[str]:
-        """Result in up to three sentences: the counts, the largest error, and divergence, claims or the limit."""
-        return [self._describe_counts(), *filter(None, (self._describe_worst(), self._describe_third()))]
-
-    def _describe_counts(self) -> str:
-        """Return the sentence with the numbers of steps that stopped before convergence or are wrong."""
-        judged, wrong = self.n_judged, int((self.verdict == AUDIT_VERDICTS.index(WRONG)).sum())
-        n = int(self.is_unconverged.sum()) - wrong
-        share = f" ({format_percent(n, judged, 1)})" if n else ""
-        worlds = format_count(int(np.count_nonzero(self.is_judged.any(axis=1))), "world")
-        text = f"{self.runs.name}, {self.engine}: {n or 'none'} of {format_count(judged, 'step')} judged in {worlds}"
-        text += f" stopped before convergence{share}"
-        return f"{text}, {wrong} wrong ({format_percent(wrong, judged, 1)})." if wrong else f"{text}."
-
-    def _describe_worst(self) -> str:
-        """Return the sentence with the largest error of steps that stopped before convergence or are wrong."""
-        if not self.is_unconverged.any():
-            return ""
-        text = f"The worst error is {format_size(self.max_velocity_error)} "
-        if not (self.worst and self.worst[0].velocity == self.max_velocity_error):
-            return f"{text}m/s."
-        w = self.worst[0]
-        name = w.where.removesuffix(" [rad/s]")
-        return f"{text}{'m/s' if name == w.where else 'rad/s'}: {name}, world {w.world}, step {w.step}."
-
-    def _describe_third(self) -> str:
-        """Return the sentence on divergence, else on the other model, claims, the limit, or missing contact."""
-        parts = []
-        if self.divergences:
-            first = min(d.step for d in self.divergences)
-            worlds = format_count(self.n_diverged, "world")
-            parts.append(f"{worlds} diverged, in step {first} at the earliest")
-        if lost := int((self.verdict == NOT_JUDGED).sum()):
-            parts.append(f"{format_count(lost, 'step')} not judged: numbers not finite or above 1e10")
-        if self.error_limit is not None:
-            n, judged = self.n_above_limit, self.n_judged
-            share = f" ({format_percent(n, judged, 1)})" if n else ""
-            parts.append(f"{format_count(n, 'step')} above {self.error_limit:g} m/s{share}")
-        if self.converged is not None:
-            counts = list(self.claim_counts.values())
-            claimed = counts[0] + counts[1] + counts[4]
-            parts.append(f"of {claimed} that the engine calls converged, {counts[1] + counts[4]} wrong")
-        if not self.judged_sizes.has_enough_contact:
-            parts.append(f"only {self.judged_sizes.contact_phrase}")
-        text = "; ".join(parts)
-        return f"{text[0].upper()}{text[1:]}." if text else ""
+        """Result in sentences: the size of the error, when and where, and the cause."""
+        counts = AuditCounts(self)
+        return [counts.verdict, *counts.sentences]
 
     @property
     def advice(self) -> list[str]:
         """Sentences with consequences and remedies, below the tables of a terminal."""
-        lines = [self._compare_in_words(), self._describe_divergences()]
+        lines = list[str]()
         if not self.judged_sizes.has_enough_contact:
-            lines.append("Too few steps have contact to rate the solver: start from other states (--states).")
+            few = f"Only {self.judged_sizes.contact_phrase}: too few to rate the solver"
+            lines.append(f"{few}; start from other states (--states).")
         if self.n_dropped:
             lines.append(
                 f"The engine had no memory for {self.n_dropped} constraint rows and dropped them: its answers solve "
@@ -366,7 +305,7 @@ class Audit:
             lines.append(f"MuJoCo's own warnings: {texts}.")
         return [*filter(None, lines), *filter(None, self.notes)]
 
-    def _describe_divergences(self) -> str:
+    def describe_divergences(self) -> str:
         """Return sentences on the cause of divergence; empty if no world diverged."""
         if not self.divergences:
             return ""
@@ -378,7 +317,7 @@ class Audit:
             return text
         return f"In {exact} worlds every solve until divergence was exact: the cause lies {OUTSIDE_SOLVER}. {text}"
 
-    def _compare_in_words(self) -> str:
+    def compare_in_words(self) -> str:
         """Return a sentence with the counts of the other model on the same states; empty without one."""
         if self.against is None:
             return ""
@@ -424,8 +363,10 @@ class Audit:
     def worst_rows(self) -> pd.DataFrame:
         """The worst rows of steps that stopped before convergence or are wrong, most frequent first."""
         ranked = sorted(self.where.items(), key=lambda entry: -entry[1][0])
-        rows = [(name, n, largest) for name, (n, largest) in ranked]
-        return _make_frame(["worst row", "steps", "largest error [m/s]"], rows)
+        rows = [
+            (row, n, format_speed(x, unit)) for name, (n, x) in ranked for row, unit in [split_row_unit(name)]
+        ]
+        return _make_frame(["worst row", "steps", "largest error"], rows)
 
     @property
     def diverged(self) -> pd.DataFrame:
@@ -440,8 +381,11 @@ class Audit:
     @property
     def worst_steps(self) -> pd.DataFrame:
         """The worlds of the worst steps, which are written to files."""
-        rows = [(f"worst_{i}.npz", w.world, w.step, w.velocity, w.where) for i, w in enumerate(self.worst, 1)]
-        return _make_frame(["file", "world", "step", "error [m/s]", "worst row"], rows)
+        rows = []
+        for i, w in enumerate(self.worst, 1):
+            row, unit = split_row_unit(w.where)
+            rows.append((f"worst_{i}.npz", w.world, w.step, format_speed(w.velocity, unit), row))
+        return _make_frame(["file", "world", "step", "error", "worst row"], rows)
 
     @property
     def claims(self) -> pd.DataFrame:
@@ -470,21 +414,6 @@ class Audit:
                 errors = one.numbers[0][both]
                 columns[f"{prefix}{one.runs.name} [m/s]"] = np.quantile(errors, QUANTILES, method="higher")
         return _make_frame(columns if both.any() else {})
-
-    def draw_errors(self, folder: Path) -> str:
-        """Draw the errors over time."""
-        from lavender.report.drawing import BLUE, draw_figure, mark_errors
-
-        def fill(axes: Any) -> str:
-            mark_errors(axes, 1e-9, self.max_velocity_error or 1e-9, self.error_limit or 1e-3)
-            for q in (0.5, 0.99, 1.0):
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore")
-                    axes.plot(np.nanquantile(self.numbers[0], q, axis=0).clip(min=0.5e-9), color=BLUE, lw=1.0)
-            axes.set_xlabel("step")
-            return f"Median, 99 % and worst error; largest {format_size(self.max_velocity_error)}"
-
-        return draw_figure("over-time", fill, (4.9, 3.3), {"left": 0.13, "right": 0.75}, folder=folder)
 
     # -- files ---------------------------------------------------------------------------------------------
 
@@ -557,21 +486,21 @@ class Audit:
     @property
     def page(self) -> ResultPage:
         """Page with the result in sentences, figures and tables, as `lavender audit` writes it."""
-        n_worlds = int(np.count_nonzero(self.is_judged.any(axis=1)))
-        note = f"{ERRORS_NOTE} {describe_exceedance(n_worlds)}".strip()
-        return ResultPage(
-            title="lavender audit", headline=self.headline, sections=[
-                Section("The same states", [self.comparison], short=5, note=AGAINST_NOTE),
-                Section("Claims and verdicts", [self.claims], short=len(OUTCOMES), note=CLAIMS_NOTE),
-                Section("Errors", [self.errors, self.verdicts], note, [self.draw_errors], short=5),
-                Section("Rows and contacts", [self.judged_sizes.table], short=2, note=SIZES_NOTE),
-                Section("Worlds that diverged", [self.diverged], short=2, note=DIVERGED_NOTE),
-                Section("Worst rows", [self.worst_rows], short=3, note=ROWS_NOTE),
-                Section("The worst worlds", [self.worst_steps], short=len(self.worst), note=FILES_NOTE),
-            ],
-            numbers=self.totals, notes=self.advice, is_stopped=self.is_stopped,
-            provenance=format_provenance(self.provenance),
-        )  # fmt: skip
+        short = [
+            self.comparison,
+            self.claims,
+            self._tabulate_classes(),
+            self.worst_rows.head(3),
+            self.worst_steps,
+        ]
+        last = format_provenance(self.provenance)
+        return ResultPage(partial(make_audit_page, self), self.totals, short, self.is_stopped, last)
+
+    def _tabulate_classes(self) -> pd.DataFrame:
+        """Build the table of the numbers of steps by the size of their error, for a terminal."""
+        counts = AuditCounts(self)
+        rows = [(name, n, format_percent(n, max(counts.n, 1))) for name, n in counts.classes]
+        return _make_frame(["error of the worst row", "steps", "share"], rows)
 
 
 def _make_frame(columns: Any, rows: Sequence[Any] | None = None) -> pd.DataFrame:

@@ -5,15 +5,17 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lavender.audit.page import ResultPage, Section
+from lavender.audit.page import ResultPage
 from lavender.audit.provenance import describe_provenance, format_provenance
 from lavender.audit.settings import MujocoSetting, get_option_value
 from lavender.audit.simulated_worlds import count_engine_warnings, has_diverged
 from lavender.audit.slip import (
+    CAUSES,
     MIN_EXPLAINED_SLIP,
     REMEDY_STEPS,
     Remedy,
@@ -31,8 +33,9 @@ from lavender.io import mujoco as adapter
 from lavender.io.mujoco_memory import import_mujoco
 from lavender.io.start_states import name_model, read_states, without_sleep
 from lavender.problem import Problem
+from lavender.report.page import Page, make_table, tabulate_frame
 from lavender.report.runner import Event
-from lavender.report.text import format_count
+from lavender.report.text import format_count, format_speed
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -96,16 +99,56 @@ class SlipOfStates:
         """Page with the slip of each pair of geoms, the settings simulated, and the slip over time."""
         worst = self.worst
         remedies = [r.__dict__ | {"speeds": list(r.speeds)} for r in worst.remedies]
-        sections = [Section("Slip by cause", [self.table])]
-        if remedies:
-            note = "\n".join(worst.advice)
-            sections.append(Section("Settings simulated", [worst.remedies_table], note, [worst.draw_slip]))
         numbers = {
             "states": self.n_states, "explained": len(self.explanations), "state": worst.state,
             "slip": self.table.to_dict("records"), "remedies": remedies, "provenance": self.provenance,
         }  # fmt: skip
-        last = format_provenance(self.provenance)
-        return ResultPage("lavender slip", worst.sentences, sections, numbers, self.notes, provenance=last)
+        tables = [self.table, worst.remedies_table] if remedies else [self.table]
+        return ResultPage(self.make_page, numbers, tables, provenance=format_provenance(self.provenance))
+
+    def make_page(self, folder: Path | None) -> Page:
+        """Make the page: the fastest contact with its cause, shares of the causes, slip over time, settings."""
+        worst, slips = self.worst, self.worst.slips
+        first = slips.loc[slips["speed"].idxmax()]
+        verdict = f"No contact slips faster than {format_speed(MIN_EXPLAINED_SLIP)}."
+        if first["cause"] != "no slip":
+            verdict = (
+                f"Contact {first['contact']} slips {format_speed(first['speed'])}; cause: {first['cause']}."
+            )
+        blocks: list[Any] = []
+        if folder is not None:
+            from markupsafe import Markup
+
+            parts = {cause: float(first[cause]) for cause in CAUSES.values()}
+            total = sum(parts.values()) or 1.0
+            colors = [f"var(--s{i})" for i in range(len(parts))]
+            bar = [
+                (f"{100.0 * x / total:.1f}", color) for x, color in zip(parts.values(), colors, strict=True)
+            ]
+            rows: list[Any] = [
+                [
+                    Markup('<span class="swatch" style="background:{}"></span> {}').format(color, cause),
+                    format_speed(x),
+                ]
+                for (cause, x), color in zip(parts.items(), colors, strict=True)
+            ]
+            alt = ", ".join(f"{cause} {format_speed(x)}" for cause, x in parts.items())
+            title = "Causes of this slip"
+            causes = [make_table(rows, title=title, classes="full"), {"bar": bar, "alt": alt}]
+            drawn = [Markup(worst.draw_slip(folder))] if worst.remedies else []
+            blocks = [{"pair": [drawn or causes, causes if drawn else []]}]
+            blocks.append(tabulate_frame(self.table, title="Slip of each pair of geoms"))
+            if worst.remedies:
+                blocks.append(tabulate_frame(worst.remedies_table, title="Settings simulated"))
+        n = len(self.explanations)
+        source = (
+            f"lavender slip · {self.provenance.get('model', '')} · {format_count(n, 'state')} with contact"
+        )
+        sentences = [" ".join(worst.sentences), *([" ".join(worst.advice)] if worst.remedies else [])]
+        footer = ["Files: numbers.json, figures/ (PDF, SVG, PNG)."]
+        return Page(
+            "lavender slip", source, verdict, sentences, warnings=self.notes, blocks=blocks, footer=footer
+        )
 
 
 def explain_slip_of_states(

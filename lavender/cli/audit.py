@@ -16,6 +16,7 @@ from lavender.cli.options import (
     FILE,
     FOLDER,
     add_worlds_options,
+    limit_option,
     limit_to_one_thread,
     precision_option,
     print_escaped,
@@ -32,8 +33,7 @@ from lavender.io.stored import check_writable
               type=click.Choice(["mujoco", "mjx", "mujoco_warp", "kamino", "newton-mujoco", "genesis"]))  # fmt: skip
 @click.option("--against", type=FILE, metavar="MODEL.xml|MODEL.mjb",
               help="Another model, such as one with other options, that solves the same steps.")  # fmt: skip
-@click.option("--max-velocity-error", type=float, metavar="M/S",
-              help="Exit with 1 if a step above its floor has a larger velocity error [m/s, rad/s].")  # fmt: skip
+@limit_option
 @click.option("--keep", type=int, metavar="N",
               help="Keep the N worst steps; default: the worst step of each of three worlds.")  # fmt: skip
 @click.option("--save-states", type=(click.Choice(["contact", "worst"]), FILE), metavar="contact|worst FILE.npz",

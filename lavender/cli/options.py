@@ -200,6 +200,13 @@ THRESHOLD: Option = (("--threshold",), {
     "type": float, "default": 1e-6, "help": "Velocity error [m/s] up to which an engine's solution is close enough.",
 })  # fmt: skip
 threshold_option = add_options([THRESHOLD], show_default=True)
+#: Option of the commands with pages that compare with a velocity error.
+LIMIT: Option = (("--max-velocity-error",), {
+    "type": float, "metavar": "M/S",
+    "help": "Velocity error with which the page compares [m/s, rad/s on angular rows]; default: 1 mm/s. If given, "
+    "an audit exits with 1 above it, and tune recommends a setting within it.",
+})  # fmt: skip
+limit_option = add_options([LIMIT])
 #: Options of all commands that simulate and record a MuJoCo model.
 RECORDING_OPTIONS: tuple[Option, ...] = (
     (("--steps",), {"default": 500, "help": "MODEL.xml: number of simulation steps."}),

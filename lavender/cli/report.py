@@ -10,6 +10,7 @@ from typing import Any
 
 import click
 
+from lavender.base.arrays import check_float
 from lavender.base.errors import InputError
 from lavender.base.exits import EXIT_INTERRUPTED, EXIT_UNMET
 from lavender.cli.completion import complete_case_or_file
@@ -21,6 +22,7 @@ from lavender.cli.options import (
     MultiValueCommand,
     describe_solvers,
     exit_after_interrupt,
+    limit_option,
     make_console,
     plan_options,
     print_escaped,
@@ -63,6 +65,7 @@ from lavender.io.stored import check_writable, write_text
               help="Answer how many sweeps a step needs: measure only fixed numbers of sweeps (--budgets) of the "
               "solvers that sweep, on recorded steps in sequence.")  # fmt: skip
 @recording_options
+@limit_option
 @click.option("--tables", is_flag=True, help="Print every table, warning and line of code.")
 @click.option("--no-reuse", is_flag=True, help="Repeat runs that the folder already holds.")
 @click.option("--no-figures", is_flag=True,
@@ -94,6 +97,8 @@ def report(
     for limit in options["time_budgets"]:
         if not (math.isfinite(limit) and limit > 0.0):
             raise InputError(f"time budget {limit} is not positive; a positive number of seconds is needed")
+    if options["max_velocity_error"] is not None:
+        check_float("max_velocity_error", options["max_velocity_error"], above=0.0)
     _reject_unused_options(context, files, options)
     check_writable(out, folder=True)
     used_folders: set[Path] = set()
@@ -119,10 +124,13 @@ def report(
             measured = measure_files(context, files, path, watch)
         # These modules import pandas, which only a report needs.
         from lavender.report.findings import Report, list_skip_reasons, print_report, write
+        from lavender.report.page import DEFAULT_ERROR_LIMIT
         from lavender.report.tables import read_engine_answers
 
         engines = read_engine_answers(files, measured.lines)
-        shown = Report(measured.lines, old, options["time_budgets"], engines)
+        limit = options["max_velocity_error"]
+        limit = DEFAULT_ERROR_LIMIT if limit is None else limit
+        shown = Report(measured.lines, old, options["time_budgets"], engines, limit)
         # Write the files before printing, as a closed pipe can end the command while it prints. After Ctrl-C, the page
         # has no figures, so that the prompt is back soon.
         try:

@@ -9,7 +9,14 @@ import click
 
 from lavender.base.exits import EXIT_UNMET
 from lavender.cli.measuring import show_page, show_progress
-from lavender.cli.options import FILE, FOLDER, add_worlds_options, limit_to_one_thread, threshold_option
+from lavender.cli.options import (
+    FILE,
+    FOLDER,
+    add_worlds_options,
+    limit_option,
+    limit_to_one_thread,
+    threshold_option,
+)
 from lavender.io.stored import check_writable
 
 
@@ -18,8 +25,7 @@ from lavender.io.stored import check_writable
 @add_worlds_options(worlds=16, steps=200)
 @click.option("--horizon", default=10, show_default=True, help="Steps after which the motion is compared.")
 @click.option("--repeats", default=5, show_default=True, help="Times that each setting is timed.")
-@click.option("--max-velocity-error", type=float, metavar="M/S",
-              help="Also recommend the fastest setting without a larger error in any step [m/s, rad/s].")  # fmt: skip
+@limit_option
 @threshold_option
 @click.option("--out", type=FOLDER, default=Path("lavender-tune"),
               show_default=True, help="Folder of the page and of the settings judged.")  # fmt: skip

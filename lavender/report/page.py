@@ -57,7 +57,7 @@ class Page:
     warnings : list of str
         Sentences on conditions on which shown numbers depend.
     blocks : list
-        See the module.
+        Blocks as the module describes them.
     footer : list
         Files, versions, machine, date and command.
     """
@@ -85,7 +85,7 @@ class Page:
             *((text, "bold red") for text in self.alarms), *((text, "") for text in self.sentences),
             *((f"    {line}", "") for line in self.code), *((text, "yellow") for text in self.warnings),
         ):  # fmt: skip
-            text = text.replace("\u00a0", " ")  # Units do not break on a page only.
+            text = text.replace("\u00a0", " ").replace("\u202f", "")  # Units do not break on a page only.
             console.print(text, style=style, highlight=False, markup=False, soft_wrap=text.startswith("    "))
 
 
@@ -93,7 +93,7 @@ def make_table(
     rows: Sequence[Any], heads: Sequence[Any] = (), *, title: str = "", small: str = "", note: str = "",
     key: Sequence[tuple[str, str]] = (), classes: str = "", foot: Sequence[Any] = (),
 ) -> dict[str, Any]:  # fmt: skip
-    """Make the block of a table: see the module."""
+    """Make the block of a table as the module describes it."""
     return {"rows": rows, "heads": heads, "title": title, "small": small, "note": note, "key": key,
             "classes": classes, "foot": foot}  # fmt: skip
 

@@ -18,6 +18,8 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from lavender.base.arrays import FloatArray, check_sequence
 from lavender.base.errors import InputError, LavenderError, require_packages
 from lavender.diagnostics.motion_error import motion_error
@@ -377,12 +379,12 @@ class Runner:
             # If an earlier run was stopped in this pass, repeat its steps without records for the last step's impulses.
             for item, task in zip(problems[:made], tasks, strict=False):
                 again = replace(task, repeats=1)
-                before = self.measure_step(item.problem, again, spec, before)[1]
+                before = self.measure_step(item, again, spec, before)[1]
         while made < len(tasks) and spent <= limit:
             task = tasks[made]
             if row and row["times"] and max(row["times"]) < UNGUARDED_TIME_RATIO * self.plan.time_limit:
                 task = replace(task, guarded=False)
-            row, before = self.measure_step(problems[made].problem, task, spec, before, made % stride == 0)
+            row, before = self.measure_step(problems[made], task, spec, before, made % stride == 0)
             self.add_row(row)
             self.report_progress(row["case"], spec.name, row)
             spent, made = spent + _get_elapsed_time(row), made + 1
@@ -393,17 +395,23 @@ class Runner:
             self.add_skip(f"{problems[0].sequence}, {target}, {call.start}", spec.name, reason)
 
     def measure_step(
-        self, problem: Problem, task: Task, spec: SolverSpec, before: tuple[Problem, FloatArray] | None,
+        self, item: Item, task: Task, spec: SolverSpec, before: tuple[Problem, FloatArray] | None,
         with_motion: bool = False,
     ) -> tuple[Row, tuple[Problem, FloatArray] | None]:  # fmt: skip
         """Measure one step; if its task has start "carried", start from the previous problem and impulses.
 
-        `with_motion` adds the error of the motion after a fixed number of sweeps, which is not timed.
+        In a pass of a fixed number of sweeps, the first recorded step starts from the guess in its file, and the second
+        step from the engine's answer to the first one, if the file has one: a recording may begin when impulses have
+        been carried for long. `with_motion` adds the error of the motion, which is not timed.
         """
-        start = None
+        start, problem = None, item.problem
+        is_first = task.start == "carried" and task.mode == "budget" and before is None
         if task.start == "carried":
             begun = perf_counter()
-            start = problem.start() if before is None else carry_impulses(*before, problem)
+            if is_first and problem.guess is not None:
+                start = problem.guess
+            else:
+                start = problem.start() if before is None else carry_impulses(*before, problem)
             task = replace(task, carry_time=perf_counter() - begun)
         row, impulse = self.measure_task(problem, task, spec, start)
         if with_motion and task.mode == "budget" and spec.order and impulse is not None:
@@ -411,6 +419,8 @@ class Runner:
             # Without bodies, the largest difference of a row's velocity counts.
             speed = error.rows if error.speed is None else error.speed
             row["motion_error"] = math.nan if speed is None else float(speed)
+        if is_first and (answer := item.load_stored()) is not None and answer.shape == (problem.m,):
+            impulse = answer if np.isfinite(answer).all() else impulse
         return row, None if impulse is None else (problem, impulse)
 
     def select_solver(self, case: str, name: str, items: Sequence[Item | Problem]) -> SolverSpec | None:

@@ -27,8 +27,10 @@ from lavender.report.tables import Contents, list_plain_sweeps, read_own_answers
 from lavender.report.text import format_count, format_percent, format_speed, format_time
 
 EQUAL_RATIO = 1.1  # Solvers whose errors differ by a smaller factor at every number of sweeps are one line.
-MAX_STRIP_STEPS = 400  # Columns of the strip of steps; a column of more steps has their largest error.
-SHOWN_RATIO = 1e-4  # Errors below this fraction of the limit lie in the strip at the bottom of the figure.
+MAX_SWEEP_COLUMNS = 400  # Columns of the strip of steps; a column of more steps has their largest error.
+SWEEPS_SHOWN_RATIO = (
+    1e-4  # Errors below this fraction of the limit lie in the strip at the bottom of the figure.
+)
 
 
 class SweepStudy:
@@ -163,7 +165,7 @@ class SweepStudy:
 
     def _draw_errors(self, folder: Path | None) -> str:
         """Draw the largest error against the number of sweeps, with the engine's own answers as a star."""
-        low = SHOWN_RATIO * self.limit
+        low = SWEEPS_SHOWN_RATIO * self.limit
         colors = [BLUE, *SERIES[2:], INK, *[QUIET] * len(self.groups)]
 
         def fill(axes: Any) -> str:
@@ -236,7 +238,7 @@ class SweepStudy:
         if len(self.answers):
             own = self.answers.set_index("case")["velocity"].reindex(cases)
             table = pd.concat([own.to_frame("your engine").T, table])
-        parts = np.array_split(np.arange(len(cases)), min(len(cases), MAX_STRIP_STEPS))
+        parts = np.array_split(np.arange(len(cases)), min(len(cases), MAX_SWEEP_COLUMNS))
         errors = np.stack([np.nanmax(table.to_numpy(float)[:, part], axis=1) for part in parts], axis=1)
         steps, n = self.report.cases.loc[cases, "step"].to_numpy(int), len(table)
         height = 0.27 * n + 0.75

@@ -103,6 +103,11 @@ def format_count(n: int, noun: str, plural: str = "") -> str:
     return f"{n} {noun if n == 1 else plural or noun + 's'}"
 
 
+def format_number(n: int) -> str:
+    """Return a whole number with narrow spaces between groups of three digits: 4 800."""
+    return f"{n:,}".replace(",", "\u202f")
+
+
 def format_percent(part: int, whole: int, digits: int = 0) -> str:
     """Return a rounded percentage with at least `digits` decimals.
 

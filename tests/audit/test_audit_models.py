@@ -192,7 +192,7 @@ def test_audit_against_another_model_judges_both_on_the_same_states(boxes, tmp_p
     table = found.comparison
     assert table.columns.tolist()[1:] == [f"{path.name} [m/s]", "against other.xml [m/s]"]
     assert table.iloc[-1, 1:].tolist() == [alone.numbers[0].max(), found.against.numbers[0].max()]
-    assert "Against other.xml, on the same 60 states" in found.advice[0]
+    assert "Against other.xml, on the same 60 states" in found.headline[-1]
     found.write(tmp_path / "out")
     assert (np.load(tmp_path / "out" / "records.npz")["against"] == found.against.numbers[0]).all()
 

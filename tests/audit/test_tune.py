@@ -172,9 +172,8 @@ def test_tune_measures_the_default_options_of_mujoco(boxes, monkeypatch):
     applied, plain = default.setting.apply_to(mj, model).opt, mj.MjOption()
     assert all(getattr(applied, name) == getattr(plain, name) for name in mujoco_settings.OPTIONS)
     assert model.opt.ls_iterations == 8 and applied.ls_iterations == 50
-    (section,) = (s for s in found.page.sections if s.short_frame is not None)
-    assert any(name.startswith("MuJoCo's defaults (") for name in section.short_frame["setting"])
-    assert default in found.terminal_settings and found.terminal_settings[0] is found.present_result
+    assert found.choices["choice"].tolist()[0] == "now"
+    assert any(name.startswith("MuJoCo's defaults (") for name in found.choices["option"])
     line = replace(chosen(measured(10.0, 1.0), replace(default, times=np.full(10, 1.0)))).lines[0]
     assert line.endswith("<!-- as accurate as now, faster, MuJoCo's defaults -->")
     # A model with the default options: its own setting is not measured twice.

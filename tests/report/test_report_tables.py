@@ -138,6 +138,8 @@ SCENARIOS = [
         ("faster", [(1e-5, 1e-9), (2e-5, 1e-9)]), ("slower", [(1e-4, 1e-9), (2e-4, 1e-9)]),
         ("as fast", [(3.9e-5, 1e-9), (8e-5, 1e-9)]), ("right on one of two cases", [(1e-6, 1e-9), (1e-6, 1e-2)]),
         ("wrong or without a residual", [(1e-6, 1e-2), (1e-6, math.nan)]))),
+    ("an engine that answered one of two problems is not ranked", ENGINE, {"answers": {
+        "a": {"solver": "NEWTON", "verdict": "wrong", "seconds": 1e-5, "relative": 1e-9}}}, "rank"),
     *((f"compared with an earlier run, {words}", [record("a", "pgs", now, x, calibration_time=1e-4 * drift)],
        {"old": lines_of(record("a", "pgs", 1e-3, 1e-8))}, "changes") for words, now, x, drift in (
         ("20 % slower is noise", 1.2e-3, 1e-8, 1.0), ("twice as slow", 2e-3, 1e-8, 1.0),

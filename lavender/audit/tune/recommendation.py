@@ -9,13 +9,26 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lavender.audit.page import ResultPage, Section, StepSizes, describe_exceedance
+from lavender.audit.page import SHOWN_RATIO, ResultPage, StepSizes, describe_exceedance
 from lavender.audit.provenance import format_provenance
 from lavender.audit.settings import MERGE_NOTE, MujocoSetting
 from lavender.audit.tune.measured import Measured
-from lavender.base.deadline import format_seconds
 from lavender.problem.derived import cached_property
-from lavender.report.text import format_ratio, format_size
+from lavender.report.drawing import (
+    BLUE,
+    GREEN,
+    INK,
+    OLIVE,
+    PAPER,
+    PINK,
+    QUIET,
+    draw_figure,
+    label_ends,
+    mark_errors,
+    write_label,
+)
+from lavender.report.page import DEFAULT_ERROR_LIMIT, Page, fold_table, tabulate_frame
+from lavender.report.text import format_count, format_size, format_speed
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -266,17 +279,6 @@ class Tuning:
             sentences.append(MERGE_NOTE)
         return " ".join(filter(None, sentences))
 
-    def _describe_gain(self) -> str:
-        """Return a sentence on the gain of the more accurate setting on the worlds held back; empty without one."""
-        tested = None if self.closer is None else self._find_held_back(self.closer)
-        if tested is None:
-            return ""
-        error, before = tested.worst_error, self.held[0].worst_error
-        if error >= before:
-            return "No setting is as fast and more accurate on the worlds held back."
-        gain = f"{format_ratio(before / error)} less" if error else "exactly 0"
-        return f"In the same time the error can be {gain} on worlds that were held back from the choice."
-
     def _tabulate_settings(self, settings: Iterable[Measured]) -> pd.DataFrame:
         """Build the table of some settings."""
         import pandas as pd
@@ -290,52 +292,174 @@ class Tuning:
         return pd.DataFrame(rows, columns=heads)
 
     @property
-    def terminal_settings(self) -> list[Measured]:
-        """Settings in the table of the terminal: the present one first, the others by time.
+    def shown_limit(self) -> float:
+        """Velocity error with which the page compares [m/s, rad/s]: `error_limit`, or else the default of all pages."""
+        return DEFAULT_ERROR_LIMIT if self.error_limit is None else self.error_limit
 
-        The others are MuJoCo's defaults, and of the Pareto front the fastest, the last one in the present time,
-        and the last one, which have the smallest errors.
+    @property
+    def advised(self) -> Measured | None:
+        """The setting of the first sentence; None if the present one is best or too few steps have contact.
+
+        It is the one within `error_limit` if that is given; else the more accurate one in the same time if the present
+        errors exceed the limit of the page, else the faster one.
         """
-        now, front = self.present_result, self.pareto_front
-        quick = [m for m in front if m.mean_step_time <= (1.0 + TIME_NOISE_FRACTION) * now.mean_step_time]
-        defaults = [m for m in self._same_problem if m.setting.is_default]
-        shown = dict.fromkeys([*quick[:1], *quick[-1:], front[-1], *defaults])
-        shown.pop(now, None)
-        return [now, *sorted(shown, key=lambda m: m.mean_step_time)]
-
-    def draw_settings(self, folder: Path) -> str:
-        """Draw the error over the time of a step."""
-        from lavender.report.drawing import BLUE, draw_figure, mark_errors
-
-        def fill(axes: Any) -> str:
-            points = np.array([(m.mean_step_time, max(m.worst_error, 0.5e-9)) for m in self._same_problem])
-            mark_errors(axes, 1e-9, float(points[:, 1].max()), self.error_limit or 1e-3)
-            axes.plot(*points.T, "o", color=BLUE)
-            axes.set_xlabel("time of a step [s]")
-            return f"{len(points)} settings"
-
-        return draw_figure("time-and-error", fill, (4.9, 3.3), {"left": 0.13, "right": 0.75}, folder=folder)
+        now = self.present_result
+        if self.reason_without_line:
+            return None
+        if self.error_limit is not None:
+            return None if self.limit_choice is now else self.limit_choice
+        both = (self.closer, self.faster)
+        first, second = both if now.error.max() > self.shown_limit else both[::-1]
+        return first or second
 
     @property
     def headline(self) -> list[str]:
-        """Time and error of the present setting, the gain, and the reason if no line is recommended."""
-        now = self.present_result
+        """What to set and what it changes; the present errors; the results on the worlds held back."""
+        now, m, n = self.present_result, self.advised, len(self._same_problem)
         own = (
-            f"{self.model}: a step takes {format_seconds(now.mean_step_time)}, and 1 % of the steps have errors above "
-            f"{format_size(now.worst_error)} m/s."
+            f"Now 1 % of the steps have errors above {format_speed(now.worst_error)}, the worst "
+            f"{format_speed(float(now.error.max()))}; the limit is {format_speed(self.shown_limit)}."
         )
-        return [own, *filter(None, (self._describe_gain(), self.reason_without_line))]
+        if self.reason_without_line:
+            return [self.reason_without_line, own]
+        if m is None:
+            return [f"Keep the model's own setting: none of {n} settings is better in the same time.", own]
+        ratio = m.mean_step_time / now.mean_step_time
+        is_same = abs(ratio - 1.0) <= TIME_NOISE_FRACTION
+        time = "the same time per step" if is_same else f"{ratio:.2f} of the time per step"
+        new, old = (format_speed(self._compute_largest_error(x)) for x in (m, now))
+        worst = f"a worst error of {new} instead of {old}" if new != old else f"the same worst error of {new}"
+        first = f"Set {m.setting.short_name}: {time}, and {worst}."
+        if self.error_limit is not None and self.within_limit is None:
+            first = f"None of {n} settings is within the limit. {first}"
+        return [first, own, *filter(None, [self._describe_held_back(m)])]
+
+    def _describe_held_back(self, m: Measured) -> str:
+        """Return the results of a setting on the worlds held back; empty if it was not measured there."""
+        held = self._find_held_back(m)
+        if held is None:
+            return ""
+        ratio, worst = (
+            held.mean_step_time / self.held[0].mean_step_time,
+            format_speed(float(held.error.max())),
+        )
+        return (
+            f"On {format_count(self.n_held_worlds, 'world')} held back from the choice: {ratio:.2f} of the time, worst "
+            f"error {worst} in {format_count(len(held.error), 'step')}."
+        )
+
+    @property
+    def choices(self) -> pd.DataFrame:
+        """The present setting and the advised ones: option, relative time, and errors on the first half of worlds."""
+        import pandas as pd
+
+        now = self.present_result
+        named = [("now", now), ("as fast, more accurate", self.closer), ("as accurate, faster", self.faster)]
+        if self.error_limit is not None:
+            goal = f"fastest within {format_speed(self.error_limit)}"
+            named.append((goal if self.within_limit else "most accurate", self.limit_choice))
+        named += [("MuJoCo's defaults", m) for m in self._same_problem if m.setting.is_default]
+        rows = [
+            (name, m.setting.short_name, f"{m.mean_step_time / now.mean_step_time:.2f}",
+             format_speed(m.worst_error), format_speed(self._compute_largest_error(m)))
+            for name, m in named if m is not None
+        ]  # fmt: skip
+        return pd.DataFrame(rows, columns=["choice", "option", "time", "1 %", "worst"])
+
+    def draw_settings(self, folder: Path) -> str:
+        """Draw the error of each setting over its time relative to the present one."""
+        now, limit = self.present_result, self.shown_limit
+        low = SHOWN_RATIO * limit
+        solvers = list(dict.fromkeys(m.solver for m in self._same_problem))
+        styles = {s: ((BLUE, GREEN, PINK, OLIVE)[i % 4], "osDv"[i % 4]) for i, s in enumerate(solvers)}
+
+        def place(m: Measured) -> tuple[float, float]:
+            """Return the relative time and the shown error of a setting."""
+            return m.mean_step_time / now.mean_step_time, max(m.worst_error, low / 2.0)
+
+        def fill(axes: Any) -> str:
+            points = np.array(list(map(place, self._same_problem)))
+            labels = mark_errors(axes, low, float(points[:, 1].max()), limit)
+            low_x, high_x = float(points[:, 0].min()), max(float(np.quantile(points[:, 0], 0.97)), 1.05)
+            axes.set_xlim(low_x - 0.04, high_x + 0.04)
+            axes.axvline(1.0, color=QUIET, lw=0.7, ls=":")
+            for solver, (color, mark) in styles.items():
+                own = np.array([place(m) for m in self._same_problem if m.solver == solver])
+                axes.plot(*own.T, mark, color=color, ms=4.5, alpha=0.75, mew=0)
+            front = np.array(list(map(place, self.pareto_front)))
+            axes.step(*front.T, where="post", color=QUIET, lw=0.8, zorder=1)
+            x, y = place(now)
+            axes.plot([x], [y], "*", ms=14, color=INK, mec=PAPER, mew=0.8, zorder=9)
+            more = {"textcoords": "offset points", "fontweight": "bold", "fontsize": 8.8}
+            axes.annotate("your option", (x, y), xytext=(-8, -14), ha="right", **more)
+            if self.advised is not None:
+                x, y = place(self.advised)
+                arrow = {"arrowstyle": "-", "lw": 0.6, "color": QUIET}
+                axes.plot([x], [y], "o", ms=10, mfc="none", mec=INK, mew=1.4, zorder=9)
+                axes.annotate("set this", (x, y), xytext=(14, 26), arrowprops=arrow, **more)
+            axes.set_xlabel("time of a step, your option = 1")
+            axes.set_ylabel("error that 1 % of the steps exceed [m/s]")
+            label_ends(axes, labels)
+            for i, (solver, (color, mark)) in enumerate(styles.items()):
+                axes.plot(
+                    [1.06],
+                    [0.97 - 0.07 * i],
+                    mark,
+                    color=color,
+                    ms=5,
+                    transform=axes.transAxes,
+                    clip_on=False,
+                )
+                write_label(axes, 1.1, 0.97 - 0.07 * i, solver, color=color)
+            fastest = self.pareto_front[0].mean_step_time / now.mean_step_time
+            numbers = f"{len(points)} settings, fastest {fastest:.2f} of the time"
+            return f"Error against time of {numbers}. {self.headline[0]}"
+
+        note = "Each mark is a setting of <option> for the same problem; line: fastest for its error (numbers.json)."
+        margins = {"left": 0.13, "right": 0.75, "top": 0.96, "bottom": 0.14}
+        return draw_figure("settings", fill, (4.9, 3.5), margins, note=note, folder=folder)
+
+    def make_page(self, folder: Path | None) -> Page:
+        """Make the page; without a folder for figures, only its head."""
+        first, *sentences = self.headline
+        m, worst = self.advised, float(self.present_result.error.max())
+        warnings = [*filter(None, self.notes)]
+        if self.busy and not self.reason_without_line:
+            warnings.append(f"{self.busy} Errors are not affected.")
+        blocks: list[Any] = []
+        if folder is not None:
+            from markupsafe import Markup
+
+            drawn = [] if self.reason_without_line else [Markup(self.draw_settings(folder))]
+            choices = tabulate_frame(self.choices, title="Choices", note=f"{self._lines_note}")
+            blocks.append({"pair": [drawn, [choices]]})
+            every = sorted(self.measured, key=lambda m: m.mean_step_time)
+            other = [m for m in self.measured if m.setting.changes_problem]
+            motion = f"Motion: distance after {self.horizon} steps from a converged run."
+            parts = [("Every setting", self._tabulate_settings(every), motion)]
+            if other:
+                note = "Settings that change the problem: the error is that of its own problem."
+                parts.append(("Other problems", self._tabulate_settings(other), note))
+            if self.sizes is not None:
+                parts.append(
+                    ("Rows and contacts of a step", self.sizes.table, "With the model's own setting.")
+                )
+            blocks += [fold_table(*part) for part in parts]
+        source = (
+            f"lavender tune · {Path(self.model).name} · {format_count(len(self._same_problem), 'setting')}"
+        )
+        is_bad = worst > self.shown_limit
+        footer = ["Files: numbers.json, judged.npz, figures/ as PDF, SVG and PNG."]
+        code = [m.setting.option_line] if m is not None and m.setting.option_line else []
+        mark = "✗ above the limit now" if is_bad else "✓ within the limit now"
+        if self.reason_without_line:
+            mark, is_bad = "✗ too little contact", True
+        return Page("lavender tune", source, first, sentences, code, mark=mark, is_bad=is_bad, warnings=warnings,
+                    blocks=blocks, footer=footer)  # fmt: skip
 
     @property
     def page(self) -> ResultPage:
         """Page with the result in sentences, figures and tables, as `lavender tune` writes it."""
-        now = self.present_result
-        other = [m for m in self.measured if m.setting.changes_problem]
-        shown = [now, *(m for m in self.pareto_front if m is not now)]
-        every = sorted(self.measured, key=lambda m: m.mean_step_time)
-        figures = [] if self.reason_without_line else [self.draw_settings]
-        title = "Provisional lines" if self.reason_provisional else "Lines to copy"
-        short = self._tabulate_settings(self.terminal_settings).iloc[:, :4]
         numbers = {
             "model": self.model, "lines": self.lines, "why_no_line": self.reason_without_line, "busy": self.busy,
             "error_limit": self.error_limit,
@@ -343,22 +467,9 @@ class Tuning:
             **({} if self.sizes is None else self.sizes.as_dict), "stopped": self.stopped,
             "measured": list(map(_to_dict, self.measured)), "held": list(map(_to_dict, self.held)),
         }  # fmt: skip
-        sizes = [] if self.sizes is None else [self.sizes.table]
-        return ResultPage(
-            title="lavender tune", headline=self.headline, sections=[
-                Section(title, code=self.lines, note=self._lines_note),
-                Section("Rows and contacts", sizes, short=2,
-                        note="Rows and contacts of the steps with the model's own setting."),
-                Section("Fastest settings by error", [self._tabulate_settings(shown)], figures=figures,
-                        note=f"Motion: distance after {self.horizon} steps from a converged run.", short_frame=short),
-                Section("Other problems", [self._tabulate_settings(other)], short=2,
-                        note="Settings that change the problem: the error is that of its own problem."),
-                Section("Every setting", [self._tabulate_settings(every)],
-                        note="Settings with which a world diverges are left out."),
-            ],
-            numbers=numbers | {"provenance": self.provenance}, notes=list(filter(None, (*self.notes, self.busy))),
-            is_stopped=self.stopped, provenance=format_provenance(self.provenance) if self.provenance else "",
-        )  # fmt: skip
+        last = format_provenance(self.provenance) if self.provenance else ""
+        numbers |= {"provenance": self.provenance}
+        return ResultPage(self.make_page, numbers, [self.choices], self.stopped, last)
 
 
 def _format_comparison(m: Measured, now: Measured) -> str:
