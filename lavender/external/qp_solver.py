@@ -176,7 +176,8 @@ class QPSolver(Solver):
     @property
     def is_isolated(self) -> bool:
         """Whether the backend runs in another process under a time limit."""
-        return not self.backend.stoppable if self.isolate is None else self.isolate
+        keeps_limit = self.backend.stoppable and not self.backend.overruns
+        return not keeps_limit if self.isolate is None else self.isolate
 
     @np.errstate(all="ignore")  # The judge finds overflows.
     def prepare(self, problem: Problem) -> Form:
@@ -230,9 +231,10 @@ class QPSolver(Solver):
             start=start, needs_definite=b.needs_definite, call_iterations=b.max_iter,
             first_tolerance=b.first_tolerance,
         )  # fmt: skip
-        if deadline.is_set and not b.stoppable:
+        if deadline.is_set and not (b.stoppable and not b.overruns):
+            limit = "reads its time limit rarely" if b.stoppable else "accepts no time limit"
             manner = "in a separate process" if is_isolated else "to its end"
-            result.message = f"{result.message}; the backend accepts no time limit and ran {manner}"
+            result.message = f"{result.message}; the backend {limit} and ran {manner}"
         return result
 
     @np.errstate(all="ignore")  # The judge finds overflows.

@@ -22,7 +22,7 @@ def test_plot_of_a_solution_shows_worst_rows_and_history(solution):
     worst, history = solution.plot(rows=3).axes
     widths = [bar.get_width() for bar in worst.patches]
     assert widths == sorted(solution.residual.velocity_by_row)[-3:]
-    assert [text.get_text() for text in worst.get_yticklabels()][-1] == solution.residual.worst_name
+    assert [text.get_text() for text in worst.get_yticklabels()][-1] == f"{solution.residual.worst_name} [m/s]"
     np.testing.assert_array_equal(history.lines[0].get_ydata(), solution.history.relative)
     with pytest.raises(lv.InputError, match="rows is 0"):
         solution.plot(rows=0)
@@ -53,4 +53,4 @@ def test_repr_html_has_the_numbers_of_a_result(problem, solution):
     floor = f"{solution.residual.roundoff_floor:.1e}"
     assert floor in solution._repr_html_() and floor in solution.residual._repr_html_()
     html = lv.cross_check(problem, ["direct", "pgs"])._repr_html_()
-    assert html.count("<tr>") == 3 and "agrees" in html
+    assert html.count("<tr") == 3 and "agrees" in html

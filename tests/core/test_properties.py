@@ -361,7 +361,7 @@ def test_call_backend_until_accepted_returns_the_claim_of_the_best_call(statuses
 
 
 def test_second_call_of_a_backend_has_all_rows_a_smaller_tolerance_and_the_rest_of_the_budget():
-    program = get_program(lv.Problem.from_qp(4.0 * np.eye(2), [4.0, 1e-3], G=np.eye(2), h=[1.0, 1e9]).qp)
+    program = get_program(lv.Problem.from_qp(np.diag([4.0, 1e4]), [4.0, 1e-3], G=np.eye(2), h=[1.0, 1e9]).qp)
     steps, start = Steps(["STALLED", "CONVERGED"], [False, True]), (np.array([3.0, 5.0]), np.array([7.0, 11.0]))
     more = {"max_iter": 100, "tol": 1e-6, "deadline": deadline.NEVER, "settings": {}}
     call_backend_until_accepted(program, steps, steps, start=start, **more)

@@ -314,7 +314,7 @@ class Tuning:
 
     @property
     def headline(self) -> list[str]:
-        """What to set and what it changes; the present errors; the results on the worlds held back."""
+        """Return the headline: the setting, its gain, the present errors, the results on worlds held back."""
         now, m, n = self.present_result, self.advised, len(self._same_problem)
         own = (
             f"Now 1 % of the steps have errors above {format_speed(now.worst_error)}, the worst "

@@ -270,7 +270,7 @@ FAULTS = [
     (UsesTheSymmetricPart, "problems_are_solved", "for an asymmetric A"),
     (ForgetsCount, "bits_are_reproducible", "keep all changes in the state"),
     (Counts, "bits_are_reproducible", "gives other bits"),
-    (OldNumbers, "bits_are_reproducible", "`update` gives other bits than `prepare`"),
+    (OldNumbers, "bits_are_reproducible", "gives other bits than `prepare`"),
     (ForgetsCount, "interruptions_return_the_iterate", "history=True changes the bits"),
     (StopsAtTwo, "interruptions_return_the_iterate", "TIME_LIMIT after at least 1 iteration is required"),
     (Restarts, "a_solution_as_start_is_kept", "changed it, or ended as"),
@@ -313,8 +313,8 @@ def test_contract_of_a_faulty_solver_names_the_unmet_check(register, factory, ch
     [
         ("options_match_the_spec", {"options": {"omega": "a factor"}}, "the options omega are in the spec or"),
         ("problems_are_solved", {"laws": {"lcp", "cone"}, "refusal": lambda p: "no" * (p.law == "cone")},
-         "the spec lists the laws ['cone'], but refuses every problem of them"),
-        ("budgets_are_kept", {"refusal": lambda p: "never"}, "the spec lists the laws ['lcp', 'linear'], but refuses"),
+         "the spec lists the law cone, but refuses every problem with it"),
+        ("budgets_are_kept", {"refusal": lambda p: "never"}, "the law linear, but refuses every problem with it"),
     ],
 )  # fmt: skip
 def test_contract_of_a_wrong_spec_names_the_unmet_check(register, check, more, words):
