@@ -3,6 +3,7 @@
 import doctest
 import importlib
 import inspect
+import json
 import pkgutil
 import re
 import shlex
@@ -325,3 +326,21 @@ def test_pages_are_within_two_clicks_of_the_readme():
     reached = first.union(*(follow(page) for page in first if page.is_file()))
     missed = {page.name for page in (ROOT / "docs").glob("*.md")} - {page.name for page in reached}
     assert missed <= {"index.md"}
+
+
+def test_readme_has_the_numbers_of_its_figure():
+    numbers = json.loads((ROOT / "docs" / "static" / "hero.json").read_text(encoding="utf-8"))
+    text = re.sub(r"\s+", " ", (ROOT / "README.md").read_text(encoding="utf-8"))
+    curves = numbers["curves"]
+    for name in ("pgs", "nncg"):
+        assert min(error for _, error in curves[name]) > 1e-4
+    reached = next(point for tol, point in enumerate(curves["auto"], 1) if tol == 6)  # at tol = 1e-6
+    newton = next(seconds for seconds, error in curves["newton"] if error <= reached[1])
+    before, after = numbers["worst"].values()
+    for part in (
+        f"a pile of {numbers['rows']} rows", "`pgs` and `nncg` stop above 0.1 mm/s",
+        f"`auto` reaches {reached[1]:.0e} m/s in {1e3 * reached[0]:.0f} ms".replace("e-0", "e-"),
+        f"needs {1e3 * newton:.0f} ms", f"all {numbers['steps']} steps",
+        f"from {before:.1e} to {after:.1e} m/s".replace("e-0", "e-"),
+    ):  # fmt: skip
+        assert part in text, part

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import mujoco
 import numpy as np
 import pytest
 from hypothesis import given
@@ -94,6 +93,7 @@ MODEL = """<mujoco><option cone="elliptic"/><worldbody><geom type="plane" size="
 
 
 def test_from_mujoco_rows_of_every_kind_have_the_unit_of_their_velocity():
+    mujoco = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[mujoco]'")
     model = mujoco.MjModel.from_xml_string(MODEL)
     data = mujoco.MjData(model)
     data.qpos[:2] = 1.5, 1.5
