@@ -352,14 +352,14 @@ class Stepping:
             self.prepare_substep()
             kernel, a = self.state.kernel, self.state.a
             kernel.solve(False)
-            if not (warm and self._run_newton_on_engine_arrays()):
+            rows = self.state.size.item(SIZE["joint_rows"]) + self.state.head.item(HEAD["contact_rows"])
+            if rows and not (warm and self._run_newton_on_engine_arrays()):
                 try:
                     problem = self._build_problem(self.state)
                 except InputError:  # The numbers of the problem are not finite.
                     self._end_run_at_lost_body()
                     return
-                if problem.m:
-                    a["impulse"][: problem.m] = self._solve(problem)
+                a["impulse"][: problem.m] = self._solve(problem)
                 kernel.apply_impulses()
             if kernel.finish_substep() != OK:
                 return

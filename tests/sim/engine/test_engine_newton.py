@@ -121,3 +121,22 @@ def test_scene_step_by_newton_with_more_bodies_than_its_first_workspace_runs():
     steps.step()
     code, _, factorisations, relative = steps.told
     assert code == FACTORED and factorisations > 0 and relative <= steps.tol
+
+
+@pytest.mark.parametrize("solver", ["newton", "pgs", "auto"])
+def test_scene_step_without_rows_flies_like_the_sweeps_and_builds_no_problem(solver, monkeypatch):
+    def fly(name):
+        scene = lv.Scene(dt=0.01, substeps=2, solver=name)
+        scene.add_plane()
+        scene.add_box((0.4, 0.3, 0.1), position=(0, 0, 50.0), velocity=(1, 2, 3), angular_velocity=(3, 1, 2))
+        sim = lv.Simulation(scene)
+        for _ in range(20):
+            observation = sim.step()[0]
+        assert sim.last_solution is None
+        return observation
+
+    expected = fly("sequential_impulses")
+    monkeypatch.setattr("lavender.sim.engine.stepping.build_problem", None)
+    found = fly(solver)
+    for quantity in ("positions", "quaternions", "velocities"):
+        np.testing.assert_array_equal(found[quantity], expected[quantity])
