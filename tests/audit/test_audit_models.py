@@ -1,5 +1,6 @@
 """Audits of models as they are: changed after loading, in an environment, against another model, and resumed."""
 
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -193,6 +194,12 @@ def test_audit_against_another_model_judges_both_on_the_same_states(boxes, tmp_p
     assert table.columns.tolist()[1:] == [f"{path.name} [m/s]", "against other.xml [m/s]"]
     assert table.iloc[-1, 1:].tolist() == [alone.numbers[0].max(), found.against.numbers[0].max()]
     assert "Against other.xml, on the same 60 states" in found.headline[-1]
+    own, its = (x.numbers[0][x.is_judged] for x in (found, found.against))
+    smaller, larger = map(
+        float, re.search(r"smaller in ([\d.]+) % .* larger in ([\d.]+) %", found.headline[-1]).groups()
+    )
+    assert (smaller, larger) == pytest.approx((100 * (own < its).mean(), 100 * (own > its).mean()), abs=0.06)
+    assert smaller != larger
     found.write(tmp_path / "out")
     assert (np.load(tmp_path / "out" / "records.npz")["against"] == found.against.numbers[0]).all()
 

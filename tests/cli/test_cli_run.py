@@ -4,6 +4,7 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from click.testing import CliRunner
 from PIL import Image
@@ -75,7 +76,9 @@ def test_ctrl_c_keeps_the_steps_until_then(lavender, monkeypatch, tmp_path):
     files = ("--trace", trace, "--film", film, "--record", problems)
     code, out, _ = lavender("run", "stack", "--steps", "50", *files)
     assert code == 130 and "5 steps" in out and "Stopped" in out
-    assert len(trace.read_text().splitlines()) == 1 + 5 and film.stat().st_size
+    rows = pd.read_csv(trace)
+    np.testing.assert_allclose(rows["time"] / rows["step"], rows["time"][0], rtol=1e-9)  # of the state after a step
+    assert rows["step"].tolist() == [1, 2, 3, 4, 5] and film.stat().st_size
     assert len(list(problems.iterdir())) >= 5
     monkeypatch.setattr(Simulation, "step", lambda self: (_ for _ in ()).throw(KeyboardInterrupt))
     assert lavender("run", "stack")[0] == 130  # nothing to keep

@@ -23,6 +23,7 @@ from lavender.solvers import direct
 from lavender.solvers.islands import find_islands, get_rows_of_blocks, restrict_to_blocks
 from lavender.solvers.polyhedral import BoundedRowSolver, convert_to_bounded_rows
 from lavender.solving import log, loop
+from lavender.solving.velocity import accept_velocity
 from lavender_ext.judge.measure import is_residual_at_floor
 
 # -- many worlds -------------------------------------------------------------------------------------------------------
@@ -114,6 +115,16 @@ def test_solve_many_invalid_world_between_valid_ones_has_no_numbers():
         assert many.status[i] is lv.Status.INVALID_PROBLEM and f"world {i}" in str(many.faults[i])
         assert (many.iterations[i], many.worst_row[i]) == (0, -1)
         assert np.isnan(many.velocity[i]).all() and np.isnan(many.impulse[i]).all()
+
+
+def test_velocity_tol_accepts_what_is_within_it_from_every_end_that_claims_nothing_else():
+    solution = lv.solve(draw_worlds("batch")[0], "pgs", tol=0.0, max_iter=2)
+    for status in lv.Status:
+        ended = solution.with_fields(status=status)
+        within = accept_velocity(ended, 1.01 * solution.residual.velocity).status
+        claims_nothing = status in ("MAX_ITERATIONS", "STALLED", "TIME_LIMIT")
+        assert within is (lv.Status.CONVERGED if claims_nothing else status)
+        assert accept_velocity(ended, 0.99 * solution.residual.velocity).status is status
 
 
 # -- verdicts and proofs -----------------------------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 """A simulation of MuJoCo as a folder of problems, with its own answers judged beside them."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from mujoco_scene import mj, scene, state
 
 import lavender as lv
 from lavender.io import recorder, recording
+from lavender.io.start_states import StartStates
 
 PGS = 1e-6  # as in test_io_mujoco.py
 
@@ -82,6 +84,22 @@ def test_record_from_different_states_makes_independent_steps(tmp_path):
     # A single step of each state is a single problem, which is solved cold.
     items = lv.report.resolve_sources(tmp_path / "three", sequences=True)
     assert [(i.name, i.sequence, i.step) for i in items] == [(f"three, state {k}", "", -1) for k in range(3)]
+
+
+@pytest.mark.parametrize(("steps", "every", "count"), [(20, 1, 3), (20, 2, 3), (17, 3, 5), (9, 4, 1)])
+def test_steps_from_start_states_are_counted_from_each_and_begin_under_its_controls(steps, every, count):
+    model, data = state(steps=1)
+    vectors = np.empty((9, mj.mj_stateSize(model, mj.mjtState.mjSTATE_INTEGRATION)))
+    for row in vectors:
+        mj.mj_step(model, data)
+        mj.mj_getState(model, data, row, mj.mjtState.mjSTATE_INTEGRATION)
+    starts = StartStates(vectors, controls=np.arange(9.0)[:, None]).select_evenly(count)
+    kept = [9 * i // count for i in range(count)]
+    assert starts.vectors.tobytes() == vectors[kept].tobytes() and starts.controls.ravel().tolist() == kept
+    starts = replace(starts, controls=None)
+    found = list(recording.iterate_steps(mj, model, data, steps, every, lambda *_: None, starts))
+    ends = [steps * i // count for i in range(count + 1)]
+    assert found == [(k + 1, i) for i in range(count) for k in range(ends[i], ends[i + 1], every)]
 
 
 def test_record_of_steps_that_cannot_be_exported_counts_them(tmp_path, monkeypatch):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from hypothesis import given
-from random_problems import as_matrix, random_contact_problem, random_lcp, seeds, sweeps, touching
+from random_problems import as_matrix, random_contact_problem, random_lcp, seeds, side_by_side, sweeps, touching
 
 import lavender as lv
 from lavender.problem.ordering import (
@@ -78,6 +78,16 @@ def test_blocks_of_floating_bodies_are_above_the_blocks_of_bodies_on_the_ground(
     assert level.tolist()[1:3] == [0, 1] and min(level[0], level[3]) > 1
     assert compute_block_order(problem, "bottom_up").blocks.tolist() == [1, 2, 0, 3]
     assert compute_block_order(problem, "top_down").blocks.tolist() in ([0, 3, 2, 1], [3, 0, 2, 1])
+
+
+@given(seed=seeds)
+def test_blocks_of_a_matrix_that_no_path_connects_to_the_ground_are_above_all_others(seed):
+    a = as_matrix(random_contact_problem(seed, bodies=8, joints=2, contacts=5))
+    two = side_by_side([a, a])
+    ground = np.arange(a.n_blocks)[::2]
+    level = compute_block_levels_from_ground(two, ground)
+    assert (level[ground] == 0).all()
+    assert level[a.n_blocks :].min() >= max(level[: a.n_blocks].max(), 1)
 
 
 def test_order_symmetric_is_forwards_then_backwards():
