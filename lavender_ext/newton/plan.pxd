@@ -13,12 +13,12 @@
                                               that there is no solution
     Coulomb's       START_FLOW                Euler steps, if the start solves the convex law     START_DAMPED_NEWTON
                     START_DAMPED_NEWTON       proximal damped Newton from the start               FIRST_DE_SAXCE
-                    FIRST_DE_SAXCE            De Saxce's interior point, 0.95 of phi's derivative CONVEX_POINT
+                    FIRST_DE_SAXCE            De Saxce's interior point, 0.95 of phi's derivative FIRST_FLOW
+                    FIRST_FLOW                Euler steps, if this point is near a solution       CONVEX_POINT
                     CONVEX_POINT              interior point of the convex law, judged under      CONVEX_FLOW
                                               Coulomb's law, unless the start solves it; ends
                                               if many contacts slide
-                    CONVEX_FLOW               Euler steps from it, if few contacts slide          FIRST_FLOW
-                    FIRST_FLOW                Euler steps, if the best point is near a solution   FIRST_PATH
+                    CONVEX_FLOW               Euler steps from it, if few contacts slide          FIRST_PATH
                     FIRST_PATH                path of smoothed problems, unless joints are rigid  SECOND_DE_SAXCE
                     SECOND_DE_SAXCE           De Saxce's interior point with 0.7 of it            AUGMENTED_DE_SAXCE
                     AUGMENTED_DE_SAXCE        the same on the augmented system, if joints are     LAST_PATH
@@ -47,9 +47,9 @@ tol is 1e-6 unless the line names another one.
     START_FLOW                granularF(n=6, sliding=2, seed=2) from the solution of the cone law: 2.4
     START_DAMPED_NEWTON       engine/balls_step_0030: 4.6
     FIRST_DE_SAXCE            cards 3000 0.1 0: 20
+    FIRST_FLOW                cards 900 0.1 0: 5.0
     CONVEX_POINT              pile 3000 0.5 0
     CONVEX_FLOW               granularF(n=4, sliding=2, seed=10): 9
-    FIRST_FLOW                cards 900 0.1 0: 5.0
     FIRST_PATH                wall 3000 0.5 1
     SECOND_DE_SAXCE           ragdolls 300 0.5 0: 1.9
     DE_SAXCE_SECOND_END       ragdolls 3000 0.5 1, seed 31: 3.2
@@ -105,9 +105,9 @@ cdef enum:                      # states of PLAN_COULOMB
     START_FLOW = 0
     START_DAMPED_NEWTON = 1
     FIRST_DE_SAXCE = 2
-    CONVEX_POINT = 3
-    CONVEX_FLOW = 4
-    FIRST_FLOW = 5
+    FIRST_FLOW = 3
+    CONVEX_POINT = 4
+    CONVEX_FLOW = 5
     FIRST_PATH = 6
     SECOND_DE_SAXCE = 7
     AUGMENTED_DE_SAXCE = 8
@@ -401,6 +401,9 @@ cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
             begin_damped_newton_stretches(n, START_FACTORISATIONS, 2.0 * max_start_residual_ratio() * n.best)
     elif state == FIRST_DE_SAXCE:
         begin_de_saxce(n, first_derivative_fraction(), far_from_end())
+    elif state == FIRST_FLOW:
+        if n.s.e.m >= MIN_FLOW_ROWS and n.best < max_flow_residual() and not n.flow.has_run:
+            begin_flow(n, n.best_z, FIRST_FLOW_FACTORISATIONS, FLOW_PATIENCE)
     elif state == CONVEX_POINT:
         if not n.has_convex_start and has_convex_law(n):
             begin_interior_point(n, compute_proximal_weight(), 0.0)
@@ -412,9 +415,6 @@ cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
             n.mostly_slides = n.mostly_slides or slides_mostly(n, n.convex_z)
         if n.has_convex_start and not n.mostly_slides:
             begin_flow(n, n.convex_z, CONVEX_FLOW_FACTORISATIONS, CONVEX_FLOW_FACTORISATIONS)
-    elif state == FIRST_FLOW:
-        if n.s.e.m >= MIN_FLOW_ROWS and n.best < max_flow_residual() and not n.flow.has_run:
-            begin_flow(n, n.best_z, FIRST_FLOW_FACTORISATIONS, FLOW_PATIENCE)
     elif state == FIRST_PATH:
         if n.is_at_rest:
             begin_flow(n, n.best_z, LAST_FLOW_FACTORISATIONS, LAST_FLOW_PATIENCE)
