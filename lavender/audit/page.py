@@ -25,7 +25,14 @@ from lavender.report.drawing import (
 )
 from lavender.report.page import Page, fold_table, make_table
 from lavender.report.render import print_table, write_files
-from lavender.report.text import format_count, format_number, format_percent, format_power, format_speed
+from lavender.report.text import (
+    format_count,
+    format_number,
+    format_percent,
+    format_power,
+    format_speed,
+    split_row_unit,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -95,12 +102,6 @@ class ResultPage:
 
 
 # -- audit -------------------------------------------------------------------------------------------------
-
-
-def split_row_unit(row: str) -> tuple[str, str]:
-    """Return the name of a row without its unit, and the unit of its velocity: rad/s if the name ends so, else m/s."""
-    name = row.removesuffix(" [rad/s]")
-    return name, "m/s" if name == row else "rad/s"
 
 
 def make_audit_page(audit: Any, folder: Path | None) -> Page:
@@ -197,16 +198,15 @@ class AuditCounts:
             parts.append("no step was judged")
         elif self.above:
             n, share = format_number(self.n), format_percent(self.above, self.n)
-            worst = format_speed(self.largest, self.unit)
+            worst = format_speed(self.largest, self.unit, self.limit)
             is_wrong = "is" if self.above == 1 else "are"
             parts.append(
                 f"{format_number(self.above)} of {n} steps ({share}) {is_wrong} wrong by more than {limit}; "
                 f"the worst by {worst}"
             )
         else:
-            by = (
-                f"by more than {format_speed(self.largest, self.unit)}" if self.largest else "beyond rounding"
-            )
+            largest = format_speed(self.largest, self.unit, self.limit)
+            by = f"by more than {largest}" if self.largest else "beyond rounding"
             parts.append(f"no step is wrong {by}; the limit is {limit}")
         if lost := int((audit.verdict == len(VERDICTS)).sum()):
             parts.append(f"{format_count(lost, 'step')} not judged")

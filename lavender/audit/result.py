@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lavender.audit.page import AuditCounts, ResultPage, StepSizes, make_audit_page, split_row_unit
+from lavender.audit.page import AuditCounts, ResultPage, StepSizes, make_audit_page
 from lavender.audit.pieces import (
     AUDIT_VERDICTS,
     N_WORST_WORLDS,
@@ -31,7 +31,7 @@ from lavender.io.npz import write_npz
 from lavender.io.stored import prepare_step_folder, write_arrays
 from lavender.judge.residuals import AT_FLOOR, CLOSE, DEFAULT_THRESHOLD, UNCONVERGED, WRONG
 from lavender.report.page import DEFAULT_ERROR_LIMIT
-from lavender.report.text import format_count, format_percent, format_size, format_speed
+from lavender.report.text import format_count, format_percent, format_size, format_speed, split_row_unit
 
 if TYPE_CHECKING:
     import pandas as pd

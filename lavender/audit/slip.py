@@ -219,7 +219,10 @@ class SlipExplanation:
 
     def draw_slip(self, folder: Path) -> str:
         """Draw the slip of the fastest contact over time, as it is and with the settings that change it."""
-        from lavender.report.drawing import Label, draw_figure, label_ends, style_line
+        from lavender.report.drawing import Label, draw_figure, fit_margins, label_ends, style_line
+
+        def shorten(setting: str) -> str:
+            return setting.removeprefix("<option ").removesuffix("/>").replace('"', "")
 
         def fill(axes: Any) -> str:
             labels: list[Label] = []
@@ -232,9 +235,8 @@ class SlipExplanation:
                     style = style_line(len(drawn)) | {"marker": ""}
                     drawn.add(finite.tobytes())
                     axes.plot(remedy.speeds, **style)
-                    labels.append(
-                        Label(finite[-1], remedy.setting, style["color"], "normal" if labels else "bold")
-                    )
+                    weight = "normal" if labels else "bold"
+                    labels.append(Label(finite[-1], shorten(remedy.setting), style["color"], weight))
             axes.set_xlim(0, REMEDY_STEPS)
             axes.set_ylim(bottom=0.0)
             axes.set_xlabel("step")
@@ -245,8 +247,8 @@ class SlipExplanation:
             )
 
         note = f"Means over {self.n_states} states. Steps without contact are gaps."
-        margins = {"left": 0.12, "right": 0.5}
-        return draw_figure("slip-over-time", fill, (7.5, 3.3), margins, note=note, folder=folder)
+        margins = fit_margins([shorten(remedy.setting) for remedy in self.remedies])
+        return draw_figure("slip-over-time", fill, (4.9, 3.3), margins, note=note, folder=folder)
 
     @property
     def sentences(self) -> list[str]:

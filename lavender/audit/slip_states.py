@@ -113,7 +113,8 @@ class SlipOfStates:
         verdict = f"No contact slips faster than {format_speed(MIN_EXPLAINED_SLIP)}."
         if first["cause"] != "no slip":
             verdict = (
-                f"Contact {first['contact']} slips {format_speed(first['speed'])}; cause: {first['cause']}."
+                f"Contact {first['contact'].removeprefix('contact ')} slips {format_speed(first['speed'])}; "
+                f"cause: {first['cause']}."
             )
         blocks: list[Any] = []
         if folder is not None:
@@ -144,7 +145,9 @@ class SlipOfStates:
         source = (
             f"lavender slip · {self.provenance.get('model', '')} · {format_count(n, 'state')} with contact"
         )
-        sentences = [" ".join(worst.sentences), *([" ".join(worst.advice)] if worst.remedies else [])]
+        head, *settings = worst.advice or [""]
+        advice = f"{head} {'; '.join(map(str.strip, settings))}." if settings else head
+        sentences = [" ".join(worst.sentences), *filter(None, [advice])]
         footer = ["Files: numbers.json, figures/ (PDF, SVG, PNG)."]
         return Page(
             "lavender slip", source, verdict, sentences, warnings=self.notes, blocks=blocks, footer=footer

@@ -143,7 +143,7 @@ def draw_error_against_time(report: Contents, case: str, names: Sequence[str], f
         axes.set_xscale("log")
         axes.set_xlim(points[:, 0].min() / 1.3, points[:, 0].max() * 1.3)
         mark_errors(axes, low, float(points[:, 1].max()), limit)
-        write_label(axes, 0.015, 0.015, "below 10⁻⁹", fontsize=8, color=QUIET, va="bottom")
+        write_label(axes, 1.02, 0.035, "below 10⁻⁹", fontsize=8.2, color=QUIET)
         place = axes.transAxes.inverted().transform(axes.transData.transform((1.0, 1.35 * limit)))[1]
         write_label(
             axes, 0.015, place, f"limit {format_speed(limit)}", color=ORANGE, va="bottom", fontsize=8.2

@@ -155,8 +155,8 @@ class Report(Contents):
         text = "; ".join(filter(None, (tied, f"{', '.join(texts)} that time" if texts else "")))
         same, n = int((self.ranking["solved"] == row["solved"]).sum()) - 1, len(self.subject)
         last = ""
-        if len(self.ranking.index.difference([ENGINE_NAME])) == 1:
-            pass
+        if len(self.ranking) == same + 1:
+            pass  # No solver remains of which to say anything.
         elif n > 1 and same <= 3:
             last = f"no other solver solves {f'all {n}' if row['solved'] == n else 'as many'}"
         elif same == 0:

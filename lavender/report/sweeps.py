@@ -24,7 +24,7 @@ from lavender.report.drawing import (
 )
 from lavender.report.page import make_table
 from lavender.report.tables import Contents, list_plain_sweeps, read_own_answers
-from lavender.report.text import format_count, format_percent, format_speed, format_time
+from lavender.report.text import format_count, format_percent, format_speed, format_time, split_row_unit
 
 EQUAL_RATIO = 1.1  # Solvers whose errors differ by a smaller factor at every number of sweeps are one line.
 MAX_SWEEP_COLUMNS = 400  # Columns of the strip of steps; a column of more steps has their largest error.
@@ -112,12 +112,13 @@ class SweepStudy:
             if last is None:
                 return "No number of sweeps was measured on every step."
             return (
-                f"{last} sweeps of {self.first} are not enough: they leave {format_speed(errors[last])}; the limit is "
-                f"{limit}."
+                f"{last} sweeps of {self.first} are not enough: they leave "
+                f"{format_speed(errors[last], limit=self.limit)}; the limit is {limit}."
             )
         text = f"{best} sweeps of {self.first} keep every velocity error below {limit}"
         fewer = [b for b in self.budgets if b < best and errors[b] == errors[b]]
-        return f"{text}; {fewer[-1]} leave {format_speed(errors[fewer[-1]])}." if fewer else f"{text}."
+        left = format_speed(errors[fewer[-1]], limit=self.limit) if fewer else ""
+        return f"{text}; {fewer[-1]} leave {left}." if fewer else f"{text}."
 
     @property
     def is_bad(self) -> bool:
@@ -140,11 +141,11 @@ class SweepStudy:
             above, worst = int((error > self.limit).sum()), self.answers.loc[error.idxmax()]
             count = self.answers["iterations"].dropna()
             own = f"{count.max():.0f} iterations leave" if len(count) else "answers leave"
-            row = f" ({worst['worst']})" if worst["worst"] else ""
+            name, unit = split_row_unit(str(worst["worst"]))
+            row = f" ({name})" if name else ""
             share = f"{format_percent(above, n) if above else 'none'} of {format_count(n, 'step')} above the limit"
-            lines.append(
-                f"Your engine's own {own} {format_speed(error.max())}, {share}; the worst is {worst['file']}{row}."
-            )
+            size = format_speed(error.max(), unit)
+            lines.append(f"Your engine's own {own} {size}, {share}; the worst is {worst['file']}{row}.")
         needs = [(g[0], self._find_smallest(g[0])) for g in self.groups[1:]]
         texts = [f"{name} needs {n}" if n else f"{name} more than {self.budgets[-1]}" for name, n in needs]
         best, cold = self._find_smallest(self.first), self._find_smallest(self.first, self.cold)

@@ -70,15 +70,27 @@ def format_time(t: float) -> str:
     return f"{x:.2g}\u00a0{unit}" if x < 9.95 else f"{x:.0f}\u00a0{unit}"
 
 
-def format_speed(v: float, unit: str = "m/s") -> str:
-    """Return a velocity error with two digits and a prefix of its unit: 0.23 mm/s; below 0.1 µm/s as a power of ten."""
+def format_speed(v: float, unit: str = "m/s", limit: float = math.nan) -> str:
+    """Return a velocity error with two digits and a prefix of its unit: 0.23 mm/s; below 0.1 µm/s as a power of ten.
+
+    Beside another `limit` of the same text, the result has the digits that tell them apart: 1.004 mm/s.
+    """
     if not math.isfinite(v):
         return NONE
     for scale, prefix in ((1.0, ""), (1e-3, "m"), (1e-6, "µ")):
         if v >= 0.0995 * scale:
-            x = v / scale
-            return f"{x:.0f}\u00a0{prefix}{unit}" if x >= 9.95 else f"{x:.2g}\u00a0{prefix}{unit}"
+            x, y, digits = v / scale, limit / scale, 2
+            while x != y and digits < 15 and f"{x:.{digits}g}" == f"{y:.{digits}g}":
+                digits += 1
+            text = f"{x:.0f}" if x >= 9.95 and digits == 2 else f"{x:.{digits}g}"
+            return f"{text}\u00a0{prefix}{unit}"
     return f"{v:.0e}\u00a0{unit}".replace("e-0", "e-").replace("0e+00", "0")
+
+
+def split_row_unit(row: str) -> tuple[str, str]:
+    """Return the name of a row without its unit, and the unit of its velocity: rad/s if the name ends so, else m/s."""
+    name = row.removesuffix(" [rad/s]")
+    return name, "m/s" if name == row else "rad/s"
 
 
 def format_power(x: float) -> str:

@@ -316,9 +316,10 @@ class Tuning:
     def headline(self) -> list[str]:
         """Return the headline: the setting, its gain, the present errors, the results on worlds held back."""
         now, m, n = self.present_result, self.advised, len(self._same_problem)
+        worst = format_speed(self._compute_largest_error(now), limit=self.shown_limit)
         own = (
-            f"Now 1 % of the steps have errors above {format_speed(now.worst_error)}, the worst "
-            f"{format_speed(float(now.error.max()))}; the limit is {format_speed(self.shown_limit)}."
+            f"Now 1 % of the steps have errors above {format_speed(now.worst_error)}, the worst {worst}; the limit is "
+            f"{format_speed(self.shown_limit)}."
         )
         if self.reason_without_line:
             return [self.reason_without_line, own]
@@ -391,7 +392,9 @@ class Tuning:
             x, y = place(now)
             axes.plot([x], [y], "*", ms=14, color=INK, mec=PAPER, mew=0.8, zorder=9)
             more = {"textcoords": "offset points", "fontweight": "bold", "fontsize": 8.8}
-            axes.annotate("your option", (x, y), xytext=(-8, -14), ha="right", **more)
+            is_left = x < np.mean(axes.get_xlim())
+            side, dx = ("left", 8) if is_left else ("right", -8)
+            axes.annotate("your option", (x, y), xytext=(dx, 8), ha=side, **more)
             if self.advised is not None:
                 x, y = place(self.advised)
                 arrow = {"arrowstyle": "-", "lw": 0.6, "color": QUIET}
