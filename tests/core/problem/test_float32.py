@@ -5,7 +5,8 @@ import pytest
 import scipy.sparse as sp
 from calls import robot
 from hypothesis import given
-from random_problems import random_contact_problem, random_lcp, random_tree_parents, seeds, tree_mass
+from hypothesis import strategies as st
+from random_problems import random_contact_problem, random_lcp, random_tree_parents, seeds, side_by_side, tree_mass
 
 import lavender as lv
 from lavender.judge.residuals import UNIT_ROUNDOFF_FLOAT32, estimate_float32_slack_errors
@@ -45,6 +46,17 @@ def test_the_parts_of_the_floor_are_the_formulas_written_densely(form, seed):
             velocities = a**2 @ np.where(acts, seen / p.compliance**2, 0.0)
     for got, want in zip(estimate_float32_slack_errors(p, lam), (own, data, velocities), strict=True):
         np.testing.assert_allclose(got, UNIT_ROUNDOFF_FLOAT32**2 * want, rtol=1e-9, atol=1e-30)
+
+
+@given(seed=seeds, off=st.sampled_from([0.5, 0.99, 0.9999]))
+def test_the_residual_above_the_floor_does_not_depend_on_the_order_of_islands(seed, off):
+    parts = [random_lcp(seed), random_lcp(seed + 1)]
+    impulses = [off * lv.solve(parts[0]).impulse, 0.9 * lv.solve(parts[1]).impulse]
+    one, other = (
+        lv.residual(side_by_side(parts[::k]), np.concatenate(impulses[::k]), precision="float32") for k in (1, -1)
+    )
+    assert (one.verdict, one.relative, one.excess) == (other.verdict, other.relative, other.excess)
+    assert one.excess > 0.0
 
 
 @given(seed=seeds)
