@@ -139,7 +139,9 @@ def write_npz(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = 
     if problem.has_singular_program:
         meta["program"] = len(problem.qp.q)
     motion = problem.__dict__.get("engine_motion")
-    if motion is not None and impulse is not None and np.array_equal(arrays["impulse"], motion.impulse):
+    if motion is not None:
+        if impulse is None or not np.array_equal(arrays["impulse"], motion.impulse):
+            arrays["engine_impulse"] = motion.impulse
         meta["moved_by"] = motion.moved_by
         arrays["engine_change"], arrays["engine_compliance"] = motion.change, motion.compliance
         if motion.momentum is not None:
@@ -182,7 +184,8 @@ def _read_own_format(archive: Arrays) -> Stored:
         problem = replace(problem, qp=recover_program(problem.csr, problem.b, problem.cones, n), copy=False)
     impulse = _read_vector(archive, "impulse", problem)
     if "moved_by" in meta:
-        _add_motion(archive, problem, impulse, meta["moved_by"])
+        moved = _read_vector(archive, "engine_impulse", problem)
+        _add_motion(archive, problem, impulse if moved is None else moved, meta["moved_by"])
     return Stored(problem, "lavender", impulse=impulse)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypedDict, TypeVar
@@ -55,6 +55,15 @@ def check_rhs_length(A: Any, b: FloatArray) -> None:
         raise InputError(f"b [m/s] has shape {b.shape}; ({shape[0]},) is needed, as A has {shape[0]} rows")
 
 
+def check_options(method: str, options: Mapping[str, Any]) -> None:
+    """Raise an InputError if options have a keyword of `Problem` that this method computes, such as cones."""
+    for name in {"b", "cones", "matrix", "rows", "generalized", "qp"} & options.keys():
+        raise InputError(
+            f"{name} is a {type(options[name]).__name__}; Problem.{method} makes {name} from its other arguments and "
+            f"takes no {name}: use Problem(...) or dataclasses.replace(problem, {name}=...)"
+        )
+
+
 class Builders(Operators):
     """Class methods that build a problem."""
 
@@ -71,6 +80,7 @@ class Builders(Operators):
         """
         b = as_array("b", b, (None,), unit="m/s")
         check_rhs_length(A, b)
+        check_options("linear", more)
         return cls(b, Cones.free(len(b)), A, **more)
 
     @classmethod
@@ -98,6 +108,7 @@ class Builders(Operators):
             as_array(n, x, (len(b),), finite=False, unit="N s")
             for n, x in (("lower", lower), ("upper", upper))
         ]
+        check_options("lcp", more)
         return cls(b, Cones.bounded(*bounds), A, **more)
 
     @classmethod
@@ -140,6 +151,7 @@ class Builders(Operators):
         b = as_array("b", b, (None,), unit="m/s")
         check_rhs_length(A, b)
         cones = make_contacts_of_rows("b", len(b), mu, tangents, patch_radius, rolling)
+        check_options("contact", more)
         return cls(b, cones, A, **more)
 
     @classmethod
@@ -288,6 +300,7 @@ class Builders(Operators):
         """
         if not isinstance(rows, Rows):
             raise InputError(f"rows is a {type(rows).__name__}; a Rows is needed")
+        check_options("from_rows", more)
         mu = as_array("mu", mu, (rows.n_contacts,))
         if tangents is None:
             tangents = 2 * (mu > 0.0).astype(np.int32)

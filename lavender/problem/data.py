@@ -381,8 +381,14 @@ class ProblemData:
     __hash__ = None  # type: ignore[assignment]
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Copies and pickles hold the fields only: derived values are computed again, and arrays stay read-only.
-        return type(self), tuple(f.name != "copy" and getattr(self, f.name) for f in fields(self) if f.init)
+        # Copies and pickles hold the fields, and the motion of an engine that `residual` judges: derived values are
+        # computed again, and arrays stay read-only.
+        state = {k: v for k, v in self.__dict__.items() if k == "engine_motion"}
+        return (
+            type(self),
+            tuple(f.name != "copy" and getattr(self, f.name) for f in fields(self) if f.init),
+            state,
+        )
 
     def __repr__(self) -> str:
         kind = self.operator if self.matrix is None else "CSR" if issparse(self.matrix) else "dense"

@@ -302,3 +302,26 @@ def test_diagnose_of_planar_velocities_in_space_names_the_conversion():
     np.testing.assert_array_equal(converted[:, [0, 1, 5]], velocity)
     assert not converted[:, 2:5].any()
     lv.diagnose(problem, velocity=converted)
+
+
+@pytest.mark.parametrize("as_matrix", [False, True])
+def test_diagnose_of_points_of_a_body_that_cannot_rotate_reports_nothing(as_matrix):
+    jac = np.tile(np.eye(3), (4, 1))
+    jac[9:, :] = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]  # a contact with another frame
+    cones = lv.Cones.contacts(np.full(4, 0.5))
+    problem = lv.Problem.from_jacobian(jac, 2.0 * np.eye(3), [0.0, 0.0, -0.1], cones=cones)
+    if as_matrix:
+        problem = lv.Problem(problem.b, cones, problem.dense())
+    assert "duplicate rows" not in kinds(problem)
+
+
+def test_diagnose_asks_for_forces_only_if_a_time_step_makes_impulses_of_them():
+    """A heavy body on a light one: 1 % off, the impulses err more than the zero impulse, and are no forces."""
+    jac, mass = np.array([[1.0, 0.0], [-1.0, 1.0]]), np.diag([1.0, 1e6])
+    problem = lv.Problem.from_jacobian(jac, mass, [-0.1, -0.1], cones=lv.Cones.bounded(np.zeros(2), np.full(2, np.inf)))
+    solved = lv.solve(problem, tol=1e-12).impulse
+    near = solved * [1.0, 1.01]
+    assert lv.residual(problem, near).relative > 50.0
+    assert not any("forces" in d.reason for d in lv.diagnose(problem, near))
+    for rate in (60.0, 240.0, 1e4):
+        assert any("forces" in d.reason for d in lv.diagnose(problem, rate * solved))

@@ -1,5 +1,8 @@
 """What moves the bodies: the judged answer predicts MuJoCo's own next velocity, and its error is that of the motion."""
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 from mujoco_scene import mj
@@ -156,9 +159,14 @@ def test_a_saved_problem_keeps_the_motion_of_the_engine(tmp_path):
         found = lv.residual(stored.problem, stored.impulse)
         assert found.moved_by == "acceleration"
         assert found.velocity == lv.residual(problem, impulse).velocity
-        # Without the engine's impulse, no motion is stored.
-        lv.io.save(problem, tmp_path / "step.npz")
-        assert lv.residual(lv.io.read(tmp_path / "step.npz").problem, impulse).moved_by == "impulse"
+        # A file without impulses or with others, a copy and a pickle keep the motion, too.
+        again = [copy.copy(problem), copy.deepcopy(problem), pickle.loads(pickle.dumps(problem))]
+        for given in (None, np.zeros(problem.m)):
+            lv.io.save(problem, tmp_path / "step.npz", impulse=given)
+            again.append(lv.io.read(tmp_path / "step.npz").problem)
+        for other in again:
+            assert lv.residual(other, impulse).velocity == found.velocity
+            assert lv.residual(other, impulse).moved_by == "acceleration"
 
 
 @pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
