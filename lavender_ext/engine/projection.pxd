@@ -8,6 +8,13 @@ joint row C + h J v. Sweeps over multipliers p [N s^2] find a shift s = M^-1 J^T
 
 Velocities are unchanged, so that the projection adds no kinetic energy. It is skipped if no contact is deeper than
 the slop and no joint has an error.
+
+A light body between heavy ones needs many sweeps; after few, s may deepen a contact that it should raise, and the
+depth then grows from substep to substep. The sweeps therefore continue, up to MAX_SWEEPS, until
+
+    max_c (required J s - J s)_c <= max (required J s) over contacts and joints                      (3)
+
+which s = 0 fulfils; without (3) there is no shift.
 """
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
@@ -19,6 +26,10 @@ from lavender_ext.engine.arrays cimport (H_CONTACTS, H_POSITION_ITERATIONS, H_PR
                                          N_JOINT, N_JOINT_REAL, N_JOINT_ROW, S_BETA, S_DEPTH, S_H,
                                          S_JOINT_ERROR, S_MAX_PUSH, S_SLOP, engine_t)
 from lavender_ext.core.vectors cimport scale3
+
+
+cdef enum:
+    MAX_SWEEPS = 1000   # largest number of sweeps of one projection
 
 
 cdef inline int32_t is_rigid_joint_row(const engine_t* e, int32_t i, int32_t row) noexcept nogil:
@@ -43,10 +54,10 @@ cdef inline void apply_contact_impulse(const engine_t* e, double* v, int32_t c, 
 
 cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
     """Compute e.shift and return 1 if it is not zero; write S_DEPTH and S_JOINT_ERROR of the poses before the substep."""
-    cdef int32_t n = e.head[H_CONTACTS], mj = e.size[N_JOINT_ROW], _sweep, i, j, c, a, b, due = 0
+    cdef int32_t n = e.head[H_CONTACTS], mj = e.size[N_JOINT_ROW], sweep, i, j, c, a, b, due = 0
     cdef double h = e.setting[S_H], slop = e.setting[S_SLOP], beta = e.setting[S_BETA]
     cdef double max_correction = e.setting[S_MAX_PUSH]
-    cdef double depth = 0.0, joint_error = 0.0, x, new_multiplier, change
+    cdef double depth = 0.0, joint_error = 0.0, x, new_multiplier, change, before = 0.0, after
     cdef double impulse[3]
     # required J s of each joint row and contact; the target array is not needed after the solve
     cdef double* goal = e.target
@@ -73,6 +84,8 @@ cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
             e.push[j] = 0.0
             x = e.joint_error[j] + h * joint_row_velocity(e.jac + 12 * j, e.shift, a, b)
             goal[j] = -clip(beta * x, -max_correction, max_correction)
+            if fabs(goal[j]) > before and is_rigid_joint_row(e, i, j):
+                before = fabs(goal[j])
             if fabs(x) > 1e-3 * slop and is_rigid_joint_row(e, i, j):
                 due = 1
     for c in range(n):
@@ -81,12 +94,14 @@ cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
         if x > 0.0:
             due = 1
         goal[mj + c] = x if x < max_correction else max_correction
+        if goal[mj + c] > before:
+            before = goal[mj + c]
     if not due:
         return 0
     # sweeps over joints, then contacts
     for i in range(6 * e.size[N_DYNAMIC]):
         e.shift[i] = 0.0
-    for _sweep in range(e.head[H_POSITION_ITERATIONS]):
+    for sweep in range(1, MAX_SWEEPS + 1):
         for i in range(e.size[N_JOINT]):
             a = e.joint_body[2 * i]
             b = e.joint_body[2 * i + 1]
@@ -103,5 +118,15 @@ cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
             e.push[mj + c] = new_multiplier
             scale3(change, e.normal + 3 * c, impulse)
             apply_contact_impulse(e, e.shift, c, impulse)
-    e.head[H_PROJECTED] = e.head[H_POSITION_ITERATIONS]
-    return 1
+        if sweep < e.head[H_POSITION_ITERATIONS]:
+            continue
+        # (3)
+        after = 0.0
+        for c in range(n):
+            x = goal[mj + c] - contact_normal_velocity(e, e.shift, c)
+            if x > after:
+                after = x
+        if after <= before:
+            e.head[H_PROJECTED] = sweep
+            return 1
+    return 0
