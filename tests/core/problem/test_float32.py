@@ -55,8 +55,8 @@ def test_the_residual_above_the_floor_does_not_depend_on_the_order_of_islands(se
     one, other = (
         lv.residual(side_by_side(parts[::k]), np.concatenate(impulses[::k]), precision="float32") for k in (1, -1)
     )
-    assert (one.verdict, one.relative, one.excess) == (other.verdict, other.relative, other.excess)
-    assert one.excess > 0.0
+    assert (one.verdict, one.relative, one.above_floor) == (other.verdict, other.relative, other.above_floor)
+    assert one.above_floor > 0.0
 
 
 @given(seed=seeds)

@@ -384,3 +384,13 @@ def test_contact_restitution_on_the_velocity_before_the_step_bounces_as_the_clos
         problem = builder.problem()
         speed = float(builder.velocity_after(problem, lv.solve(problem, tol=1e-12).impulse)[0, up])
         assert speed == pytest.approx(4.0 * e ** (k + 1), rel=1e-9)
+
+
+@pytest.mark.parametrize("dimensions", [2, 3])
+def test_distance_of_coincident_points_acts_along_a_direction_that_bodies_can_move(dimensions):
+    inertia = np.full(2, 1.0) if dimensions == 2 else np.tile(np.eye(3), (2, 1, 1))
+    velocity = np.zeros((2, 3 if dimensions == 2 else 6))
+    rows = lv.RowBuilder(np.ones(2), inertia, velocity, 0.01, np.zeros((2, dimensions)))
+    rows.distance(0, 1, np.zeros(dimensions), np.zeros(dimensions), 0.5)
+    [[diagonal]] = rows.problem().dense()
+    assert diagonal == 2.0  # 1/m_0 + 1/m_1 along a unit vector
