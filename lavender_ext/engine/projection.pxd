@@ -9,8 +9,9 @@ joint row C + h J v. Sweeps over multipliers p [N s^2] find a shift s = M^-1 J^T
 Velocities are unchanged, so that the projection adds no kinetic energy. It is skipped if no contact is deeper than
 the slop and no joint has an error.
 
-A light body between heavy ones needs many sweeps; after few, s may deepen a contact that it should raise, and the
-depth then grows from substep to substep. The sweeps therefore continue, up to MAX_SWEEPS, until
+A light body between heavy ones needs many sweeps; after few, s may deepen a contact that it should raise. Without slop,
+the depth then grows from substep to substep out of rounding. If the slop is 0, the sweeps therefore continue, up to
+MAX_SWEEPS, until
 
     max_c (required J s - J s)_c <= max (required J s) over contacts and joints                      (3)
 
@@ -29,7 +30,7 @@ from lavender_ext.core.vectors cimport scale3
 
 
 cdef enum:
-    MAX_SWEEPS = 1000   # largest number of sweeps of one projection
+    MAX_SWEEPS = 1000   # largest number of sweeps of one projection without slop
 
 
 cdef inline int32_t is_rigid_joint_row(const engine_t* e, int32_t i, int32_t row) noexcept nogil:
@@ -55,6 +56,7 @@ cdef inline void apply_contact_impulse(const engine_t* e, double* v, int32_t c, 
 cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
     """Compute e.shift and return 1 if it is not zero; write S_DEPTH and S_JOINT_ERROR of the poses before the substep."""
     cdef int32_t n = e.head[H_CONTACTS], mj = e.size[N_JOINT_ROW], sweep, i, j, c, a, b, due = 0
+    cdef int32_t n_sweeps = e.head[H_POSITION_ITERATIONS], max_sweeps = n_sweeps
     cdef double h = e.setting[S_H], slop = e.setting[S_SLOP], beta = e.setting[S_BETA]
     cdef double max_correction = e.setting[S_MAX_PUSH]
     cdef double depth = 0.0, joint_error = 0.0, x, new_multiplier, change, before = 0.0, after
@@ -101,7 +103,9 @@ cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
     # sweeps over joints, then contacts
     for i in range(6 * e.size[N_DYNAMIC]):
         e.shift[i] = 0.0
-    for sweep in range(1, MAX_SWEEPS + 1):
+    if slop == 0.0 and 0 < n_sweeps < MAX_SWEEPS:
+        max_sweeps = MAX_SWEEPS
+    for sweep in range(1, max_sweeps + 1):
         for i in range(e.size[N_JOINT]):
             a = e.joint_body[2 * i]
             b = e.joint_body[2 * i + 1]
@@ -118,7 +122,7 @@ cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
             e.push[mj + c] = new_multiplier
             scale3(change, e.normal + 3 * c, impulse)
             apply_contact_impulse(e, e.shift, c, impulse)
-        if sweep < e.head[H_POSITION_ITERATIONS]:
+        if slop > 0.0 or sweep < n_sweeps:
             continue
         # (3)
         after = 0.0
@@ -129,4 +133,7 @@ cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
         if after <= before:
             e.head[H_PROJECTED] = sweep
             return 1
+    if slop > 0.0 or n_sweeps == 0:
+        e.head[H_PROJECTED] = n_sweeps
+        return 1
     return 0

@@ -69,8 +69,8 @@ class Parameters:
     friction_shape : {"disk", "box"}
         With "box", each tangent has its own bound, as in many engines; there is then no torsional friction.
     position_iterations : int
-        Sweeps of the position projection in a substep, 0 for no projection. If the largest error of a contact would
-        be larger after them than before, up to 1000 sweeps follow until it is not.
+        Sweeps of the position projection in a substep, 0 for no projection. With `slop` 0, up to 1000 sweeps follow
+        while the largest error of a contact would be larger after them than before.
     seed : int
     on_failure : {"use", "keep", "damp", "raise"}
         Treatment of a failed solve: use its impulses, keep the warm start, use the mean of both, or raise SolveFailed.
