@@ -207,7 +207,7 @@ class AuditCounts:
         else:
             largest = format_speed(self.largest, self.unit, self.limit)
             by = f"by more than {largest}" if self.largest else "beyond rounding"
-            parts.append(f"no step is wrong {by}; the limit is {limit}")
+            parts.append(f"no step is wrong {by}; the limit is {format_speed(self.limit, self.unit)}")
         if lost := int((audit.verdict == len(VERDICTS)).sum()):
             parts.append(f"{format_count(lost, 'step')} not judged")
         if audit.n_dropped:
