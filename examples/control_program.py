@@ -1,13 +1,12 @@
 """A program of predictive control with 10,000 variables: lavender beside the backends alone.
 
 A random stable system x' = A x + B u of 12 states and 4 inputs, bounded, over a horizon of N steps: minimise the sum of
-u'R u / 2 + x'Q x / 2 subject to the equations of motion. Without arguments, N = 625. Each solver runs once on sparse
-matrices; times are CPU times of this process.
+u'R u / 2 + x'Q x / 2 subject to the equations of motion. Each solver runs once on sparse matrices; times are CPU times
+of this process.
 
-    python examples/control_program.py [N]
+    python examples/control_program.py
 """
 
-import sys
 import time
 
 import numpy as np
@@ -16,7 +15,7 @@ import scipy.sparse as sp
 
 import lavender as lv
 
-N_STATES, N_INPUTS = 12, 4
+N_STATES, N_INPUTS, N_STEPS = 12, 4, 625
 
 
 def make_program(n_steps, seed=1):
@@ -36,9 +35,9 @@ def make_program(n_steps, seed=1):
     return P, np.zeros(P.shape[0]), A, b, -ub, ub
 
 
-def main(n_steps=625):
+def main():
     """Print the time of each solver and the largest difference of its x from that of `auto`."""
-    P, q, A, b, lb, ub = make_program(int(n_steps))
+    P, q, A, b, lb, ub = make_program(N_STEPS)
     settings = {"osqp": {"eps_abs": 1e-8, "eps_rel": 1e-8}}
     alone = [name for name in ("piqp", "clarabel", "osqp") if name in qpsolvers.available_solvers]
     reference = None
@@ -57,4 +56,4 @@ def main(n_steps=625):
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main()
