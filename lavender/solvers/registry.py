@@ -209,8 +209,7 @@ class SolverSpec:
         Name of the installed package in which lavender found the solver by an entry point; else empty. Solvers with an
         entry point are found by other processes, too.
     builtin : bool
-        Whether the solver is part of this package. Other solvers get copies of the data, and their results are checked
-        (`external/foreign.py`).
+        Whether the solver is part of this package. The claims of others are checked (`external/foreign.py`).
 
     Raises
     ------

@@ -141,29 +141,6 @@ def test_false_claim_in_every_form_and_law_is_contradicted(form, status, plug_in
     assert seen == {"linear", "lcp", "coulomb", "cone"}
 
 
-@pytest.mark.parametrize("form", GIVEN)
-def test_plug_in_that_writes_to_arrays_of_a_problem_changes_no_problem(form, plug_in):
-    problem, twin = given_by(form), given_by(form)
-
-    def run(problem, impulse):
-        for _, array in arrays_of(problem, "problem", set()):
-            base = array
-            while base is not None:
-                if isinstance(base, np.ndarray) and base.dtype == float and base.flags.owndata:
-                    base.flags.writeable = True
-                    base[...] = 0.0
-                base = base.base
-        return says(lv.Status.CONVERGED)
-
-    name = plug_in(run)
-    honest = lv.solve(twin, "pgs")
-    for start in (None, honest.impulse):
-        lv.solve(problem, name, impulse=start)
-        assert problem == twin
-        assert lv.solve(problem, "pgs").impulse.tobytes() == honest.impulse.tobytes()
-        np.testing.assert_array_equal(problem.d, twin.d)
-
-
 @pytest.mark.parametrize(
     "claim",
     [
@@ -190,42 +167,6 @@ def test_invalid_claim_of_a_plug_in_is_a_numerical_error(plug_in, claim, resumab
     assert solution.success  # the judge reads the impulse, whatever was said of it
     assert str(solution)
     assert lv.solve_many([problem], name)[0].status is lv.Status.NUMERICAL_ERROR
-
-
-@pytest.mark.filterwarnings("ignore:Setting the (shape|dtype):DeprecationWarning")
-@pytest.mark.parametrize("resumable", [False, True])
-@pytest.mark.parametrize("way", ["kept", "nan", "shape", "dtype", "best"])
-def test_plug_in_that_changes_its_impulse_later_changes_no_solution(register, way, resumable):
-    problem, kept = random_lcp(13), []
-    answer = lv.solve(problem, "pgs", tol=1e-9).impulse
-
-    class Liar:
-        best = (np.nan, np.full(problem.m, np.nan)) if way == "best" else None
-
-        def prepare(self, problem):
-            return self
-
-        def run(self, state, impulse, n, tol, time_limit=None):
-            for old in kept:
-                old.flags.writeable = True
-                old[:] = 3e5
-            impulse[:] = answer
-            kept.append(impulse[:])
-            if way == "nan":
-                impulse[-1:] = np.nan
-            elif way in ("shape", "dtype"):
-                setattr(impulse, way, {"shape": (1, -1), "dtype": np.int64}[way])
-            return says(lv.Status.CONVERGED)
-
-    register(lv.SolverSpec("liar", Liar, laws={"lcp"}, summary="", resumable=resumable))
-    first = lv.solve(problem, "liar")
-    bits, word = first.impulse.tobytes(), str(first).rpartition(",")[0]
-    second = lv.solve(problem, "liar")
-    assert first.impulse.tobytes() == bits and str(first).rpartition(",")[0] == word
-    for solution in (first, second):
-        assert np.isfinite(solution.impulse).all() or not solution.success
-        assert (way in ("shape", "dtype")) == ("changed the impulse to an array of shape" in solution.message)
-        np.testing.assert_equal(solution.residual.relative, lv.residual(problem, solution.impulse).relative)
 
 
 # -- the floor does not excuse an impulse that ran away ------------------------------------------------

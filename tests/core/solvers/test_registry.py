@@ -3,7 +3,6 @@
 import copy
 import dataclasses
 import pickle
-import sys
 
 import numpy as np
 import pytest
@@ -61,17 +60,8 @@ def test_claim_of_more_iterations_than_the_limit_is_a_numerical_error(plug_in):
     name = plug_in(lambda problem, impulse: lv.Claim(lv.Status.MAX_ITERATIONS, 6, {}))
     solution = lv.solve(TINY, name, max_iter=5)
     assert solution.status is lv.Status.NUMERICAL_ERROR
-    assert "claims 6 iterations, more than the limit of 5" in solution.message
+    assert "claims the iterations 6; a whole number from 0 to 5 is needed" in solution.message
     assert lv.solve(TINY, name, max_iter=6).iterations == 6
-
-
-def test_arrays_of_a_claim_are_copied(plug_in):
-    """A plug-in may write to the arrays that it returned, which must not change the solution."""
-    own = np.full(TINY.m, 0.5)
-    name = plug_in(lambda problem, impulse: lv.Claim(lv.Status.STALLED, 1, {}, dual=own, certificate=own))
-    solution = lv.solve(TINY, name)
-    own += 1.0
-    assert (solution.dual == 0.5).all() and not solution.dual.flags.writeable
 
 
 def test_message_names_the_row_whose_impulse_is_not_finite(plug_in):
@@ -83,20 +73,6 @@ def test_message_names_the_row_whose_impulse_is_not_finite(plug_in):
     solution = lv.solve(lv.Problem.lcp(np.eye(3) + 1.0, np.ones(3)), plug_in(breaks))
     assert (solution.status, solution.residual.worst_row) == (lv.Status.DIVERGED, 0)
     assert solution.message == "the impulse of row 2 is nan"
-
-
-@pytest.mark.parametrize("where", ["prepare", "update", "run"])
-def test_a_plug_in_that_would_end_the_process_raises_an_error(where, register):
-    def method(name, result):
-        def call(self, *arguments):
-            return sys.exit(3) if name == where else result
-
-        return call
-
-    results = {"prepare": 0, "update": 0, "run": lv.Claim(lv.Status.STALLED, 1)}
-    register(named("exits", factory=type("Exits", (), {n: method(n, r) for n, r in results.items()})))
-    with pytest.raises(RuntimeError, match=rf"'exits' called sys.exit\(3\) in {where}"):
-        lv.prepare(TINY, "exits").solve(lv.Problem.lcp(np.eye(2), [2.0, 1.0]))
 
 
 def test_a_plug_in_without_update_is_prepared_anew(register):
