@@ -46,8 +46,8 @@ PARTS = {
 
 
 @contextmanager
-def opened(address, **options):
-    """Open the page of this checkout in headless Chromium, and close it at the end; `options` are those of `new_page`.
+def browse(**options):
+    """Yield an empty page of headless Chromium, and close it at the end; `options` are those of `new_page`.
 
     Raises
     ------
@@ -62,18 +62,24 @@ def opened(address, **options):
     browser_path = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, names)), None)
     if browser_path is None:
         raise SolverUnavailable(f"none of {', '.join(names)} is installed, and CHROMIUM names no browser")
-    with tempfile.TemporaryDirectory() as folder, sync_playwright() as p:
+    with sync_playwright() as p:
+        # In containers and as root there are no user namespaces for the sandbox.
+        browser = p.chromium.launch(executable_path=browser_path, args=["--no-sandbox"])
+        yield browser.new_page(**options)
+        browser.close()
+
+
+@contextmanager
+def opened(address, **options):
+    """Open the page of this checkout, as `browse` does, and close it at the end."""
+    with tempfile.TemporaryDirectory() as folder, browse(**options) as page:
         pages.write_page(Path(folder), print)
         server = pages.create_file_server(Path(folder))
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        # In containers and as root there are no user namespaces for the sandbox.
-        browser = p.chromium.launch(executable_path=browser_path, args=["--no-sandbox"])
-        page = browser.new_page(**options)
         page.goto(f"http://127.0.0.1:{server.server_address[1]}/#{address}")
         page.wait_for_selector("html[data-ready=true]")
         page.wait_for_function("!lavender.waiting")
         yield page
-        browser.close()
         server.shutdown()
 
 
