@@ -25,6 +25,7 @@ DECLARATION = '''cdef extern from *:
 '''
 CONDITION = re.compile(r"(if|elif|while) (.*):")
 RANGE = re.compile(r"for (\w+) in range\((.*)\):")
+DECLARED_VALUE = re.compile(r"(cdef [\w *]+ = )([^,=]*(?:\(.*\)[^,=]*)?)")
 # Lines that cannot be in a branch, or cannot begin one.
 DECLARED = re.compile(r"(cdef|cpdef|ctypedef|def|cimport|from|import)\b")
 CONTINUED = re.compile(r"(elif|else|except|finally)\b")
@@ -53,11 +54,11 @@ def switch_change(lines: list[str], begin: int, end: int, new: list[str], number
     return lines
 
 
-def insert_import(text: str) -> str:
-    """Return the text of a kernel with the import of `fault_number` before its first import."""
+def insert_import(text: str, added: str = IMPORT) -> str:
+    """Return the text of a kernel with an import, by default of `fault_number`, before its first import."""
     lines = text.splitlines()
     first = next(k for k, line in enumerate(lines) if re.match(r"from [\w.]+ c?import |c?import ", line))
-    return "\n".join([*lines[:first], IMPORT, *lines[first:], ""])
+    return "\n".join([*lines[:first], added, *lines[first:], ""])
 
 
 def _switch_statements(
@@ -79,6 +80,9 @@ def _switch_statements(
         if a and b and a[1] == b[1]:
             header = f"{pad}{a[1]} (({b[2]}) if {condition} else ({a[2]})):"
             return [*lines[:first], header, *lines[last:]]
+        a, b = DECLARED_VALUE.fullmatch(one), DECLARED_VALUE.fullmatch(other)
+        if a and b and a[1] == b[1]:
+            return [*lines[:first], f"{pad}{a[1]}({b[2]}) if {condition} else ({a[2]})", *lines[last:]]
         a, b = RANGE.fullmatch(one), RANGE.fullmatch(other)
         if a and b:
             ends = zip(a[2].split(", "), b[2].split(", "), strict=False)

@@ -1,23 +1,20 @@
 """CPU time of `auto` compared with every other solver of this package and with a rule of two lines, on drawn problems.
 
-    python -m benchmarks regret [--seed 0] [--count 200] [--models FOLDER ...] [--file FILE ...] [--base CHECKOUT]
+    python -m benchmarks regret [--seed 0] [--count 200] [--models FOLDER ...] [--file FILE ...]
                                 [--out FILE]
 
 Regret is (t + 50 us) / (best + 50 us). t is the CPU time of a cold call of `auto` to `TOL`, and best is the CPU time of
 the fastest solver that reaches `TOL` by name; each is the minimum of alternating runs. The rule uses `newton`, or
 sweeps (`anderson`) if `newton` does not accept or solve the problem, whose time is then added. Problems that no solver
 solves do not count. The draws of a seed are the same on every machine: tune on some seeds, publish figures of others.
-With `--base`, `auto` of another checkout (built, with a `.venv`) solves the same problems between these runs; its
-answers are judged by this checkout.
+`python -m benchmarks corpus` compares `auto` of two commits on the same draws.
 """
 
 from __future__ import annotations
 
 import json
 import math
-import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -155,49 +152,6 @@ def call(problem: Problem, solver: str, limit: float | None = None) -> tuple[flo
     return process_time() - start, solution
 
 
-# Solves the problems of the files that it reads, cold, and writes the smallest CPU time [s] and the impulses.
-BASE_WORKER = """
-import sys, time
-from dataclasses import replace
-import numpy as np
-import lavender as lv
-for line in sys.stdin:
-    path, tol, best, begun = line.split()[0], float(line.split()[1]), float("inf"), time.perf_counter()
-    given = lv.load(path)
-    for run in range(6):
-        if run > 2 and time.perf_counter() - begun > 0.5 or run and best > 1.0:
-            break
-        problem = replace(given, copy=False)
-        start = time.process_time()
-        solution = lv.solve(problem, tol=tol)
-        best = min(best, time.process_time() - start)
-    np.save(path + ".npy", solution.impulse)
-    print(best, flush=True)
-"""
-
-
-class Base:
-    """A process that solves problems by `auto` of another checkout."""
-
-    def __init__(self, checkout: Path) -> None:
-        self.folder = Path(tempfile.mkdtemp())
-        self.process = subprocess.Popen(
-            [checkout.resolve() / ".venv/bin/python", "-c", BASE_WORKER], cwd=checkout, text=True,
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-        )  # fmt: skip
-
-    def measure(self, problem: Problem) -> float:
-        """Return the smallest CPU time of a cold call [s]; NaN if this checkout's judge rejects the answer."""
-        path = self.folder / "problem.npz"
-        replace(problem, guess=None).save(path)
-        assert self.process.stdin is not None and self.process.stdout is not None
-        self.process.stdin.write(f"{path} {TOL}\n")
-        self.process.stdin.flush()
-        taken = float(self.process.stdout.readline())
-        impulse = np.load(f"{path}.npy")
-        return taken if lv.residual(problem, impulse).relative <= TOL else math.nan
-
-
 def is_solved(solution: Any) -> bool:
     """Return whether a solution reaches `TOL`."""
     return bool(solution.residual.relative <= TOL)
@@ -268,23 +222,19 @@ def summarize(label: str, lines: list[dict[str, Any]]) -> list[str]:
     auto = [compute_regret(x["auto"], x["best"]) for x in lines if x["auto"] == x["auto"]]
     rule = [compute_regret(x["rule"], x["best"]) for x in lines if x["rule"] == x["rule"]]
     if not auto:
-        return [label, str(len(lines)), *["-"] * 5, str(len(lines)), *["-"] * 8]
-    base = [compute_regret(x["base"], x["best"]) for x in lines if x.get("base", math.nan) == x.get("base")]
-    means = [math.exp(float(np.mean(np.log(x)))) for x in (auto, rule or [math.nan], base or [math.nan])]
+        return [label, str(len(lines)), *["-"] * 5, str(len(lines)), *["-"] * 3]
+    means = [math.exp(float(np.mean(np.log(x)))) for x in (auto, rule or [math.nan])]
     return [
         label, str(len(lines)), f"{means[0]:.2f}", f"{np.mean(auto):.2f}", f"{np.quantile(auto, 0.95):.2f}",
         f"{max(auto):.1f}", str(sum(r > 2.0 for r in auto)), str(len(lines) - len(auto)),
         f"{means[1]:.2f}", f"{max(rule, default=math.nan):.1f}", str(len(lines) - len(rule)),
-        f"{means[2]:.2f}", f"{np.mean(base or [math.nan]):.2f}", f"{np.quantile(base or [math.nan], 0.95):.2f}",
-        f"{max(base, default=math.nan):.1f}", str(len(lines) - len(base)),
     ]  # fmt: skip
 
 
 def print_tables(lines: list[dict[str, Any]], worst: int) -> None:
     """Print regrets of all problems, of each source and class, and the problems with the largest regret."""
     head = ["problems", "count", "auto: geometric mean", "mean", "95 %", "worst", "above 2", "unsolved",
-            "rule: geometric mean", "worst", "unsolved", "base: geometric mean", "mean", "95 %", "worst",
-            "unsolved"]  # fmt: skip
+            "rule: geometric mean", "worst", "unsolved"]  # fmt: skip
     cells = [summarize("all", lines)]
     for key in ("source", "class"):
         groups = sorted({x[key] for x in lines})
@@ -320,7 +270,6 @@ def print_tables(lines: list[dict[str, Any]], worst: int) -> None:
     type=click.Path(path_type=Path, exists=True),
     help="Print tables of --out files.",
 )
-@click.option("--base", type=click.Path(path_type=Path, exists=True), help="Built checkout to compare with.")
 @out_option("Write every measurement to this JSON file.")
 def command(
     seed: int,
@@ -329,7 +278,6 @@ def command(
     files: tuple[Path, ...],
     worst: int,
     read: tuple[Path, ...],
-    base: Path | None,
     out: Path | None,
 ) -> None:
     """Compare auto with every solver by name on drawn problems."""
@@ -340,14 +288,12 @@ def command(
         print_tables(lines, worst)
         return
     paths = sorted(path for folder in models for path in folder.rglob("*.xml"))
-    unsolved, other = 0, None if base is None else Base(base)
+    unsolved = 0
     for source, item, problem in draw_problems(seed, count, paths, list(files)):
         measured = measure(problem)
         if measured is None:
             unsolved += 1
             continue
-        if other is not None:
-            measured["base"] = other.measure(problem)
         drawn = {
             "source": source,
             "seed": item,

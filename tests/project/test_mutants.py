@@ -1,5 +1,6 @@
 """`.ci/mutants`: every fault of tests/mutants applies to the present sources and states its effect in a sentence."""
 
+import ast
 import importlib.machinery
 import importlib.util
 import sys
@@ -19,6 +20,8 @@ def load_command():
 
 
 mutants = load_command()
+from fault_draw import OPERATORS, list_places  # noqa: E402 (found by the line above)
+
 FAULTS = mutants.list_faults([])
 
 
@@ -114,3 +117,51 @@ def test_nearly_all_faults_of_kernels_can_be_switched():
     kernels = [fault for fault in FAULTS if fault.is_kernel]
     single = [f.name for f in kernels if mutants.switch_fault(f, (ROOT / f.path).read_text(), 1) is None]
     assert len(single) <= 5, single
+
+
+def test_drawn_faults_are_those_of_their_seed_and_each_applies_and_changes_one_line():
+    drawn = [mutants.Fault(*own[:3], "", own[3]) for own in mutants.draw_faults(ROOT, 64, 5)]
+    assert drawn == [mutants.Fault(*own[:3], "", own[3]) for own in mutants.draw_faults(ROOT, 64, 5)]
+    assert len({(fault.path, *fault.lines) for fault in drawn}) == len(drawn) == 64
+    assert sum(fault.is_kernel for fault in drawn) == 32
+    assert len({fault.sentence.split(",")[0] for fault in drawn}) == len(OPERATORS)
+    for fault in drawn:
+        text = (ROOT / fault.path).read_text()
+        changed = mutants.apply_fault(fault, text)
+        differ = [a for a, b in zip(text.splitlines(), changed.splitlines(), strict=True) if a != b]
+        assert len(differ) == 1
+        assert not differ[0].strip().startswith(("def ", "import ", "from ", "#"))
+
+
+@pytest.mark.parametrize(
+    ("operator", "line", "expected"),
+    [
+        ("sign", "    x = a - b", "    x = a + b"),
+        ("sign", "    x = f(-y)", "    x = f(y)"),
+        ("bound", "    return x < 1", "    return x <= 1"),
+        ("row", "    y = x[3 * i + 2]", "    y = x[3 * i]"),
+        ("row", "    y = x[0]", "    y = x[1]"),
+        ("other of a pair", "    r = arm_a", "    r = arm_b"),
+        ("dropped branch", "    if x and y:", "    if False:"),
+        ("stale state", "    s.at[k] = 2.0", "    pass"),
+        ("ignored argument", "    f(x, tol=tol)", "    f(x)"),
+        ("ignored argument", "    if g(x, deadline):", "    if g(x, NULL):"),
+    ],
+)
+def test_operator_changes_code_but_no_text_comment_or_declaration(operator, line, expected):
+    lines = [line, f'    y = "{line.strip()}"', f"    # {line.strip()}", f"def f(x={line.strip()!r}):"]
+    [place] = list_places("x.py", "\n".join(lines))[operator]
+    assert (place.line, f"{line[: place.begin]}{place.text}{line[place.end :]}") == (0, expected)
+
+
+def test_marks_enter_every_function_of_a_module():
+    text = (ROOT / "lavender" / "solving" / "limits.py").read_text()
+    functions = [x for x in ast.walk(ast.parse(text)) if isinstance(x, ast.FunctionDef)]
+    marked = [
+        x
+        for x in ast.walk(ast.parse(mutants.fault_reach.insert_marks(text, 7, is_kernel=False)))
+        if isinstance(x, ast.FunctionDef) and any("mark(7)" in ast.unparse(y) for y in x.body[:2])
+    ]
+    assert len(marked) == len(functions) > 1
+    lines = mutants.fault_reach.insert_marks(KERNEL, 2, is_kernel=True).splitlines()
+    assert lines[lines.index("    mark(2)") - 1].startswith("cdef inline double f(")

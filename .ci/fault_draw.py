@@ -1,0 +1,182 @@
+"""Draw single faults by operators from the lines of the sources, Python and Cython alike.
+
+An operator is a pattern and a function of its match: the text in its place. Comments, texts, declarations and imports
+are not changed. A draw takes the operators in turn, then a place of one of them at random, so that no operator is
+frequent because its places are; half of the faults are in kernels.
+"""
+
+import random
+import re
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+TEXTS = re.compile(r'"""[\s\S]*?"""|\'\'\'[\s\S]*?\'\'\'|"(?:\\.|[^"\\\n])*"|\'(?:\\.|[^\'\\\n])*\'|#[^\n]*')
+#: Statements without a computation that a fault could change.
+SKIPPED = re.compile(
+    r"(async def|def|cpdef|ctypedef|class|import|from|cimport|raise|assert|pass|global|@|[\w.]+: [\w\[\]]+ = field)\b|@"
+)
+#: Statements of kernels that declare; one with a value may be changed right of "=".
+DECLARATION = re.compile(r"cdef\b(?!.*[^=!<>]=[^=])|cdef (inline|class|struct|enum|extern|cppclass)\b")
+NAME = r"[A-Za-z_][\w.]*"
+BOUNDS = {"<": "<=", "<=": "<", ">": ">=", ">=": ">", "==": "!=", "!=": "=="}
+PAIRS = {
+    "_a": "_b", "_b": "_a", "lower": "upper", "upper": "lower", "low": "high", "high": "low", "first": "last",
+    "last": "first", "min": "max", "max": "min", "fmin": "fmax", "fmax": "fmin", "row": "column", "any": "all",
+    "all": "any", "and": "or", "or": "and", "True": "False", "False": "True",
+}  # fmt: skip
+
+
+class Place(NamedTuple):
+    """A possible fault: columns [begin, end) of a line get another text."""
+
+    path: str
+    line: int
+    begin: int
+    end: int
+    text: str
+
+
+#: Name of each operator: its pattern in code without texts, and the text in place of a match.
+OPERATORS: dict[str, tuple[re.Pattern[str], Callable[[re.Match[str]], str]]] = {
+    "sign": (
+        re.compile(r"(?<=[\w)\]] )[+-](?= [\w(<&-])|(?<= )[+-](?==)|(?:(?<=\()|(?<=[=(,] ))-(?=[A-Za-z(])"),
+        lambda m: {"+": "-", "-": "+"}[m[0]] if m.string[m.end() : m.end() + 1] in " =" else "",
+    ),
+    "bound": (re.compile(r"(?<= )(<=|>=|==|!=|<|>)(?= )"), lambda m: BOUNDS[m[0]]),
+    "row": (
+        re.compile(r"(?<=\[)\d(?=[\],])|(?<=\[)[^\[\]]*(?<= )\+ \d+(?=\])|(?<=range\()(?=[\w.]+\))"),
+        lambda m: "1, " if not m[0] else str(1 - int(m[0]) if m[0] in "01" else int(m[0]) - 1) if m[0].isdigit()
+        else re.sub(r" \+ \d+$", "", m[0]),
+    ),
+    "other of a pair": (
+        re.compile(r"(?<=\w)_[ab]\b|\b(lower|upper|low|high|first|last|f?min|f?max|row|any|all|and|or|True|False)\b(?!=)"),
+        lambda m: PAIRS[m[0]],
+    ),
+    "swapped arguments": (
+        re.compile(rf"(?<=\w\()({NAME}), ({NAME})(?=[,)])|(?<=, )({NAME}), ({NAME})(?=\))"),
+        lambda m: f"{m[2]}, {m[1]}" if m[1] else f"{m[4]}, {m[3]}",
+    ),
+    "dropped branch": (
+        re.compile(r"(?<=if )(?!TYPE_CHECKING|fault)[^:]+(?=:\s*$)|(?<= )and [^:()]+(?=:\s*$)"),
+        lambda m: "" if m[0].startswith("and ") else "False",
+    ),
+    "stale state": (
+        re.compile(r"^\s*(?:\w+(?:\.\w+|\[[^\]]*\])+)(?:, [\w.\[\]]+)* [-+*/]?= \S.*$"),
+        lambda m: m[0][: len(m[0]) - len(m[0].lstrip())] + "pass",
+    ),
+    "ignored argument": (
+        re.compile(
+            r", (\w+)=[\w.]+(?=[,)])|(?<=\()(\w+)=[\w.]+, "
+            r"|(?<=, )deadline(?=[,)])|(?<= )1\.0 [-+] [A-Za-z]\w*(?![\w.(\[])"
+        ),
+        lambda m: "NULL" if m[0] == "deadline" else "1.0" if m[0].startswith("1.0") else "",
+    ),
+}  # fmt: skip
+
+
+def mask_texts(text: str) -> str:
+    """Return the text with blanks in place of texts and comments."""
+    return TEXTS.sub(lambda m: re.sub(r"[^\n]", " ", m[0]), text)
+
+
+def list_code_lines(text: str) -> Iterator[tuple[int, str, bool]]:
+    """Yield (number, code, whether it is a whole statement) of the lines with statements that may be changed."""
+    depth, is_skipped = 0, False
+    for number, code in enumerate(mask_texts(text).splitlines()):
+        before = depth
+        depth += sum(map(code.count, "([{")) - sum(map(code.count, ")]}"))
+        if before == 0:
+            is_skipped = bool(SKIPPED.match(code.strip()) or DECLARATION.match(code.strip()))
+        if code.strip() and not is_skipped:
+            yield number, code, before == depth == 0
+
+
+def read_types(text: str) -> dict[str, set[str]]:
+    """Return the types with which each name is declared in a file."""
+    types = defaultdict[str, set[str]](set)
+    for m in re.finditer(r"\b(\w+): ([\w\[\], |.]+?)(?=,? *\w+: |, \*|\)| =|$)", text, re.MULTILINE):
+        types[m[1]].add(m[2])
+    for m in re.finditer(r"(?:cdef|[(,]) *(?:const )?(\w+\*?) \**(\w+(?:, \w+)*)(?=[,)=\n ])", text):
+        for name in m[2].split(", "):
+            types[name].add(m[1])
+    return types
+
+
+def list_places(path: str, text: str, lines: set[int] | None = None) -> dict[str, list[Place]]:
+    """Return the places of each operator in a file; `lines` selects some of its lines, counted from 0."""
+    places = defaultdict[str, list[Place]](list)
+    own, types = text.splitlines(), read_types(text)
+    for number, code, is_whole in list_code_lines(text):
+        if lines is not None and number not in lines:
+            continue
+        for operator, (pattern, replace) in OPERATORS.items():
+            if operator in ("stale state", "dropped branch") and not is_whole:
+                continue
+            for m in pattern.finditer(code):
+                if operator == "swapped arguments":
+                    one, other = (types.get(name, set()) for name in (m[1] or m[3], m[2] or m[4]))
+                    if not one or one != other:  # A swap of two kinds fails in each call.
+                        continue
+                new = own[number][: m.start()] + replace(m) + own[number][m.end() :]
+                if new.strip() != own[number].strip():
+                    places[operator].append(Place(path, number, m.start(), m.end(), replace(m)))
+    return places
+
+
+def draw_places(
+    places: dict[str, list[Place]], count: int, rng: random.Random
+) -> Iterator[tuple[str, Place]]:
+    """Yield (operator, place): operators in turn in a random order, each line once."""
+    order, used = sorted(places), set[tuple[str, int]]()
+    rng.shuffle(order)
+    pools = {operator: rng.sample(places[operator], len(places[operator])) for operator in order}
+    for turn in range(len(order) * count):
+        pool = pools[order[turn % len(order)]]
+        while pool and (pool[-1].path, pool[-1].line) in used:
+            pool.pop()
+        if pool and len(used) < count:
+            place = pool.pop()
+            used.add((place.path, place.line))
+            yield order[turn % len(order)], place
+
+
+def make_lines(text: str, place: Place) -> list[str]:
+    """Return the lines of a fault, with as many lines around the change as make them unique in the file."""
+    own = text.splitlines()
+    stripped, old = [line.strip() for line in own], own[place.line]
+    changed = f"{old[: place.begin]}{place.text}{old[place.end :]}".rstrip()
+    for margin in range(1, len(own)):
+        begin, end = max(place.line - margin, 0), min(place.line + margin + 1, len(own))
+        block = stripped[begin:end]
+        if sum(stripped[k : k + len(block)] == block for k in range(len(own))) == 1:
+            break
+    return [
+        *(f" {line}" for line in own[begin : place.line]), f"-{old}", f"+{changed}",
+        *(f" {line}" for line in own[place.line + 1 : end]),
+    ]  # fmt: skip
+
+
+def draw_faults(
+    root: Path, count: int, seed: int, changed: dict[str, set[int]] | None = None
+) -> Iterator[tuple[str, str, str, list[str]]]:
+    """Yield (name, sentence, path, lines) of `count` faults of the packages, half of them in kernels.
+
+    `changed` selects lines by path, counted from 0.
+    """
+    rng = random.Random(seed)
+    for folder, suffixes, share in (
+        ("lavender", {".py"}, count - count // 2), ("lavender_ext", {".pyx", ".pxd"}, count // 2),
+    ):  # fmt: skip
+        places, texts = defaultdict[str, list[Place]](list), dict[str, str]()
+        for path in sorted((root / folder).rglob("*")):
+            name = path.relative_to(root).as_posix()
+            if path.suffix in suffixes and (changed is None or name in changed):
+                texts[name] = path.read_text()
+                for operator, own in list_places(name, texts[name], changed and changed[name]).items():
+                    places[operator] += own
+        for number, (operator, place) in enumerate(draw_places(places, share, rng)):
+            lines = make_lines(texts[place.path], place)
+            sentence = f"{operator}, line {place.line + 1} of {place.path}"
+            yield f"{Path(folder).name}_{seed}_{number:03}", sentence, place.path, lines
