@@ -6,7 +6,6 @@ The standard library's pools are not used: they need `if __name__ == "__main__"`
 from __future__ import annotations
 
 import contextlib
-import faulthandler
 import os
 import pickle
 import signal
@@ -14,16 +13,12 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 START_TIMEOUT = 60.0  # [s] On a loaded machine, importing a function and its modules may take this long.
-KILL_TIMEOUT = (
-    10.0  # [s] The end of a killed process is awaited for this long; one that waits for a disk may not end.
-)
+KILL_TIMEOUT = 10.0  # [s] The end of a killed process is awaited for this long.
 PARENT_CHECK_INTERVAL = 0.5  # [s] Time after which a process notices that its parent has ended.
-# [s] Code that holds the interpreter after its parent has ended is killed this long after its limit, or after a year.
-ORPHAN_TIME, MAX_ORPHAN_TIME = 60.0, 3e7
 #: Whether a process is killed together with the processes that it started, as one process group.
 PROCESS_GROUPS = os.name == "posix"
 #: Program of the other process. `python -m` is not used: it searches modules in the current folder first, where the
@@ -51,16 +46,9 @@ class ProcessBackend:
 
     When this process ends, the other one ends within `PARENT_CHECK_INTERVAL`, or when its code next returns to the
     interpreter.
-
-    Parameters
-    ----------
-    environment : mapping, optional
-        Environment variables that are added to the environment of this process.
     """
 
-    def __init__(self, environment: Mapping[str, str] | None = None) -> None:
-        self._environment = environment or {}
-        self.popen: subprocess.Popen[bytes] | None = None
+    popen: subprocess.Popen[bytes] | None = None
 
     def call_function(
         self, function: Callable[..., Any], *arguments: Any, timeout: float | None = None
@@ -94,7 +82,7 @@ class ProcessBackend:
         try:
             if timeout is not None:
                 timer.start()
-            pickle.dump((timeout, request), process.stdin)
+            pickle.dump(request, process.stdin)
             process.stdin.flush()
             error, result = pickle.load(process.stdout)
         except (OSError, EOFError, pickle.UnpicklingError):
@@ -126,7 +114,7 @@ class ProcessBackend:
             self.popen = subprocess.Popen(
                 [sys.executable, "-c", SERVE_SCRIPT, str(os.getpid())],
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-                env={**os.environ, **self._environment, "PYTHONPATH": path}, start_new_session=PROCESS_GROUPS,
+                env={**os.environ, "PYTHONPATH": path}, start_new_session=PROCESS_GROUPS,
             )  # fmt: skip
         except OSError as error:
             raise ProcessEnded(f"it did not start: {error}") from None
@@ -157,7 +145,7 @@ def kill_process(process: subprocess.Popen[bytes]) -> None:
 
 
 def serve_requests(parent: int) -> None:
-    """Answer requests, each with a time limit [s] or None, a function and its arguments, until the pipe ends."""
+    """Answer requests, each with a function and its arguments, until the pipe ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # The parent handles Ctrl-C.
     if PROCESS_GROUPS:
         threading.Thread(target=_wait_and_kill_group, args=(parent,), daemon=True).start()
@@ -167,17 +155,14 @@ def serve_requests(parent: int) -> None:
     os.dup2(null, 1)
     while True:
         try:
-            timeout, request = pickle.load(requests)
+            request = pickle.load(requests)
         except EOFError:
             return
         try:
-            if timeout is not None:
-                faulthandler.dump_traceback_later(min(timeout + ORPHAN_TIME, MAX_ORPHAN_TIME), exit=True)
             function, arguments = pickle.loads(request)
             answer = pickle.dumps((None, function(*arguments)), pickle.HIGHEST_PROTOCOL)
         except BaseException as error:  # A panic of Rust code, for example, is not an Exception.
             answer = pickle.dumps(((type(error).__name__, str(error)), None))
-        faulthandler.cancel_dump_traceback_later()
         answers.write(answer)
         answers.flush()
 

@@ -102,9 +102,8 @@ def contract(context: click.Context, name: str, list_only: bool, out: Path) -> N
     """Check that a solver meets the requirements on every solver.
 
     NAME is a built-in solver or an installed plug-in. Each capability that the spec of the solver lists is exercised on
-    small problems of every law, form and kind of block; each requirement that is not met is explained in a sentence. A
-    plug-in runs in another process, so that a crash costs one check. The problem of each requirement that is not met is
-    written to the folder --out.
+    small problems of every law, form and kind of block; each requirement that is not met is explained in a sentence,
+    and its problem is written to the folder --out.
 
     Exit code 1: a requirement is not met.
     """

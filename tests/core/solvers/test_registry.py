@@ -47,15 +47,6 @@ def test_solver_with_a_missing_factory_raises_an_error_that_names_it(register, t
         lv.solve(TINY, "half")
 
 
-def test_solver_with_a_refusal_that_raises_is_refused_alone(register):
-    register(named("unsure", refusal=lambda problem: 1 / 0))
-    register(named("sure", refusal=lambda problem: False))
-    reason = "cannot say whether it takes the problem: ZeroDivisionError: division by zero"
-    assert (lv.known(TINY)["unsure"], lv.known(TINY)["sure"]) == (reason, None)
-    with pytest.raises(lv.CapabilityError, match="ZeroDivisionError"):
-        lv.solve(TINY, "unsure")
-
-
 def test_claim_of_more_iterations_than_the_limit_is_a_numerical_error(plug_in):
     name = plug_in(lambda problem, impulse: lv.Claim(lv.Status.MAX_ITERATIONS, 6, {}))
     solution = lv.solve(TINY, name, max_iter=5)
