@@ -193,3 +193,18 @@ def test_recorder_warns_of_a_step_that_its_answer_does_not_predict(integrator, t
         problem, impulse = lv.io.from_mujoco(model, data), adapter.impulse(model, data)
         with pytest.warns(UserWarning, match="differs by 5.0e-01"):
             assert recorder.add(problem, impulse)[0].prediction_gap == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("scale", [0.3, 1.0, 4.0])
+def test_rotation_rows_of_a_weld_are_the_angular_velocity_for_every_torque_scale(scale):
+    mj = pytest.importorskip("mujoco")
+    model = mj.MjModel.from_xml_string(f"""<mujoco><worldbody>
+      <body name="a" pos="0 0 1"><freejoint/><geom size=".1"/></body>
+      <body name="b" pos="0 .3 1"><freejoint/><geom size=".1"/></body></worldbody>
+      <equality><weld body1="a" body2="b" torquescale="{scale}"/></equality></mujoco>""")
+    data = mj.MjData(model)
+    mj.mj_forward(model, data)
+    problem = lv.io.from_mujoco(model, data)
+    jac = problem.generalized.jac.toarray()
+    np.testing.assert_allclose(np.abs(jac[:, 9:12]), np.eye(6)[:, 3:], atol=1e-12)
+    assert [problem.row_unit(k) for k in range(6)] == 3 * [problem.row_unit(0)] + 3 * [problem.row_unit(3)]

@@ -386,11 +386,19 @@ def test_contact_restitution_on_the_velocity_before_the_step_bounces_as_the_clos
         assert speed == pytest.approx(4.0 * e ** (k + 1), rel=1e-9)
 
 
-@pytest.mark.parametrize("dimensions", [2, 3])
-def test_distance_of_coincident_points_acts_along_a_direction_that_bodies_can_move(dimensions):
-    inertia = np.full(2, 1.0) if dimensions == 2 else np.tile(np.eye(3), (2, 1, 1))
-    velocity = np.zeros((2, 3 if dimensions == 2 else 6))
-    rows = lv.RowBuilder(np.ones(2), inertia, velocity, 0.01, np.zeros((2, dimensions)))
-    rows.distance(0, 1, np.zeros(dimensions), np.zeros(dimensions), 0.5)
-    [[diagonal]] = rows.problem().dense()
-    assert diagonal == 2.0  # 1/m_0 + 1/m_1 along a unit vector
+@pytest.mark.parametrize("block_type", ARRAYS)
+@pytest.mark.parametrize("coincide", [False, True])
+@given(seed=seeds)
+def test_rows_in_two_dimensions_move_bodies_in_their_plane_alone(block_type, coincide, seed):
+    """Of points that coincide too, whose direction is chosen."""
+    rng = np.random.default_rng(seed)
+    builder = lv.RowBuilder(np.ones(2), np.full(2, 2.0), rng.normal(size=(2, 3)), DT, np.zeros((2, 2)))
+    values = draw_arguments(rng, block_type, 1, 2)
+    if coincide:
+        values |= {name: np.zeros((1, 2)) for name, kind in ARRAYS[block_type].items() if kind == "point"}
+    getattr(builder, block_type)(0, 1, **{name: x[0].tolist() for name, x in values.items()})
+    problem = builder.problem()
+    jac = problem.rows.jacobian(problem.cones).toarray().reshape(-1, 2, 6)
+    assert not jac[:, :, 2:5].any()
+    assert (np.abs(jac[:, :, [0, 1, 5]]).max(axis=(1, 2)) > 0.0).all()
+    np.testing.assert_allclose(problem.velocity(np.ones(problem.m))[:, 2:5], 0.0, atol=0.0)

@@ -251,6 +251,22 @@ def test_worlds_whose_turn_comes_after_the_deadline_keep_their_judged_start(kind
     )
 
 
+@pytest.mark.parametrize("rows", [180, 189, 198])
+def test_deadline_that_passes_inside_a_compiled_world_of_a_batch_ends_it(rows, readings):
+    problem = over_velocities(rows, rows // 2)
+
+    def solve(limit):
+        readings.count = 0
+        return lv.solve_many([fresh(problem)], tol=1e-10, time_limit=limit)[0], readings.count
+
+    whole, count = solve(1e9)
+    assert whole.success and count >= 3  # the first is that of the deadline, the last that after the world
+    for limit in np.arange(0.5, count - 1):
+        late = solve(limit)[0]
+        assert late.status is lv.Status.TIME_LIMIT
+        assert late.residual.relative == lv.residual(problem, late.impulse).relative
+
+
 SLOW = """
 import sys, time
 

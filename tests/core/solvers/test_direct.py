@@ -1,5 +1,7 @@
 """`direct`: every factorisation, pivoting against enumeration, singular and infeasible problems."""
 
+from collections import Counter
+
 import hypothesis.strategies as st
 import numpy as np
 import pytest
@@ -266,3 +268,19 @@ def test_direct_never_exchanges_rows_with_equal_limits(seed):
     low, high = np.where(np.isnan(fixed), 0.0, fixed), np.where(np.isnan(fixed), np.inf, fixed)
     solution = lv.solve(lv.Problem.lcp(a, 3.0 * b, low, high), "direct", tol=1e-12)
     assert solution.success and solution.work.get("pivots", 0) <= 3, str(solution)
+
+
+def test_direct_ends_with_a_solution_or_a_proof_on_singular_problems_with_rows_of_equal_limits():
+    count = Counter()
+    for seed in range(150):
+        rng = np.random.default_rng(seed)
+        m = int(rng.integers(6, 20))
+        jac = rng.normal(size=(m, int(rng.integers(2, 5))))
+        lower, upper = np.where(rng.random(m) < 0.2, -np.inf, 0.0), np.where(rng.random(m) < 0.3, 1.0, np.inf)
+        fixed = rng.random(m) < 0.3
+        lower[fixed] = upper[fixed] = rng.uniform(-1.0, 1.0, fixed.sum())
+        problem = lv.Problem(rng.normal(size=m), lv.Cones.bounded(lower, upper), jac @ jac.T)
+        found = lv.solve(problem, "direct", tol=1e-9)
+        count[found.status.name] += 1
+        assert found.claim_check == "confirmed", (seed, found)
+    assert count.keys() == {"CONVERGED", "INFEASIBLE"} and min(count.values()) > 30

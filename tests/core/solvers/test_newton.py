@@ -386,3 +386,25 @@ def test_newton_over_velocities_with_coulomb_friction_takes_few_steps():
         assert solution.success, str(solution)
         steps.append(solution.iterations)
     assert sum(steps) <= 900 and max(steps) <= 110, steps
+
+
+@pytest.mark.parametrize("law", ["cone", "coulomb"])
+@pytest.mark.parametrize("softest", [-3.0, 1.0])
+def test_newton_needs_no_more_factorisations_for_unequal_compliances_of_a_contact(law, softest):
+    """The two tangents of a contact share the regularisation with which friction is on a circle."""
+    steps, fallbacks = [0, 0], 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        n, contacts = int(rng.integers(3, 8)), int(rng.integers(1, 5))
+        half, jac, free = rng.normal(size=(n, n)), rng.normal(size=(3 * contacts, n)), rng.normal(size=n)
+        mu, soft = rng.uniform(0.2, 1.0, contacts), 10.0 ** rng.uniform(softest - 2.0, softest, 3 * contacts)
+        for k, own in enumerate((soft, np.full(3 * contacts, soft.min()))):
+            problem = lv.Problem.from_jacobian(
+                jac, half @ half.T + np.eye(n), free, cones=lv.Cones.contacts(mu, 2), compliance=own, friction=law
+            )
+            found = lv.solve(problem, "newton", tol=1e-9, form="velocity")
+            assert found.success, (seed, found)
+            steps[k] += found.work["factorisations"]
+            fallbacks += "interior" in found.message
+    assert steps[0] <= 2 * steps[1]
+    assert fallbacks <= 4
