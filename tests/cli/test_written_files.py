@@ -8,6 +8,7 @@ import re
 import signal
 from ast import literal_eval
 from importlib.util import find_spec
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -94,9 +95,18 @@ def test_write_on_a_full_disk_keeps_the_old_file(is_renamed, suffix, call, resul
     def raise_full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
+    def write_part(path, data):
+        with path.open("wb") as file:
+            file.write(data[:1])
+        raise_full()
+
+    # The limit also holds for what pytest and imports write, so writers in Python meet a full disk without it.
+    is_played = is_renamed or suffix in (".csv", ".txt")
     if is_renamed:
         monkeypatch.setattr(os, "replace", raise_full)
-    limit = contextlib.nullcontext() if is_renamed else file_size_limit(1)
+    else:
+        monkeypatch.setattr(Path, "write_bytes", write_part)
+    limit = contextlib.nullcontext() if is_played else file_size_limit(1)
     with limit, pytest.raises(lv.InputError, match=r"No space left|cannot write"):
         call(results, path)
     assert path.read_bytes() == BEFORE
