@@ -52,6 +52,10 @@ class Backend:
         Default limit of the iterations of a call.
     first_tolerance : float
         Tolerance of the first call, as a multiple of tol; above 1 if a Newton step is cheaper than the iterations.
+    row_iterations : float
+        Most iterations of the first call for each variable and row; daqp may cycle for all of `max_iter`.
+    interior : bool
+        Whether the backend is an interior-point method.
     dense : bool
         Whether the backend accepts dense matrices only.
     prefers_dense : bool
@@ -86,6 +90,8 @@ class Backend:
     min_tolerance: float = 0.0
     max_iter: int = 10_000
     first_tolerance: float = FIRST_TOLERANCE
+    row_iterations: float = 1e9
+    interior: bool = False
     dense: bool = False
     prefers_dense: bool = False
     starts: bool = False
@@ -137,22 +143,15 @@ def _call_through_qpsolvers(
         settings |= _make_start_settings(backend, program, start)
     x0 = settings.pop("initvals", None)
     settings |= extra
-    equations, inequalities, low, high = program.parts
-    bounds = program.list_bounds()
-    if backend.finite and bounds is not None:  # Pass bounds as rows.
-        low, high = low[low >= program.free], high[high >= program.free]
-        fixed = np.flatnonzero(program.variable[: program.free] >= 0)
-        equations, inequalities = np.append(equations, fixed), np.concatenate([inequalities, low, high])
-        bounds = None
-    lb, ub = (None, None) if bounds is None else bounds
+    equations, inequalities, lb, ub = program.split_rows(backend.finite)
     a = b = g = h = None
     if len(equations):
         a, b = program.select_rows(equations, 1.0, dense), program.t[equations]
     if len(inequalities):
         g, h = program.select_rows(inequalities, -1.0, dense), -program.t[inequalities]
-    elif not len(equations) and bounds is None:
+    elif not len(equations) and lb is None:
         # Many backends need a row or a bound, and qpsolvers passes programs without them to LSQR: add 0 x <= 1.
-        g, h = program.select_rows(np.zeros(0, int), 1.0, dense), np.ones(1)
+        g, h = program.select_rows(np.zeros(0, np.int32), 1.0, dense), np.ones(1)
         g.resize((1, n))
     problem = qpsolvers.Problem(program.get_hessian(dense), program.q, g, h, a, b, lb, ub)
     try:
@@ -165,19 +164,7 @@ def _call_through_qpsolvers(
     extras = solution.extras or {}
     status, text = _get_status(solution, extras)
     x = None if solution.x is None else np.asarray(solution.x, float).ravel()
-    lam = np.zeros(len(program.t))
-    for rows, values, sign in ((equations, solution.y, -1.0), (inequalities, solution.z, 1.0)):
-        if len(rows):
-            values = np.ravel([] if values is None else values)
-            lam[rows] = sign * values[: len(rows)] if len(values) >= len(rows) else np.nan
-    if bounds is not None:
-        box = np.ravel([] if solution.z_box is None else solution.z_box)
-        of_bounds = program.join_multipliers(None, None, box if len(box) == n else np.full(n, np.nan))
-        lam = np.where(program.variable >= 0, of_bounds, lam)
-    elif backend.finite:
-        lam = program.join_multipliers(
-            *program.split_multipliers(lam)
-        )  # Opposite bounds have one multiplier.
+    lam = program.join_multipliers(solution.y, solution.z, solution.z_box, backend.finite)
     iterations = _get_iterations(extras)
     message = text or (
         "solved" if solution.found else "not solved" + (", nothing returned" if x is None else "")
@@ -191,29 +178,29 @@ def _call_through_qpsolvers(
     return Answer(status, message, x, lam, {} if iterations is None else {"iterations": iterations})
 
 
-def _find_value(extras: Mapping[str, Any], *names: str) -> Any:
+def _find_value(extras: dict[str, Any], *names: str) -> Any:
     """Return the first of the named values in the additional data of a backend; None without one."""
     for source in (extras.get("info", extras.get("sip_output", extras)), extras):
         for name in names:
-            value = source.get(name) if isinstance(source, Mapping) else getattr(source, name, None)
+            value = source.get(name) if isinstance(source, dict) else getattr(source, name, None)
             if value is not None:
                 return value
     return None
 
 
-def _get_iterations(extras: Mapping[str, Any]) -> int | None:
+def _get_iterations(extras: dict[str, Any]) -> int | None:
     """Return the number of iterations from the additional data of a backend, or None if they do not contain it."""
     value = _find_value(
         extras, "iter", "iterations", "num_iterations", "nbIter", "num_iter", "iter_num", "nWSR", "stats"
     )
-    if isinstance(value, list) and value and isinstance(value[0], Mapping):
+    if isinstance(value, list) and value and isinstance(value[0], dict):
         return len(value)  # qtqp returns the statistics of each iteration.
     # quadprog returns two counts, of added and of dropped constraints.
     value = value[0] if isinstance(value, (tuple, list, np.ndarray)) and len(value) else value
     return int(value) if isinstance(value, (int, np.integer)) else None
 
 
-def _get_status(solution: Any, extras: Mapping[str, Any]) -> tuple[Status, str]:
+def _get_status(solution: Any, extras: dict[str, Any]) -> tuple[Status, str]:
     """Return the status, and the backend's text for it if qpsolvers returns one."""
     value, flag = _find_value(extras, "status", "exitFlag", "exit_status"), _find_value(extras, "exitFlag")
     text = "" if value is None else str(getattr(value, "name", value))
@@ -237,7 +224,7 @@ def _make_start_settings(
     from proxsuite import proxqp
 
     y, z, box = program.split_multipliers(lam)
-    z = z if program.list_bounds() is None else np.concatenate([z, box])
+    z = np.concatenate([z, box]) if (program.variable >= 0).any() else z
     settings = {"initvals": x, "initial_guess": proxqp.InitialGuess.WARM_START}
     settings |= {"y": y} if len(y) else {}
     return settings | ({"z": z} if len(z) else {})

@@ -16,7 +16,6 @@ judge of programs calls active as equations:
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -28,7 +27,18 @@ from lavender.base.lazy_import import import_module_under_lock
 from lavender.base.lazy_import import sparse as sp
 from lavender.problem.derived import cached_property
 from lavender.problem.generalized import Compressed
-from lavender_ext.judge.program import equilibrate_program, judge_program, scale_rows
+from lavender_ext.judge.convex import (
+    NewtonStep,
+    compute_slacks,
+    is_below,
+    join_multipliers,
+    make_columns,
+    make_dense,
+    scale_program,
+    split_multipliers,
+    split_rows,
+)
+from lavender_ext.judge.program import equilibrate_program, judge_program
 
 IntArray = npt.NDArray[np.int32]
 MAX_BACKEND_NUMBER = 1e20  # Backends treat larger numbers as infinite, or fail.
@@ -42,9 +52,9 @@ DEFINITE_SHIFTS = 1e-7, 1e-5
 MAX_CLAIM_ERROR = (
     1e-3  # [-] A claim "infeasible" with a larger error of its proof is followed by a second call.
 )
-# P and J are dense with at most this many entries together, and with more than this share of nonzeros.
-MAX_CONVERTED_ENTRIES, MIN_DENSE_FILL = 10**5, 0.2
-MAX_DENSE_STEP_SIZE = 300  # The matrix of the step is dense up to this many variables and active rows.
+# The matrix of a step of k equations is sparse with at most this multiple of k^3 entries. At k = 292 to 380, both kinds
+# of factor take the same time with 1.5 to 2.5 % of k^2 entries; with 86 %, a dense one takes a quarter.
+MAX_SPARSE_ENTRIES = 5e-5
 MAX_STEP_SIZE = 20_000  # No step is done with more variables and active rows.
 MAX_FIT_SIZE = 300  # Largest number of variables and of active rows for `fit_multipliers`.
 NEAR_SLACK = 1e-8  # [-] Rows with a smaller slack in scaled units may be active with a multiplier of 0.
@@ -107,12 +117,10 @@ class ConvexProgram:
     @cached_property
     def scaled(self) -> ScaledProgram:
         """The program in scaled variables."""
-        d, e, sigma, c = self.scales
-        hessian, jac = scale_rows(self.P, c * sigma * sigma * d, d), scale_rows(self.J, e, d)
+        hessian, q, jac, t = scale_program(self.P, self.q, self.J, self.t, self.scales)
         return ScaledProgram(
-            P=hessian, q=c * sigma * d * self.q, J=jac, t=e * self.t / sigma, free=self.free,
-            variable=self.variable, cones=self.cones,
-        )  # fmt: skip
+            P=hessian, q=q, J=jac, t=t, free=self.free, variable=self.variable, cones=self.cones
+        )
 
     def scale_point(self, x: FloatArray, lam: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Convert x (n,) and multipliers (m,) to the scaled program."""
@@ -137,17 +145,12 @@ class ConvexProgram:
     def clip_to_bounds(self, x: FloatArray) -> FloatArray:
         """Return x (n,) with each variable within its bounds."""
         low, high = self._bounds
-        return np.minimum(np.maximum(x, low), high)
+        return x if low is None or high is None else np.minimum(np.maximum(x, low), high)
 
     @cached_property
-    def _bounds(self) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper bounds of the variables (n,); infinite without one."""
-        bound = np.flatnonzero(self.variable >= 0)
-        side = self.t[bound] * self.J[2][self.J[0][bound]]
-        is_low, is_fixed = self.J[2][self.J[0][bound]] > 0.0, bound < self.free
-        low, high = np.full(len(self.q), -np.inf), np.full(len(self.q), np.inf)
-        low[self.variable[bound[is_low]]] = side[is_low]
-        high[self.variable[bound[~is_low | is_fixed]]] = side[~is_low | is_fixed]
+    def _bounds(self) -> tuple[FloatArray | None, FloatArray | None]:
+        """Lower and upper bounds of the variables (n,), infinite without one; None without any."""
+        low, high = split_rows(self.J, self.t, self.variable, None, len(self.q), self.free)[2:]
         return low, high
 
     def resize(self, x: FloatArray) -> ConvexProgram:
@@ -173,44 +176,23 @@ class ConvexProgram:
         It is computed in scaled units, in which all roundings are the same, because the scales are powers of two.
         Variables at active bounds are eliminated.
         """
-        n, scaled = len(x), self.scaled
-        rows, at_bound = (
-            np.flatnonzero(active & (self.variable < 0)),
-            np.flatnonzero(active & (self.variable >= 0)),
-        )
-        fixed, first = np.unique(self.variable[at_bound], return_index=True)
-        at_bound = at_bound[first]
-        is_free = np.ones(n, bool)
-        is_free[fixed] = False
-        free = np.flatnonzero(is_free)
-        size = len(free) + len(rows)
-        if self.cones or size > MAX_STEP_SIZE:
+        if self.cones:
             return None
-        (P, J), t = scaled.matrices, scaled.t[rows]
-        J = J[rows]
-        largest = np.abs(scaled.P[2]).max(initial=0.0)
-        weight = 1.0 / float(largest) if 0.0 < largest < np.inf else 1.0
-        x, lam = self.scale_point(x, lam)
-        sign = scaled.J[2][scaled.J[0][at_bound]]
-        x[fixed] = sign * scaled.t[at_bound]
-        multipliers = lam[rows]
+        s = self.scaled
+        step = NewtonStep(s.P, s.q, s.J, s.t, self.variable, self.scales, active, x, lam)
+        size = step.size
+        if size > MAX_STEP_SIZE:
+            return None
         if size:
-            parts = weight * P[:, free][free], J[:, free]
-            if size <= MAX_DENSE_STEP_SIZE and sp.issparse(P):
-                parts = parts[0].toarray(), parts[1].toarray()
             try:
-                solve, refinements = (_factor_sparse if sp.issparse(parts[0]) else _factor_dense)(*parts)
+                is_dense = step.count_entries() > MAX_SPARSE_ENTRIES * size**3
+                solve, refinements = (_factor_dense if is_dense else _factor_sparse)(step)
             except RuntimeError:  # The sparse matrix is singular in spite of its shift.
                 return None
             for _ in range(refinements):
-                gradient = P @ x + scaled.q - J.T @ multipliers
-                move = solve(np.concatenate([-weight * gradient[free], t - J @ x]))
-                x[free] += move[: len(free)]
-                multipliers = multipliers + move[len(free) :] / weight
-        lam = np.zeros(len(lam))
-        lam[rows] = multipliers
-        lam[at_bound] = sign * (P @ x + scaled.q - J.T @ multipliers)[fixed]
-        return self.restore_point(x, lam) if np.isfinite(x).all() else None
+                step.move(solve(step.compute_residual()))
+        point: tuple[FloatArray, FloatArray] | None = step.finish()
+        return point
 
     def compare_multipliers_with_slacks(self, x: FloatArray, lam: FloatArray) -> npt.NDArray[np.bool_]:
         """Return the equations, and the inequalities with a multiplier that exceeds the slack in scaled units.
@@ -218,8 +200,9 @@ class ConvexProgram:
         At the end of an interior point one of the two is far below the other, also on a row with a right-hand side of
         0 and no other terms, which `judge_program` compares with its own slack.
         """
-        x, lam = self.scale_point(x, lam)
-        active: npt.NDArray[np.bool_] = lam > self.scaled.matrices[1] @ x - self.scaled.t
+        _, e, sigma, c = self.scales
+        slack, _, _ = compute_slacks(self.scaled.J, self.scaled.t, self.scales, x)
+        active: npt.NDArray[np.bool_] = lam * (c * sigma) / e > slack
         active[: self.free] = True
         return active
 
@@ -255,9 +238,8 @@ class ConvexProgram:
 
     def find_near_rows(self, x: FloatArray) -> npt.NDArray[np.bool_]:
         """Return the equations, and the inequalities with a slack of almost 0 in scaled units."""
-        x = x / (self.scales[0] * self.scales[2])
-        size = np.abs(x).max(initial=1.0) + np.abs(self.scaled.t)
-        near: npt.NDArray[np.bool_] = self.scaled.matrices[1] @ x - self.scaled.t <= NEAR_SLACK * size
+        slack, _, top = compute_slacks(self.scaled.J, self.scaled.t, self.scales, x)
+        near: npt.NDArray[np.bool_] = slack <= NEAR_SLACK * (max(top, 1.0) + np.abs(self.scaled.t))
         near[: self.free] = True
         return near
 
@@ -265,8 +247,8 @@ class ConvexProgram:
         self, x: FloatArray, lam: FloatArray, active: npt.NDArray[np.bool_], tol: float
     ) -> npt.NDArray[np.bool_]:
         """Return the active rows after a step: without negative multipliers, with rows that are violated by tol."""
-        x, (_, J), t = x / (self.scales[0] * self.scales[2]), self.scaled.matrices, self.scaled.t
-        active = (active & (lam > 0.0)) | (J @ x - t < -tol * (abs(J) @ np.abs(x) + np.abs(t)))
+        slack, terms, _ = compute_slacks(self.scaled.J, self.scaled.t, self.scales, x)
+        active = (active & (lam > 0.0)) | (slack < -tol * terms)
         active[: self.free] = True
         return active
 
@@ -302,8 +284,7 @@ class ScaledProgram(ConvexProgram):
     def is_representable(self) -> bool:
         """Whether all numbers of the rows that are kept are below MAX_BACKEND_NUMBER."""
         side = self.t if self.is_kept is None else self.t[self.is_kept]
-        numbers = (self.P[2], self.q, self.J[2], side)
-        return all(bool(np.abs(x).max(initial=0.0) < MAX_BACKEND_NUMBER) for x in numbers)
+        return bool(is_below(MAX_BACKEND_NUMBER, self.P[2], self.q, self.J[2], side))
 
     def is_nearly_proven_unsolvable(self, x: FloatArray | None, lam: FloatArray | None) -> bool:
         """Return whether lam nearly proves that no point satisfies the rows, or x that the objective is unbounded.
@@ -324,7 +305,7 @@ class ScaledProgram(ConvexProgram):
     @cached_property
     def is_definite(self) -> bool:
         """Whether P has a Cholesky factor without negligible pivots."""
-        P = self.get_hessian(True)
+        P = make_dense(self.P, self.n)
         try:
             pivots = np.square(np.linalg.cholesky(P).diagonal())
         except np.linalg.LinAlgError:
@@ -335,113 +316,61 @@ class ScaledProgram(ConvexProgram):
         """Return the program with DEFINITE_SHIFTS[attempt] on the diagonal of P, at first only if P is singular."""
         if self.is_definite and not attempt:
             return self
-        P = self.get_hessian(True)
+        P = make_dense(self.P, self.n)
         shift = DEFINITE_SHIFTS[attempt] * float(P.diagonal().max(initial=0.0) or 1.0)
         P[np.diag_indices(self.n)] += shift
         flat = np.arange(self.n * self.n, dtype=np.int32) % max(self.n, 1)
         ptr = np.arange(self.n + 1, dtype=np.int32) * self.n
         return replace(self, P=(ptr.astype(np.int32), flat, P.ravel()), shift=shift)
 
-    @cached_property
-    def parts(self) -> tuple[Any, Any, Any, Any]:
-        """Rows of A, rows of G with the rows of the cones at the end, rows that are lower and that are upper bounds."""
-        rows, is_general = np.arange(len(self.t)), self.variable < 0
-        is_kept = np.ones(len(rows), bool) if self.is_kept is None else self.is_kept
-        sign = np.ones(len(rows))
-        bound = np.flatnonzero(~is_general)
-        sign[bound] = self.J[2][self.J[0][bound]]
-        return (
-            rows[is_general & (rows < self.free)],
-            rows[is_general & (rows >= self.free) & is_kept],
-            rows[~is_general & is_kept & (sign > 0.0)],
-            rows[~is_general & is_kept & ((sign < 0.0) | (rows < self.free))],
+    def split_rows(
+        self, bounds_as_rows: bool
+    ) -> tuple[IntArray, IntArray, FloatArray | None, FloatArray | None]:
+        """Return the rows of A and of G, and lb and ub (n,), None without bounds; or bounds as rows of A and G."""
+        rows: tuple[Any, Any, Any, Any] = split_rows(
+            self.J, self.t, self.variable, self.is_kept, self.n, self.free, bounds_as_rows
         )
+        return rows
 
-    def list_bounds(self) -> tuple[FloatArray, FloatArray] | None:
-        """Return lb and ub (n,), or None if no variable is bounded."""
-        _, _, low, high = self.parts
-        if not len(low) and not len(high):
-            return None
-        lb, ub = np.full(self.n, -np.inf), np.full(self.n, np.inf)
-        lb[self.variable[low]] = self.t[low]
-        ub[self.variable[high]] = np.where(high < self.free, self.t[high], -self.t[high])
-        return lb, ub
-
-    def select_rows(self, rows: Any, sign: float, dense: bool) -> Any:
+    def select_rows(self, rows: IntArray, sign: float, dense: bool) -> Any:
         """Return sign J of these rows, dense or as `csc_matrix`."""
         if dense:
-            J = self.matrices[1]
-            return sign * (J[rows].toarray() if sp.issparse(J) else J[rows])
-        ptr, idx, value = self.J
-        first, last = (int(rows[0]), int(rows[-1])) if len(rows) else (0, -1)
-        if last - first + 1 != len(rows):
-            return (sign * self.jacobian[rows]).tocsc()
-        at = slice(ptr[first], ptr[last + 1])  # Consecutive rows are sliced in a tenth of the time.
-        arrays = sign * value[at], idx[at], ptr[first : last + 2] - ptr[first]
-        return sp.csr_matrix(arrays, (len(rows), self.n)).tocsc()
-
-    @cached_property
-    def matrices(self) -> tuple[Any, Any]:
-        """P and J, dense if they are small or full, otherwise sparse."""
-        entries = self.n * (self.n + len(self.t))
-        nonzeros = len(self.P[2]) + len(self.J[2])
-        if entries <= MAX_CONVERTED_ENTRIES or nonzeros > MIN_DENSE_FILL * entries:
-            return _make_dense(self.P, self.n), _make_dense(self.J, self.n)
-        return self.hessian, self.jacobian
+            return make_dense(self.J, self.n, rows, sign)
+        return sp.csc_matrix(make_columns(self.J, self.n, rows, sign), (len(rows), self.n))
 
     def get_hessian(self, dense: bool) -> Any:
         """Return a new dense P, or P as `csc_matrix` with sorted indices."""
-        return _make_dense(self.P, self.n) if dense else self.hessian
+        return make_dense(self.P, self.n) if dense else self.hessian
 
-    def join_multipliers(self, y: Any, z: Any, box: Any) -> FloatArray:
-        """Return lambda (m,) of multipliers with the signs of qpsolvers; missing ones (None) count as 0."""
-        a, g, low, high = self.parts
-        lam = np.zeros(len(self.t))
-        if y is not None:
-            lam[a] = -y
-        if z is not None:
-            lam[g] = z
-        if box is not None:
-            lower, upper = box[self.variable[low]], box[self.variable[high]]
-            lam[high] = np.maximum(upper, 0.0)
-            lam[low] = np.where(low < self.free, -lower, np.maximum(-lower, 0.0))
+    def make_upper_triangle(self) -> Any:
+        """Return the upper triangle of P as `csc_matrix`."""
+        return sp.csc_matrix(make_columns(self.P, self.n, None, 1.0, True), (self.n, self.n))
+
+    def join_multipliers(self, y: Any, z: Any, box: Any, bounds_as_rows: bool = False) -> FloatArray:
+        """Return lambda (m,) of multipliers with the signs of qpsolvers; missing ones count as 0."""
+        lam: FloatArray = join_multipliers(
+            self.J, self.variable, self.is_kept, self.n, self.free, y, z, box, bounds_as_rows
+        )
         return lam
 
     def split_multipliers(self, lam: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return (y, z, box) of multipliers (m,), with the signs of qpsolvers."""
-        a, g, low, high = self.parts
-        box = np.zeros(self.n)
-        inequality = high >= self.free
-        np.add.at(box, self.variable[low], -lam[low])
-        np.add.at(box, self.variable[high[inequality]], lam[high[inequality]])
-        return -lam[a], lam[g], box
+        y, z, box = split_multipliers(self.J, self.variable, self.is_kept, self.n, self.free, lam)
+        return y, z, box
 
 
-def _make_dense(compressed: Compressed, n: int) -> FloatArray:
-    """Return compressed rows of n columns as a new dense matrix."""
-    ptr, idx, value = compressed
-    matrix = np.zeros((len(ptr) - 1, n))
-    matrix[np.repeat(np.arange(len(ptr) - 1), np.diff(ptr)), idx] = value
-    return matrix
-
-
-def _factor_dense(hessian: FloatArray, jac: FloatArray) -> tuple[Callable[[FloatArray], FloatArray], int]:
+def _factor_dense(step: Any) -> tuple[Any, int]:
     """Return the solver of the step's equations and the number of its refinements; singular equations are shifted."""
-    lapack, (k, n) = import_module_under_lock("scipy.linalg.lapack"), jac.shape
-    matrix = np.zeros((n + k, n + k))
-    matrix[:n, :n], matrix[:n, n:], matrix[n:, :n] = hessian, -jac.T, jac
-    lu, pivots, info = lapack.dgetrf(matrix)
+    lapack = import_module_under_lock("scipy.linalg.lapack")
+    lu, pivots, info = lapack.dgetrf(step.make_dense(0.0), overwrite_a=True)
     pivot, refinements = np.abs(lu.diagonal()), 2
     if info != 0 or not pivot.min() > MAX_SINGULAR_STEP_PIVOT * pivot.max():
-        matrix[np.diag_indices(n + k)] += STEP_SHIFT
-        lu, pivots, _ = lapack.dgetrf(matrix)
+        lu, pivots, _ = lapack.dgetrf(step.make_dense(STEP_SHIFT), overwrite_a=True)
         refinements = REFINEMENTS_OF_SHIFTED_STEP
     return lambda rhs: lapack.dgetrs(lu, pivots, rhs)[0], refinements
 
 
-def _factor_sparse(hessian: Any, jac: Any) -> tuple[Callable[[FloatArray], FloatArray], int]:
+def _factor_sparse(step: Any) -> tuple[Any, int]:
     """Return the solver of the step's equations with a shifted diagonal, and the number of its refinements."""
-    n, k = jac.shape[1], jac.shape[0]
-    shift = STEP_SHIFT * sp.eye_array(n + k)
-    matrix = sp.csc_array(sp.block_array([[hessian, -jac.T], [jac, None]]) + shift)
+    matrix = sp.csc_matrix(step.make_columns(STEP_SHIFT), (step.size, step.size))
     return import_module_under_lock("scipy.sparse.linalg").splu(matrix).solve, REFINEMENTS_OF_SHIFTED_STEP

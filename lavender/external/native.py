@@ -9,7 +9,6 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
-from lavender.base.lazy_import import sparse as sp
 from lavender.external.convex import ScaledProgram
 from lavender.external.running import Answer, Limits, classify_status
 from lavender.judge.solution import Status
@@ -22,10 +21,9 @@ def call_clarabel(
     import clarabel
 
     # All rows A x + s = b: equations, inequalities with the bounds, cones.
-    n_rows, n_linear = len(program.t), len(program.t) - sum(program.cones)
-    is_kept = np.ones(n_rows, bool) if program.is_kept is None else program.is_kept
-    rows = np.flatnonzero(is_kept)
-    n_inequalities = int(np.count_nonzero(is_kept[program.free : n_linear]))
+    equations, inequalities, _, _ = program.split_rows(True)
+    rows = np.concatenate([equations, inequalities])
+    n_inequalities = len(inequalities) - sum(program.cones)
     cones = [clarabel.ZeroConeT(program.free)] if program.free else []
     cones += [clarabel.NonnegativeConeT(n_inequalities)] if n_inequalities else []
     cones += [clarabel.SecondOrderConeT(size) for size in program.cones]
@@ -47,17 +45,16 @@ def call_clarabel(
         setattr(settings, key, value)
     matrix = program.select_rows(rows, -1.0, False)
     solver = clarabel.DefaultSolver(
-        sp.triu(program.hessian, format="csc"), program.q, matrix, -program.t[rows], cones, settings
+        program.make_upper_triangle(), program.q, matrix, -program.t[rows], cones, settings
     )
     result = solver.solve()
-    name, lam = str(result.status), np.zeros(n_rows)
-    lam[rows] = result.z
+    name, z = str(result.status), np.array(result.z)
     # "Almost infeasible" is a claim, too, because the certificate is checked.
     almost = name in ("AlmostPrimalInfeasible", "AlmostDualInfeasible")
     status = Status.INFEASIBLE if almost else classify_status(name)
     # There is one factorisation before the first step and one for each step.
     work = {"iterations": result.iterations, "factorisations": result.iterations + 1}
-    lam = program.join_multipliers(*program.split_multipliers(lam))  # Opposite bounds have one multiplier.
+    lam = program.join_multipliers(-z[: program.free], z[program.free :], None, True)
     return Answer(status, name, np.array(result.x), lam, work)
 
 
@@ -79,7 +76,8 @@ def call_osqp(
     """Call OSQP: operator splitting (Stellato et al. 2020)."""
     import osqp
 
-    rows = np.arange(len(program.t)) if program.is_kept is None else np.flatnonzero(program.is_kept)
+    equations, inequalities, _, _ = program.split_rows(True)
+    rows = np.concatenate([equations, inequalities])
     matrix, low = program.select_rows(rows, 1.0, False), program.t[rows]
     high = np.where(rows < program.free, low, np.inf)
     solver = osqp.OSQP(algebra=_get_osqp_algebra())
@@ -104,9 +102,7 @@ def call_osqp(
         if key not in known:
             raise InputError(f"osqp has no setting {key!r}; known: {', '.join(sorted(known))}")
     try:
-        solver.setup(
-            sp.triu(program.hessian, format="csc"), program.q, matrix, low, high, **(settings | extra)
-        )
+        solver.setup(program.make_upper_triangle(), program.q, matrix, low, high, **(settings | extra))
     except osqp.OSQPException as error:
         # The text is an error code; 4: the factorisation found that P is not positive semidefinite.
         message = "P is not positive semidefinite" if str(error) == "4" else "see its list of error codes"
@@ -121,8 +117,6 @@ def call_osqp(
             np.zeros(size) if part is None or np.size(part) != size else np.nan_to_num(part)
             for part, size in ((result.dual_inf_cert, program.n), (result.prim_inf_cert, len(rows)))
         )
-    lam = np.zeros(len(program.t))
-    lam[rows] = -np.asarray(y)
     work = {"iterations": info.iter, "factorisations": 1 + info.rho_updates}
-    lam = program.join_multipliers(*program.split_multipliers(lam))
+    lam = program.join_multipliers(y[: program.free], -y[program.free :], None, True)
     return Answer(status, str(info.status), np.array(x), lam, work)

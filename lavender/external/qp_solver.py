@@ -65,13 +65,18 @@ class ProgramJudge:
         self.lam: FloatArray | None = None
         self.has_step = False
 
-    def accepts(self, x: FloatArray, lam: FloatArray) -> bool:
-        """Judge a point and its Newton steps; return whether the best point meets tol."""
+    def accepts(self, x: FloatArray, lam: FloatArray, is_last: bool = True) -> bool:
+        """Judge a point and its Newton steps; return whether the best point meets tol.
+
+        Steps of degenerate vertices are done only if `is_last`: they seldom succeed where a second call would not.
+        """
         _, active, complementary = self.keep(x, lam)
         size = len(x) + len(lam)
         if self.strict_error > (STEP_ERROR if size <= MAX_FREE_STEP_SIZE else max(self.tol, STEP_ERROR)):
             first = self._polish(x, lam, self.program.compare_multipliers_with_slacks(x, lam))
             near = None
+            if not is_last:
+                return self.error <= self.tol
             if self.error > self.tol:  # Rows of almost no slack may be active with a multiplier of 0.
                 near = self._take_step(x, lam, self.program.find_near_rows(x))
             if near is not None:
@@ -97,8 +102,10 @@ class ProgramJudge:
             if point is None:
                 break
             first = first or point
-            _, _, lam = self.keep(*point, True)
-            if self.error <= self.tol:
+            error, _, lam = self.keep(*point, True)
+            if (
+                self.error <= self.tol or not error <= 1.0
+            ):  # Steps from a point without a right digit lead nowhere.
                 break
             x, active = point[0], self.program.update_active_rows(*point, active, self.tol)
         return first
@@ -134,7 +141,7 @@ class ContactJudge:
         self.relative = self.above = np.inf
         self.dual: FloatArray | None = None
 
-    def accepts(self, x: FloatArray, lam: FloatArray) -> bool:
+    def accepts(self, x: FloatArray, lam: FloatArray, is_last: bool = True) -> bool:
         """Judge a point, and its Newton step if the point does not meet tol; return whether the best point does."""
         self._keep(x, lam)
         program = self.form.program
@@ -228,8 +235,8 @@ class QPSolver(Solver):
         call = partial(run_isolated, b) if is_isolated else b.run
         result = call_backend_until_accepted(
             program, judge, call, max_iter=max_iter, tol=tol, deadline=deadline, settings=self.settings,
-            start=start, needs_definite=b.needs_definite, call_iterations=b.max_iter,
-            first_tolerance=b.first_tolerance,
+            start=start, needs_definite=b.needs_definite, first_tolerance=b.first_tolerance, interior=b.interior,
+            call_iterations=int(min(b.max_iter, b.row_iterations * (len(program.q) + len(program.t)))),
         )  # fmt: skip
         if deadline.is_set and not (b.stoppable and not b.overruns):
             limit = "reads its time limit rarely" if b.stoppable else "accepts no time limit"

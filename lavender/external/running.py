@@ -24,6 +24,8 @@ MIN_TOLERANCES = 1e-11, 1e-12  # Smallest tolerances of the two calls: rounding 
 # Gap of the second call: an interior-point method leaves an error of the square root of the gap on a row on which
 # multiplier and slack vanish together.
 SECOND_GAP = 1e-16
+# Iterations of an interior-point method in the first call, and in the second call above those of the first one.
+MAX_INTERIOR_ITERATIONS, MORE_INTERIOR_ITERATIONS = 100, 15
 OUT_OF_BUDGET = (Status.MAX_ITERATIONS, Status.TIME_LIMIT, Status.INTERRUPTED)
 # No second call follows, except after a claim of infeasibility that its multipliers contradict.
 FINAL = (Status.TIME_LIMIT, Status.INTERRUPTED, Status.INFEASIBLE)
@@ -90,8 +92,8 @@ class BackendResult:
 class PointJudge(Protocol):
     """Measures points of a program and keeps the best."""
 
-    def accepts(self, x: FloatArray, lam: FloatArray) -> bool:
-        """Measure a point; return whether the best point so far meets tol."""
+    def accepts(self, x: FloatArray, lam: FloatArray, is_last: bool) -> bool:
+        """Measure a point; return whether the best point so far meets tol. A call follows unless `is_last`."""
         ...
 
 
@@ -115,13 +117,15 @@ def call_backend_until_accepted(
     first_tolerance: float = FIRST_TOLERANCE,
     start: tuple[FloatArray, FloatArray] | None = None,
     needs_definite: bool = False,
+    interior: bool = False,
 ) -> BackendResult:
     """Call the backend, and once more with a smaller tolerance and all rows unless the judge accepts its point.
 
     The second call has the size of the first call's x as unit. `max_iter` limits the iterations of both calls,
     `call_iterations` the iterations of the first one; `first_tolerance` is the tolerance of the first call as a
-    multiple of tol; `settings` are additional options of the backend; `start` is (x, lam); `needs_definite` states that
-    the backend needs a positive definite P.
+    multiple of tol; `interior` states that the backend is an interior-point method, whose iterations hardly depend on
+    the program and the tolerance; `settings` are additional options of the backend; `start` is (x, lam);
+    `needs_definite` states that the backend needs a positive definite P.
     """
     best: BackendResult | None = None
     work: dict[str, int] = {"backend_calls": 0}
@@ -137,9 +141,11 @@ def call_backend_until_accepted(
         eps = min(max((SECOND_TOLERANCE if attempt else first_tolerance) * tol, min_eps), 1e-2)
         gap = SECOND_GAP if attempt else eps
         left = max_iter - work.get("iterations", 0)
-        limits = Limits(
-            eps, gap, left if attempt else min(left, call_iterations), deadline.get_remaining_seconds(1e-6)
-        )
+        if not attempt:
+            left = min(left, call_iterations, MAX_INTERIOR_ITERATIONS if interior else call_iterations)
+        elif interior:
+            left = min(left, work.get("iterations", left) + MORE_INTERIOR_ITERATIONS)
+        limits = Limits(eps, gap, left, deadline.get_remaining_seconds(1e-6))
         begin = None if start is None else program.scale_point(*start)
         answer = _call_backend_once(scaled, begin, call, limits, dict(settings))
         work = sum_work_counts((work, {"backend_calls": 1}, answer.work))
@@ -155,7 +161,7 @@ def call_backend_until_accepted(
         if answer.x is not None and answer.lam is not None:
             point = program.restore_point(answer.x, answer.lam)
             result.point = point
-            accepted = not is_unfounded and judge.accepts(*point)
+            accepted = not is_unfounded and judge.accepts(*point, attempt > 0)
         is_better = best is None or accepted or best.status in (Status.NUMERICAL_ERROR, Status.TIME_LIMIT)
         if is_better or answer.status in OUT_OF_BUDGET:
             best = result
@@ -164,7 +170,7 @@ def call_backend_until_accepted(
         used = work.get("iterations", 0)
         is_last = used >= max_iter or deadline.has_passed() or (answer.status in FINAL and not is_unfounded)
         # A limit of iterations in `settings` ends both calls.
-        if accepted or is_last or (answer.status is Status.MAX_ITERATIONS and used < call_iterations):
+        if accepted or is_last or (answer.status is Status.MAX_ITERATIONS and used < left):
             break
     assert best is not None
     if best.iterations > max_iter:

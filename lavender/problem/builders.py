@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING, Any, TypedDict, TypeVar
 
 import numpy as np
@@ -14,12 +13,12 @@ from lavender.base.errors import InputError
 from lavender.base.lazy_import import issparse
 from lavender.problem.cones import Cones
 from lavender.problem.contact_rows import make_contacts, make_contacts_of_rows, make_joints
-from lavender.problem.data import Names, check_matrix
+from lavender.problem.data import check_matrix
 from lavender.problem.findex import convert_from_findex, convert_to_findex, order_findex_rows
 from lavender.problem.friction import check_shape
 from lavender.problem.generalized import Generalized
 from lavender.problem.operators import Operators
-from lavender.problem.program import make_quadratic_program, unpack_qp_arguments
+from lavender.problem.program import make_quadratic_program
 from lavender.problem.rows import Rows
 from lavender_ext.core.problem import multiply_body_jacobian
 
@@ -460,11 +459,9 @@ class Builders(Operators):
         >>> answer.x.round(9).tolist(), answer.y.round(9).tolist(), answer.z_box.round(9).tolist()
         ([0.3, 0.7], [-1.95], [0.0, 0.1])
         """
-        qp = make_quadratic_program(unpack_qp_arguments((P, q, G, h, A, b, lb, ub)))
-        if qp.is_singular:
-            n, m = len(qp.q), len(qp.target)
-            more.setdefault("names", Names(n + m, partial(_make_program_names, n, m)))
-        return cls(**qp.problem_fields(), qp=qp, **more)
+        qp = make_quadratic_program((P, q, G, h, A, b, lb, ub))
+        fields: dict[str, Any] = qp.problem_fields() | dict(more)
+        return cls(**fields, qp=qp)
 
     def updated(
         self: ProblemT,
@@ -529,8 +526,3 @@ class Builders(Operators):
             return problem
         qp = self.qp.with_bias(rhs) if self.has_singular_program else None
         return replace(self, generalized=general, b=rhs, guess=start, qp=qp, copy=False)
-
-
-def _make_program_names(n: int, m: int) -> list[str]:
-    """Return default names of the unknowns and constraints of a quadratic program."""
-    return [f"variable {i}" for i in range(n)] + [f"constraint {i}" for i in range(m)]

@@ -28,7 +28,7 @@ whose matrix is not symmetric. Solvers of quadratic programs receive P, q, J and
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -47,6 +47,7 @@ from lavender.base.errors import InputError
 from lavender.base.lazy_import import issparse
 from lavender.base.lazy_import import sparse as sp
 from lavender.problem.cones import Cones
+from lavender.problem.data import Names
 from lavender.problem.derived import cached_property
 from lavender.problem.generalized import (
     Compressed,
@@ -54,7 +55,8 @@ from lavender.problem.generalized import (
     convert_to_compressed_rows,
     extract_lower_triangle,
 )
-from lavender_ext.core.assemble import dense_to_csr, mirror_lower_triangle, stack_csr_matrices
+from lavender_ext.core.assemble import dense_to_csr, mirror_lower_triangle
+from lavender_ext.judge.convex import split_multipliers, stack_program
 from lavender_ext.judge.measure import all_finite
 from lavender_ext.judge.program import equilibrate_program, judge_program
 
@@ -68,8 +70,6 @@ MAX_SINGULAR_PIVOT = 1e-13
 SEMIDEFINITE_SHIFT = 1e-12
 INFINITE = 1e20  # A right-hand side or bound of this size or larger counts as infinite, as in other packages.
 MAX_NAMED_ROWS = 8  # A message names up to this many rows.
-# Bounds that cross by less than this multiple of their size count as equal.
-MAX_CROSSING = 1e-12
 MAX_PROGRAM_ASYMMETRY = 1e-8  # [-] An asymmetry of P up to this multiple of its largest entry is removed.
 # Up to this many variables, the message about an indefinite P has its smallest eigenvalue.
 MAX_EIGENVALUE_SIZE = 1000
@@ -210,10 +210,12 @@ class QuadraticProgram:
         Whether P is singular: the problem is (5), which only solvers of quadratic programs accept.
     n_equalities, n_inequalities : int or None
         Number of rows of A and of G; None without A or G.
+    variable : (m,) int
+        Variable of each row of J that is a bound, -1 for rows of A and G.
+    has_bounds : bool
+        Whether lb or ub was given.
     kept : (mi,) int or None
         Rows of G that are in J; None if all are.
-    fixed, lower, upper : (n_f,), (n_l,), (n_u,) int, or None without lb and ub
-        Variables of the rows of bounds.
     has_impossible_rows : bool
         Whether rows G x <= -inf were given, which became 0 <= -1.
     """
@@ -225,14 +227,13 @@ class QuadraticProgram:
     is_singular: bool
     n_equalities: int | None
     n_inequalities: int | None
-    kept: IntpArray | None
-    fixed: IntpArray | None
-    lower: IntpArray | None
-    upper: IntpArray | None
+    variable: IntArray
+    has_bounds: bool = False
+    kept: IntpArray | None = None
     has_impossible_rows: bool = False
 
     def problem_fields(self) -> dict[str, Any]:
-        """Return the fields b, cones and matrix or generalized of the constraint problem."""
+        """Return the fields b, cones and matrix or generalized of the constraint problem, and its names."""
         general = self.generalized
         if not self.is_singular:
             cones = _make_one_sided_cones(self.free, len(self.target))
@@ -242,7 +243,13 @@ class QuadraticProgram:
         matrix.eliminate_zeros()
         matrix.sort_indices()
         b = np.concatenate([-self.q, self.target])
-        return {"b": b, "cones": _make_one_sided_cones(n + self.free, len(b)), "matrix": matrix}
+        names = Names(len(b), partial(_make_program_names, n, len(b) - n))
+        return {
+            "b": b,
+            "cones": _make_one_sided_cones(n + self.free, len(b)),
+            "matrix": matrix,
+            "names": names,
+        }
 
     def with_bias(self, b: FloatArray) -> QuadraticProgram:
         """Return the program of a singular P for which the right-hand side of (5) is b (n + m,)."""
@@ -265,17 +272,6 @@ class QuadraticProgram:
         jac = self.generalized.jac
         return jac.indptr, jac.indices, jac.data
 
-    @cached_property
-    def variable_of_row(self) -> IntArray:
-        """Variable of each row of J that is a bound, -1 for rows of A and G (m,)."""
-        variable = np.full(len(self.target), -1, np.int32)
-        if self.fixed is not None and self.lower is not None and self.upper is not None:
-            variable[self.n_equalities or 0 : self.free] = self.fixed
-            end = len(variable) - len(self.upper)
-            variable[end:] = self.upper
-            variable[end - len(self.lower) : end] = self.lower
-        return variable
-
     def judge(self, x: FloatArray, multipliers: FloatArray) -> tuple[Any, ...]:
         """Judge x (n,) and the multipliers (m,) of the rows: `judge_program`."""
         return judge_program(
@@ -285,9 +281,7 @@ class QuadraticProgram:
     @cached_property
     def scales(self) -> tuple[FloatArray, FloatArray, float, float]:
         """Scales D (n,), E (m,), sigma and c of `equilibrate_program`."""
-        return equilibrate_program(
-            self.hessian, self.q, self.jacobian, self.target, self.variable_of_row, self.free
-        )
+        return equilibrate_program(self.hessian, self.q, self.jacobian, self.target, self.variable, self.free)
 
     def with_vectors(self, q: Any = None, h: Any = None, b: Any = None) -> QuadraticProgram:
         """Return the program with another q (n,), h (mi,) or b (me,); its matrices are shared, and h stays infinite."""
@@ -307,7 +301,7 @@ class QuadraticProgram:
         if q is not None and not self.is_singular:
             general = general.with_jacobian(None, general.solve(-changes["q"]))
         new = replace(self, target=mark_read_only(target), generalized=general, **changes)
-        for name in ("hessian", "jacobian", "variable_of_row"):
+        for name in ("hessian", "jacobian"):
             new.__dict__[name] = getattr(self, name)
         return new
 
@@ -329,37 +323,28 @@ class QuadraticProgram:
         If `impulse` is a certificate of infeasibility, the result proves that the program has no feasible point:
         A^T y + G^T z + z_box = 0 and b.y + h.z + (ub or lb).z_box < 0.
         """
-        y = z = box = None
-        impulse = self.select_row_multipliers(impulse)
-        n_equalities, end = self.n_equalities or 0, len(impulse)
-        if self.n_equalities is not None:
-            y = -impulse[:n_equalities]
-        if self.fixed is not None and self.lower is not None and self.upper is not None:
-            box = np.zeros(len(self.q))
-            box[self.upper] = impulse[end - len(self.upper) :]
-            end -= len(self.upper)
-            box[self.lower] -= impulse[end - len(self.lower) : end]
-            end -= len(self.lower)
-            box[self.fixed] = -impulse[n_equalities : self.free]
-        if self.n_inequalities is not None:
-            z = impulse[self.free : end]
-            if self.kept is not None:
-                z_of_all_rows = np.zeros(self.n_inequalities)
-                z_of_all_rows[self.kept] = z
-                z = z_of_all_rows
-        return y, z, box
+        lam = np.ascontiguousarray(self.select_row_multipliers(impulse))
+        y, z, box = split_multipliers(self.jacobian, self.variable, None, len(self.q), self.free, lam)
+        if self.kept is not None:
+            z_of_all_rows = np.zeros(self.n_inequalities or 0)
+            z_of_all_rows[self.kept] = z
+            z = z_of_all_rows
+        return (
+            None if self.n_equalities is None else y,
+            None if self.n_inequalities is None else z,
+            box if self.has_bounds else None,
+        )
 
     def describe_rows(self, impulse: FloatArray) -> str:
         """Return the names of the rows with nonzero multipliers, such as A[0], G[3], lb[2]."""
-        none = np.zeros(0, int)
-        n_rows = self.n_inequalities or 0
-        groups = (
-            ("A", np.arange(self.n_equalities or 0)), ("lb", none if self.fixed is None else self.fixed),
-            ("G", np.arange(n_rows) if self.kept is None else self.kept),
-            ("lb", none if self.lower is None else self.lower), ("ub", none if self.upper is None else self.upper),
-        )  # fmt: skip
-        all_names = [f"{name}[{i}]" for name, indices in groups for i in indices.tolist()]
-        names = [all_names[i] for i in np.flatnonzero(self.select_row_multipliers(impulse))]
+        ptr, _, value = self.jacobian
+        rows = np.flatnonzero(self.select_row_multipliers(impulse))
+        names, n_a = [], self.n_equalities or 0
+        for i in rows.tolist():
+            j, row = int(self.variable[i]), i - self.free
+            bound = "ub" if j >= 0 and value[ptr[i]] < 0.0 else "lb"
+            row = row if self.kept is None or j >= 0 or i < n_a else int(self.kept[row])
+            names.append(f"{bound}[{j}]" if j >= 0 else f"A[{i}]" if i < n_a else f"G[{row}]")
         more = f" and {len(names) - MAX_NAMED_ROWS} more" if len(names) > MAX_NAMED_ROWS else ""
         return ", ".join(names[:MAX_NAMED_ROWS]) + more
 
@@ -381,6 +366,11 @@ class QuadraticProgram:
         )  # fmt: skip
 
 
+def _make_program_names(n: int, m: int) -> list[str]:
+    """Return default names of the unknowns and constraints of a quadratic program."""
+    return [f"variable {i}" for i in range(n)] + [f"constraint {i}" for i in range(m)]
+
+
 @lru_cache(maxsize=8)  # A controller solves many programs with equal cones.
 def _make_one_sided_cones(free: int, m: int) -> Cones:
     """Return cones of m rows, the first ones free and the others nonnegative."""
@@ -391,37 +381,29 @@ def _make_one_sided_cones(free: int, m: int) -> Cones:
 
 def make_quadratic_program(arrays: ProgramArrays) -> QuadraticProgram:
     """Check the arrays P, q, G, h, A, b, lb, ub and convert them to a program; see `Problem.from_qp`."""
-    P, q, G, h, A, b, lb, ub = arrays
+    P, q, G, h, A, b, lb, ub = _unpack_arguments(arrays)
     q, h, b, lb, ub = map(_flatten_column, (q, h, b, lb, ub))
     q = as_array("q", q, (None,))
     n = len(q)
     lower = _convert_hessian(P, n)
-    rows = _RowStack(n)
-    n_a, _ = rows.add_matrix("A", A, "b", b)
-    fixed = low = up = None
-    if lb is not None or ub is not None:
+    A, b = _convert_rows("A", A, "b", b, n, 1.0)
+    G, h = _convert_rows("G", G, "h", h, n, -1.0)
+    has_bounds = lb is not None or ub is not None
+    if has_bounds:
         lb, ub = (
             np.full(n, infinite) if x is None else as_array(name, x, (n,), finite=False)
             for name, x, infinite in (("lb", lb, -np.inf), ("ub", ub, np.inf))
         )
-        lb, ub = _check_bounds(lb, ub)
-        equal = lb == ub
-        fixed, low, up = (
-            np.flatnonzero(on) for on in (equal, (lb > -INFINITE) > equal, (ub < INFINITE) > equal)
-        )
-        rows.add_bounds(fixed, lb, 1.0)
-    free = rows.m
-    n_g, finite_rows = rows.add_matrix("G", G, "h", h)
-    if low is not None and up is not None:
-        rows.add_bounds(low, lb, 1.0)  # pyright: ignore[reportArgumentType]
-        rows.add_bounds(up, ub, -1.0)  # pyright: ignore[reportArgumentType]
-    jac, target = rows.stacked
+    jac, target, variable, n_fixed, n_kept, bad = stack_program(n, A, b, G, h, lb, ub)
+    if bad >= 0:
+        raise InputError(f"variable {bad}: lb = {lb[bad]}, ub = {ub[bad]}; lb < inf and ub > -inf are needed")
     general, is_singular = _factor_hessian(lower, jac, q)
+    n_a, n_g = (None if side is None else len(side) for side in (b, h))
     return QuadraticProgram(
-        q=q, target=mark_read_only(target), free=free, generalized=general, is_singular=is_singular,
-        n_equalities=n_a, n_inequalities=n_g,
-        kept=finite_rows, fixed=fixed, lower=low, upper=up,
-        has_impossible_rows=h is not None and bool(np.isneginf(np.asarray(h, float)).any()),
+        q=q, target=mark_read_only(target), free=n_fixed + (n_a or 0), generalized=general,
+        is_singular=is_singular, n_equalities=n_a, n_inequalities=n_g, variable=variable, has_bounds=has_bounds,
+        kept=None if h is None or n_kept == n_g else np.flatnonzero(h < INFINITE),
+        has_impossible_rows=h is not None and bool(np.isneginf(h).any()),
     )  # fmt: skip
 
 
@@ -450,15 +432,15 @@ def recover_program(matrix: sp.csr_array, b: FloatArray, cones: Cones, n: int) -
     general, _ = _factor_hessian(lower, convert_to_compressed_rows("J", jac), -b[:n])
     return QuadraticProgram(
         q=mark_read_only(-b[:n]), target=mark_read_only(b[n:].copy()), free=free, generalized=general,
-        is_singular=True, n_equalities=free,
-        n_inequalities=len(b) - n - free, kept=None, fixed=None, lower=None, upper=None,
+        is_singular=True, n_equalities=free, n_inequalities=len(b) - n - free,
+        variable=np.full(len(b) - n, -1, np.int32),
     )  # fmt: skip
 
 
 # -- conversion of arguments --------------------------------------------------------------------------
 
 
-def unpack_qp_arguments(arguments: ProgramArrays) -> ProgramArrays:
+def _unpack_arguments(arguments: ProgramArrays) -> ProgramArrays:
     """Return the eight arrays; the first argument may be a `qpsolvers.Problem`, or an object with its attributes."""
     P = arguments[0]
     if arguments[1] is not None and not hasattr(P, "ub"):
@@ -514,94 +496,22 @@ def _flatten_column(vector: Any) -> Any:
     return np.asarray(vector)[:, 0] if getattr(vector, "shape", ())[1:] == (1,) else vector
 
 
-class _RowStack:
-    """Builder of J and target of (2) from consecutive groups of rows."""
-
-    def __init__(self, n: int) -> None:
-        self.n, self.m = n, 0
-        self.groups = list[Compressed]()
-        self.targets = list[FloatArray]()
-
-    def add_rows(self, rows: Compressed, target: FloatArray) -> None:
-        """Add a group of rows."""
-        self.groups.append(rows)
-        self.targets.append(target)
-        self.m += len(target)
-
-    @property
-    def stacked(self) -> tuple[Compressed, FloatArray]:
-        """J and target of all groups."""
-        if len(self.groups) == 1:
-            return self.groups[0], self.targets[0]
-        groups = [(*rows, False, 1.0, len(rows[0]) - 1) for rows in self.groups]
-        return stack_csr_matrices(self.n, groups), np.concatenate([np.zeros(0), *self.targets])
-
-    def add_bounds(self, variables: IntpArray, bound: FloatArray, sign: float) -> None:
-        """Add the rows sign x_i >= sign bound_i of these variables."""
-        k = len(variables)
-        rows = np.arange(k + 1, dtype=np.int32), variables.astype(np.int32), np.full(k, sign)
-        self.add_rows(rows, sign * bound[variables])
-
-    def add_matrix(
-        self, name: str, matrix: Any, rhs_name: str, rhs: Any
-    ) -> tuple[int | None, IntpArray | None]:
-        """Add the rows of A, or the rows of G with finite h.
-
-        Returns
-        -------
-        n_rows, finite_rows
-            Number of rows of the matrix (None without it), and the indices of the added rows (None if all are added).
-        """
-        if (matrix is None) != (rhs is None):
-            missing = name if matrix is None else rhs_name
-            raise InputError(
-                f"{missing} is missing; {name} and {rhs_name} describe the same constraints: give both or "
-                "neither"
-            )
-        if matrix is None:
-            return None, None
-        rows = _convert_matrix(name, matrix, self.n, 1.0 if name == "A" else -1.0)
-        m = len(rows[0]) - 1
-        if name == "A":
-            self.add_rows(rows, as_array(rhs_name, rhs, (m,)))
-            return m, None
-        h, finite_rows = as_array(rhs_name, rhs, (m,), finite=False), None
-        if not (all_finite(h) and (h < INFINITE).all()):
-            check_not_nan(rhs_name, h)
-            finite_rows = np.flatnonzero(h < INFINITE)
-            is_impossible = np.isneginf(h)
-            if is_impossible.any():  # G x <= -inf becomes 0 <= -1, which no x satisfies either.
-                ptr, idx, val = rows
-                value = np.where(np.repeat(is_impossible, np.diff(ptr)), 0.0, val)
-                rows, h = (
-                    convert_to_compressed_rows("G", sp.csr_array((value, idx, ptr), (m, self.n))),
-                    np.where(is_impossible, -1.0, h),
-                )
-            rows, h = _select_rows(rows, finite_rows), h[finite_rows]
-        self.add_rows(rows, -h)
-        return m, finite_rows
-
-
-def _select_rows(rows: Compressed, selected: IntpArray) -> Compressed:
-    """Return the selected rows of a matrix."""
-    ptr, idx, val = rows
-    size = np.diff(ptr)
-    entries = np.repeat(np.isin(np.arange(len(size)), selected), size)
-    return np.concatenate([[0], np.cumsum(size[selected])]).astype(np.int32), idx[entries], val[entries]
-
-
-def _check_bounds(lb: FloatArray, ub: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the bounds, equal if they cross by rounding; raise InputError for NaN, lb = inf and ub = -inf.
-
-    Bounds that cross by more are two rows that contradict each other.
-    """
-    bad = np.flatnonzero(~((lb < np.inf) & (ub > -np.inf)))
-    if len(bad):
-        i = bad[0]
-        raise InputError(f"variable {i}: lb = {lb[i]}, ub = {ub[i]}; lb < inf and ub > -inf are needed")
-    crossing = lb - ub
-    is_rounding = (crossing > 0.0) & (crossing <= MAX_CROSSING * np.maximum(np.abs(lb), np.abs(ub)))
-    return (lb, np.where(is_rounding, lb, ub)) if is_rounding.any() else (lb, ub)
+def _convert_rows(
+    name: str, matrix: Any, rhs_name: str, rhs: Any, n: int, sign: float
+) -> tuple[Compressed | None, FloatArray | None]:
+    """Convert A and b, or -G and h, to checked compressed rows and an array; None without them."""
+    if (matrix is None) != (rhs is None):
+        missing = name if matrix is None else rhs_name
+        raise InputError(
+            f"{missing} is missing; {name} and {rhs_name} describe the same constraints: give both or neither"
+        )
+    if matrix is None:
+        return None, None
+    rows = _convert_matrix(name, matrix, n, sign)
+    rhs = as_array(rhs_name, rhs, (len(rows[0]) - 1,), finite=name == "A")
+    if name == "G" and not all_finite(rhs):
+        check_not_nan(rhs_name, rhs)
+    return rows, rhs
 
 
 # -- definiteness of P --------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from functools import partial
+from functools import cached_property, partial
 from time import perf_counter
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -39,6 +39,7 @@ from lavender.judge.solution import (
     sum_work_counts,
 )
 from lavender.problem import Problem, QPSolution
+from lavender.problem.program import QuadraticProgram, make_quadratic_program
 from lavender.solvers.registry import SolverSpec, get
 from lavender.solving.limits import check_time_limit
 from lavender.solving.singular_programs import program_backends
@@ -135,16 +136,18 @@ def solve_qp(
     ([0.0, 1.0], True)
     """
     begun = perf_counter()
+    problem = None
     if isinstance(P, Problem):
         if isinstance(q, str):
             solver, q = q, None
         problem = _update_program(P, q, h, b, (G, A, lb, ub))
+        qp = problem.qp
     else:
         if P is None:
             if q is None:
                 raise InputError("P and q are missing; q is needed, and P unless the program is linear")
             P = sp.csr_array((np.size(q), np.size(q)))
-        problem = Problem.from_qp(P, q, G, h, A, b, lb, ub)
+        qp = make_quadratic_program((P, q, G, h, A, b, lb, ub))
     tol = check_float("tol", tol, low=0.0)
     limit = check_time_limit(time_limit)
     deadline = Deadline(None if limit == math.inf else limit)
@@ -155,9 +158,9 @@ def solve_qp(
             {"verbose": True} if verbose else {}
         )
         options = own | ({"settings": {**own.get("settings", {}), **settings}} if settings else {})
-    task = _Task(problem, spec, tol, deadline, max_iter, impulse, options)
+    task = _Task(qp, problem, spec, tol, deadline, max_iter, impulse, options)
     if initvals is not None:
-        task.initial_x = as_array("initvals", initvals, (len(problem.qp.q),))
+        task.initial_x = as_array("initvals", initvals, (len(qp.q),))
     return task.solve(begun)
 
 
@@ -186,7 +189,8 @@ class _Task:
 
     def __init__(
         self,
-        problem: Problem,
+        qp: QuadraticProgram,
+        problem: Problem | None,
         spec: SolverSpec,
         tol: float,
         deadline: Deadline,
@@ -194,10 +198,11 @@ class _Task:
         start: Any,
         options: dict[str, Any],
     ) -> None:
-        self.problem, self.spec, self.tol, self.deadline = problem, spec, tol, deadline
+        self.qp, self.spec, self.tol, self.deadline = qp, spec, tol, deadline
         self.max_iter, self.options = max_iter, options
-        self.qp = problem.qp
-        self.start = None if start is None else problem.make_start(start)
+        if problem is not None:
+            self.__dict__["problem"] = problem
+        self.start = None if start is None else self.problem.make_start(start)
         self.initial_x: FloatArray | None = None
         self.program = get_program(self.qp)
         self.judge = ProgramJudge(self.program, max(tol, MIN_TOL), deadline)
@@ -206,6 +211,11 @@ class _Task:
         self.proof: Proof | None = None
         self.ray: FloatArray | None = None
         self.solution: Solution | None = None  # Last solution of the constraint problem.
+
+    @cached_property
+    def problem(self) -> Problem:
+        """The constraint problem, which a backend does not need."""
+        return Problem(**self.qp.problem_fields(), qp=self.qp)
 
     def solve(self, begun: float) -> QPSolution:
         """Run the solvers, search for proofs, and build the answer."""

@@ -39,13 +39,6 @@ cdef double PLACEHOLDER = 1e18              # Larger numbers have no part in the
 cdef double MAX_SIZE_RATIO = 1e6            # Largest ratio of the size of the variables to the smallest right-hand side.
 
 
-cdef struct csr_t:
-    Py_ssize_t m, n
-    const int32_t* ptr
-    const int32_t* idx
-    const double* val
-
-
 cdef csr_t read_csr(object arrays, Py_ssize_t m, Py_ssize_t n) except *:
     """Return the addresses of compressed rows (indptr, indices, data)."""
     cdef csr_t a
@@ -199,20 +192,6 @@ def judge_program(hessian, q_, jac, t_, scales, lam_, x_, int32_t free):
     if not (isfinite(gap) and isfinite(terms) and v == v):
         v = INFINITY
     return v, max(v, strict), row_error, column_error, active_, complementary
-
-
-def scale_rows(rows, row_scale_, column_scale_):
-    """Return compressed rows with new arrays, entry (i, j) multiplied by row_scale_[i] column_scale_[j]."""
-    cdef Py_ssize_t i, k, m = len(row_scale_)
-    cdef csr_t a = read_csr(rows, m, len(column_scale_))
-    cdef const double* e = as_double_pointer(row_scale_, m)
-    cdef const double* d = as_double_pointer(column_scale_, len(column_scale_))
-    value_ = np.empty(len(rows[2]))
-    cdef double* value = as_double_pointer(value_, len(value_))
-    for i in range(m):
-        for k in range(a.ptr[i], a.ptr[i + 1]):
-            value[k] = a.val[k] * e[i] * d[a.idx[k]]
-    return np.array(rows[0]), np.array(rows[1]), value_     # Copies, because SciPy sorts indices in place.
 
 
 cdef inline double approximate_log2(double x) noexcept nogil:

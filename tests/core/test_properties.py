@@ -344,7 +344,7 @@ class Steps:
     def __init__(self, statuses, accepted):
         self.statuses, self.accepted, self.calls, self.received = statuses, iter(accepted), 0, []
 
-    def accepts(self, x, lam):
+    def accepts(self, x, lam, is_last):
         return next(self.accepted)
 
     def __call__(self, scaled, start, limits, settings):
