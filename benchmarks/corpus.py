@@ -1,9 +1,9 @@
 """Figures of two commits on inputs that nobody here wrote: programs, recorded problems, FCLIB, reports, robot models.
 
-    python -m benchmarks corpus --base COMMIT [--problems FOLDER] [--solver auto ...] [--drawn 20] [--out FILE]
+    python -m benchmarks corpus --base COMMIT|FOLDER [--problems FOLDER] [--solver auto ...] [--drawn 20] [--out FILE]
 
-The base commit is built in a worktree that is removed in the end. A process in each checkout solves the same inputs in
-turn, and this checkout judges both answers. Inputs:
+The base commit is built in a worktree that is removed in the end, unless it is a built checkout. A process in each
+checkout solves the same inputs in turn, and this checkout judges both answers. Inputs:
 
     programs   the folder `programs` beside the folder of problems, or that of tests/field. "Right": the objective
                differs from the optimal value, and rows are violated, by at most 1e-5 of their terms; "solved": right,
@@ -208,7 +208,10 @@ class Checkout:
 
 @contextmanager
 def build_base(commit: str) -> Iterator[Path]:
-    """Check a commit out and compile its kernels; remove it in the end."""
+    """Check a commit out and compile its kernels; remove it in the end. A folder is a checkout that is built."""
+    if Path(commit).is_dir():
+        yield Path(commit).resolve()
+        return
     with tempfile.TemporaryDirectory() as work:
         folder = Path(work) / "base"
         subprocess.run(["git", "worktree", "add", "-q", "--detach", folder, commit], cwd=ROOT, check=True)
@@ -304,10 +307,11 @@ def write_drawn_problems(count: int, folder: Path) -> list[tuple[str, Path]]:
 
 def run_reports(folder: Path) -> str:
     """Run the table of public reports of this checkout with the package of a checkout; return the last line."""
-    command = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", "--tb=no",
-               "tests/field/test_reports.py"]  # fmt: skip
+    table = str(ROOT / "tests/field/test_reports.py")
+    command = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", "--tb=no", table]
+    command += ["-c", str(ROOT / "pyproject.toml"), "--rootdir", str(ROOT)]
     environment = os.environ | {"PYTHONPATH": str(folder)}
-    ended = subprocess.run(command, cwd=ROOT, env=environment, text=True, capture_output=True, check=False)
+    ended = subprocess.run(command, cwd=folder, env=environment, text=True, capture_output=True, check=False)
     return ended.stdout.strip().rpartition("\n")[2]
 
 
@@ -373,7 +377,7 @@ def make_command() -> Any:
     from benchmarks.output import markdown, out_option, write_json
 
     @click.command("corpus")
-    @click.option("--base", required=True, help="Commit to compare with.")
+    @click.option("--base", required=True, help="Commit to compare with, or a built checkout.")
     @click.option(
         "--problems",
         type=click.Path(path_type=Path, exists=True),
