@@ -59,8 +59,8 @@ OPERATORS: dict[str, tuple[re.Pattern[str], Callable[[re.Match[str]], str]]] = {
         lambda m: f"{m[2]}, {m[1]}" if m[1] else f"{m[4]}, {m[3]}",
     ),
     "dropped branch": (
-        re.compile(r"(?<=if )(?!TYPE_CHECKING|fault)[^:]+(?=:\s*$)|(?<= )and [^:()]+(?=:\s*$)"),
-        lambda m: "" if m[0].startswith("and ") else "False",
+        re.compile(r"(?<=^)(?:\s*(?:el)?if )(?!TYPE_CHECKING)[^:]+(?=:\s*$)|(?<= )and [^:()]+(?=:\s*$)"),
+        lambda m: "" if m[0].startswith("and ") else m[0][: m[0].index("if ") + 3] + "False",
     ),
     "stale state": (
         re.compile(r"^\s*(?:\w+(?:\.\w+|\[[^\]]*\])+)(?:, [\w.\[\]]+)* [-+*/]?= \S.*$"),
