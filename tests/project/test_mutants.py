@@ -120,8 +120,12 @@ def test_nearly_all_faults_of_kernels_can_be_switched():
 
 
 def test_drawn_faults_are_those_of_their_seed_and_each_applies_and_changes_one_line():
-    drawn = [mutants.Fault(*own[:3], "", own[3]) for own in mutants.draw_faults(ROOT, 64, 5)]
-    assert drawn == [mutants.Fault(*own[:3], "", own[3]) for own in mutants.draw_faults(ROOT, 64, 5)]
+    files = [*(ROOT / "lavender" / "solving").glob("*.py"), *(ROOT / "lavender_ext" / "newton").glob("*.pxd")]
+    lines = {path.relative_to(ROOT).as_posix(): set(range(100, 400)) for path in files}
+    drawn = [mutants.Fault(*own[:3], "", own[3]) for own in mutants.draw_faults(ROOT, 64, 5, lines)]
+    assert drawn == [mutants.Fault(*own[:3], "", own[3]) for own in mutants.draw_faults(ROOT, 64, 5, lines)]
+    assert {fault.path for fault in drawn} <= lines.keys()
+    assert all(100 < int(fault.sentence.split()[-3]) <= 400 for fault in drawn)
     assert len({(fault.path, *fault.lines) for fault in drawn}) == len(drawn) == 64
     assert sum(fault.is_kernel for fault in drawn) == 32
     assert len({fault.sentence.split(",")[0] for fault in drawn}) == len(OPERATORS)
