@@ -55,7 +55,6 @@ MAX_CLAIM_ERROR = (
 # The matrix of a step of k equations is sparse with at most this multiple of k^3 entries. At k = 292 to 380, both kinds
 # of factor take the same time with 1.5 to 2.5 % of k^2 entries; with 86 %, a dense one takes a quarter.
 MAX_SPARSE_ENTRIES = 5e-5
-MAX_STEP_SIZE = 20_000  # No step is done with more variables and active rows.
 MAX_FIT_SIZE = 300  # Largest number of variables and of active rows for `fit_multipliers`.
 NEAR_SLACK = 1e-8  # [-] Rows with a smaller slack in scaled units may be active with a multiplier of 0.
 # [-] Shift of the diagonal of a singular or sparse matrix of the step; each refinement reduces its effect.
@@ -80,6 +79,8 @@ class ConvexProgram:
         Variable of a row that is a bound, x_j >= t_i or -x_j >= t_i; -1 for other rows.
     cones : tuple of int
         Sizes of the second-order cones, which are the last rows.
+    definite : bool
+        Whether P is known to be positive definite.
     """
 
     P: Compressed
@@ -89,6 +90,7 @@ class ConvexProgram:
     free: int
     variable: IntArray
     cones: tuple[int, ...] = ()
+    definite: bool = False
 
     @cached_property
     def hessian(self) -> Any:
@@ -119,8 +121,9 @@ class ConvexProgram:
         """The program in scaled variables."""
         hessian, q, jac, t = scale_program(self.P, self.q, self.J, self.t, self.scales)
         return ScaledProgram(
-            P=hessian, q=q, J=jac, t=t, free=self.free, variable=self.variable, cones=self.cones
-        )
+            P=hessian, q=q, J=jac, t=t, free=self.free, variable=self.variable, cones=self.cones,
+            definite=self.definite,
+        )  # fmt: skip
 
     def scale_point(self, x: FloatArray, lam: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Convert x (n,) and multipliers (m,) to the scaled program."""
@@ -169,9 +172,9 @@ class ConvexProgram:
 
     @np.errstate(all="ignore")  # The caller judges a step that overflows.
     def polish(
-        self, x: FloatArray, lam: FloatArray, active: npt.NDArray[np.bool_]
+        self, x: FloatArray, lam: FloatArray, active: npt.NDArray[np.bool_], max_size: int
     ) -> tuple[FloatArray, FloatArray] | None:
-        """Do one Newton step with iterative refinement; None if the program has cones or is too large.
+        """Do one Newton step with iterative refinement; None with cones or with more than `max_size` equations.
 
         It is computed in scaled units, in which all roundings are the same, because the scales are powers of two.
         Variables at active bounds are eliminated.
@@ -181,7 +184,7 @@ class ConvexProgram:
         s = self.scaled
         step = NewtonStep(s.P, s.q, s.J, s.t, self.variable, self.scales, active, x, lam)
         size = step.size
-        if size > MAX_STEP_SIZE:
+        if size > max_size:
             return None
         if size:
             try:
@@ -305,6 +308,8 @@ class ScaledProgram(ConvexProgram):
     @cached_property
     def is_definite(self) -> bool:
         """Whether P has a Cholesky factor without negligible pivots."""
+        if self.definite:
+            return True
         P = make_dense(self.P, self.n)
         try:
             pivots = np.square(np.linalg.cholesky(P).diagonal())

@@ -238,7 +238,13 @@ def get_program(qp: QuadraticProgram) -> ConvexProgram:
     program: ConvexProgram | None = qp.__dict__.get("_convex_program")
     if program is None:
         program = ConvexProgram(
-            P=qp.hessian, q=qp.q, J=qp.jacobian, t=qp.target, free=qp.free, variable=qp.variable
+            P=qp.hessian,
+            q=qp.q,
+            J=qp.jacobian,
+            t=qp.target,
+            free=qp.free,
+            variable=qp.variable,
+            definite=not qp.is_singular,
         )
         program.__dict__["scales"] = qp.scales
         qp.__dict__["_convex_program"] = program

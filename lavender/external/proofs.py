@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.base.deadline import Deadline
+from lavender.base.deadline import Deadline, read_clock
 from lavender.base.lazy_import import import_module_under_lock
 from lavender.base.lazy_import import sparse as sp
 from lavender.external.convex import ConvexProgram
@@ -21,7 +21,7 @@ from lavender.problem import Problem
 RAY_TOLERANCE = 1e-8  # [-] P d, J d and q.d count as 0 up to this multiple of their largest terms.
 FEASIBLE_TOLERANCE = 1e-6  # [-] Largest error of a row of the feasible point of an unbounded program.
 # Matrices of more rows or columns are projected by a sparse factor with this shift, which repetitions remove.
-MAX_DENSE_PROJECTION, PROJECTION_SHIFT, PROJECTIONS = 300, 1e-10, 3
+MAX_DENSE_PROJECTION, PROJECTION_SHIFT, PROJECTIONS = 100, 1e-10, 3
 # [-] t.lambda of a proof is positive by more than this multiple of the sum of |lambda| in scaled units; the rest is
 # rounding of right-hand sides (2^10 unit roundoffs).
 PROOF_ROUNDING = 2.0**-43
@@ -48,6 +48,8 @@ def find_infeasibility_proof(
             scaled_y = y / e
             if not rows.scaled.t @ scaled_y > PROOF_ROUNDING * np.abs(scaled_y).sum():
                 continue
+            if deadline.has_passed():
+                return None
             proof = prove_infeasibility(
                 problem, np.concatenate([np.zeros(problem.m - len(y)), y]), 0.0, deadline
             )
@@ -61,7 +63,9 @@ def find_infeasibility_proof(
         found = _solve_linear_program(-t, matrix, None, np.where(is_equation, -1.0, 0.0), high, deadline)
         if found is None:
             return None
-        candidates = [_project_to_kernel(found, matrix) * e, found * e]
+        candidates = (
+            [found * e] if deadline.has_passed() else [_project_to_kernel(found, matrix) * e, found * e]
+        )
     return None
 
 
@@ -75,7 +79,7 @@ def find_ray(
     hessian, jac = scaled.hessian, scaled.jacobian
     level = sp.vstack([hessian, jac[:free]])
     d = _solve_linear_program(scaled.q, level, jac[free:], -1.0, 1.0, deadline)
-    if d is None or not scaled.q @ d < 0.0:
+    if d is None or not scaled.q @ d < 0.0 or deadline.has_passed():
         return None
     d = _remove_small_entries(d)
     at_bound = np.abs(jac @ d) <= RAY_TOLERANCE * (abs(jac) @ np.abs(d))
@@ -86,6 +90,8 @@ def find_ray(
         return None
     point = x
     if point is None or not _is_feasible(program, point):
+        if deadline.has_passed():
+            return None
         none = np.full(n, np.inf)
         found = _solve_linear_program(
             np.zeros(n), jac[:free], jac[free:], -none, none, deadline, scaled.t[:free], scaled.t[free:]
@@ -150,8 +156,9 @@ def _solve_linear_program(
     at_least: Any = 0.0,
 ) -> FloatArray | None:
     """Minimise cost.x with equations x = equal_to, inequalities x >= at_least and bounds; None without a point."""
-    from scipy.optimize import linprog  # Imported here: it takes 0.1 s, and is seldom needed.
-
+    begin = read_clock()
+    linprog = import_module_under_lock("scipy.optimize").linprog  # It takes 0.1 s, and is seldom needed.
+    deadline.extend(read_clock() - begin)
     n = len(cost)
     options: dict[str, Any] = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
     if deadline.is_set:
