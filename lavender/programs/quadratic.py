@@ -24,7 +24,7 @@ from lavender.base.lazy_import import sparse as sp
 from lavender.external.forms import get_program
 from lavender.external.proofs import find_infeasibility_proof, find_ray
 from lavender.external.qp_solver import OPTION_HELP, ProgramJudge, QPSolver, get_false_claim_error
-from lavender.judge.certificates import Proof
+from lavender.judge.certificates import Proof, prove_infeasibility
 from lavender.judge.residuals import residual
 from lavender.judge.solution import (
     CONFIRMED,
@@ -240,8 +240,9 @@ class _Task:
     def _list_steps(self) -> Iterator[Any]:
         """Yield the runs to do, one after the other, until a point meets tol."""
         spec = self.spec
-        if not len(self.qp.q):  # Backends reject programs without variables.
-            self.start = np.zeros(len(self.qp.target))
+        if not len(self.qp.q):
+            yield self._judge_without_variables
+            return
         if self.start is not None and self.tol > 0.0 and (spec.delegates or spec.external):
             yield self._judge_start
         if spec.delegates and spec.builtin:
@@ -254,6 +255,17 @@ class _Task:
             yield partial(self._call_backend, spec, self.options)
         else:
             yield self._solve_constraint_problem
+
+    def _judge_without_variables(self) -> None:
+        """Judge the only point of a program without variables, or prove that a row contradicts itself."""
+        target, free = self.qp.target, self.qp.free
+        self.start = np.zeros(len(target))
+        self._judge_start()
+        if not self.judge.error <= self.tol:
+            violation = np.append(np.abs(target[:free]), target[free:])
+            y = np.where(np.arange(len(target)) == np.argmax(violation), np.sign(target), 0.0)
+            proof = prove_infeasibility(self.problem, y)
+            self.proof = None if proof.reason else proof
 
     def _judge_start(self) -> None:
         """Judge the start: if it meets tol, nothing runs."""

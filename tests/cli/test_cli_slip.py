@@ -23,3 +23,14 @@ def test_slip_command_on_a_geom_without_contact_ends_with_1(lavender, tmp_path):
     (tmp_path / "slope.xml").write_text(SLOPE.replace("0 0 .05", "0 0 5"))
     code, output, _ = lavender("slip", tmp_path / "slope.xml", "--contact", "box")
     assert code == 1 and "'box' touches nothing with friction in these states." in output
+
+
+@pytest.mark.parametrize("command", [("slip", "--steps", 15), ("audit", "--worlds", 1, "--steps", 5)])
+def test_command_makes_the_folders_of_its_page_and_rejects_a_file_in_their_place(command, lavender, tmp_path):
+    model, page = tmp_path / "slope.xml", tmp_path / "new" / "of" / "page"
+    model.write_text(SLOPE)
+    code, _, error = lavender(command[0], model, *command[1:], "--out", page)
+    assert code in (0, 1), error
+    assert (page / "index.html").is_file()
+    code, _, error = lavender(command[0], model, *command[1:], "--out", model / "page")
+    assert code == 2 and str(model) in error

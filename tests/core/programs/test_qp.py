@@ -458,3 +458,15 @@ def test_solve_qp_limits_reach_the_solver_and_a_start_that_is_a_solution_is_retu
         assert is_of_start == ("the start" in answer.solution.message), name
         assert is_of_start == (answer.solution.status is lv.Status.STALLED), name
         assert "is a solution" not in answer.solution.message, name
+
+
+@pytest.mark.parametrize("solver", ["auto", "newton", *installed("clarabel", "piqp", "daqp", "quadprog", "osqp")])
+@pytest.mark.parametrize("h", [[], [1.0, 0.0], [1.0, -1.0]])
+@pytest.mark.parametrize("b", [[], [0.0], [0.0, 1e-3], [-2.0]])
+def test_program_without_variables_is_found_unless_a_row_contradicts_itself(solver, h, b):
+    rows = {"G": np.zeros((len(h), 0)), "h": np.array(h)} if h else {}
+    rows |= {"A": np.zeros((len(b), 0)), "b": np.array(b)} if b else {}
+    answer = lv.solve_qp(P=np.zeros((0, 0)), q=np.zeros(0), solver=solver, **rows)
+    is_solvable = min(h, default=0.0) >= 0.0 and not np.any(b)
+    assert answer.x.shape == (0,) and answer.found == is_solvable
+    assert answer.solution.status is (lv.Status.CONVERGED if is_solvable else lv.Status.INFEASIBLE)
