@@ -16,6 +16,7 @@ import lavender as lv
 from lavender import report, suite
 from lavender.report import cases, machine, runner, store, timing, workers
 from lavender.report.store import KEY, RUN_COLUMNS, make_lines, select_cases, select_runs, select_skips
+from lavender.report.sweeps import SweepStudy
 from lavender.report.timing import format_call
 
 QUICK = report.Plan(tolerances=(1e-3, 1e-8), budgets=(2, 5), repeats=2, time_limit=60.0, orders=("reverse",))
@@ -338,6 +339,55 @@ def test_run_sequence_carries_each_solvers_own_impulses():
     assert len(found) == 5 * 4
     # The load changes by a thousandth: from the second step on, carried impulses are far closer.
     assert by["carried", "budget", 4].relative < 0.2 * by["cold", "budget", 4].relative
+
+
+def record_warm_engine(folder, sweeps, first=30, steps=90):
+    """Record a stack of a planar engine with own warm sweeps from a step on; return its velocity errors.
+
+    The sweeps are written out: per contact the normal, then the tangent within mu times the new normal impulse.
+    """
+    n, dt, mu = 4, 1 / 60, 0.5
+    position, angle, velocity = np.array([(0.02 * i, i + 0.5) for i in range(n)]), np.zeros(n), np.zeros((n, 3))
+    cache, errors = {}, []
+    with lv.io.Recorder(folder, every=1, solver="own loop") as recorder:
+        for step in range(steps):
+            free = velocity + dt * np.array([0.0, -9.81, 0.0])
+            builder = lv.RowBuilder(np.ones(n), np.full(n, 6.0), free, dt, position, slop=0.002)
+            names = []
+            for i in range(n):
+                axis = np.array([np.cos(angle[i]), np.sin(angle[i])])
+                for corner, side in enumerate((-0.5, 0.5)):
+                    point = position[i] + side * axis - 0.5 * np.array([-axis[1], axis[0]])
+                    gap = point[1] - (position[i - 1][1] + 0.5 if i else 0.0)
+                    if gap < 0.02:
+                        builder.contact(i - 1, i, point=point, normal=(0.0, 1.0), mu=mu, gap=gap, feature=corner)
+                        names.append((i, corner))
+            problem = builder.problem()
+            A, b = problem.dense(), problem.b
+            impulse = np.concatenate([cache.get(name, (0.0, 0.0)) for name in names])
+            for _ in range(sweeps):
+                for k in range(0, len(b), 2):
+                    impulse[k] = max(0.0, impulse[k] - (A[k] @ impulse - b[k]) / A[k, k])
+                    t, bound = k + 1, mu * impulse[k]
+                    impulse[t] = np.clip(impulse[t] - (A[t] @ impulse - b[t]) / A[t, t], -bound, bound)
+            cache = dict(zip(names, impulse.reshape(-1, 2), strict=True))
+            velocity = builder.velocity_after(problem, impulse)
+            position, angle = position + dt * velocity[:, :2], angle + dt * velocity[:, 2]
+            if step >= first:
+                recorder.add(problem, impulse)
+                errors.append(lv.residual(problem, impulse).velocity)
+    return errors
+
+
+@pytest.mark.parametrize("sweeps", [6, 12])
+def test_run_recording_from_step_30_of_a_warm_engine_has_its_error_in_the_table(tmp_path, sweeps):
+    errors = record_warm_engine(tmp_path, sweeps)
+    plan = report.Plan(tolerances=(), budgets=(sweeps,), repeats=1)
+    lines = report.run(cases.resolve_sources([str(tmp_path)]), ["sequential_impulses"], plan)
+    study = SweepStudy(report.Report(lines), limit=1e-3)
+    # The report starts the second step from the engine's answer to the first; the sweeps are the same.
+    assert study.errors.loc["sequential_impulses", sweeps] == pytest.approx(max(errors[1:]), rel=1e-6)
+    assert study.cold.loc["sequential_impulses", sweeps] > 2.0 * max(errors[1:])
 
 
 def test_run_sequence_pass_ends_at_its_time_limit_with_a_note(tmp_path, monkeypatch):
