@@ -18,7 +18,7 @@ from lavender.base.errors import InputError, LavenderError
 from lavender.batch.data import Batch
 from lavender.batch.residuals import WorldResults, check_problems, convert_impulses_or_guesses, residual_many
 from lavender.judge.residuals import judge_impulse, residual
-from lavender.judge.solution import CONTRADICTED, Solution, Status, raise_if_interrupted
+from lavender.judge.solution import CONTRADICTED, Solution, Status, name_start, raise_if_interrupted
 from lavender.problem import Problem
 from lavender.problem.derived import cached_property
 from lavender.solvers.registry import SolverSpec, get
@@ -213,7 +213,8 @@ class Solutions(WorldResults, Sequence[Solution]):
         impulse.setflags(write=False)
         status = Status.TIME_LIMIT if late else Status.CONVERGED
         rest = self._make_postponed_fields, (i, impulse, status)
-        return Solution.with_late_fields(impulse, status, self.tol, self._time_per_world, rest)
+        solution = Solution.with_late_fields(impulse, status, self.tol, self._time_per_world, rest)
+        return solution.with_fields(start=name_start(self.problems[i], self.get_start(i)))
 
     def _make_postponed_fields(self, i: int, impulse: FloatArray, status: Status) -> dict[str, Any]:
         """Compute the fields of a solution that are computed only at its first access."""

@@ -104,8 +104,9 @@ def check(
                 item.problem, solvers=solvers, reference=reference, tol=tol, time_limit=time_limit
             )
             stored = item.judge_stored_answer(precision, threshold)
-            show(item.name, style="bold")
-            show(comparison.description)
+            if item.name != item.problem.name:  # The description begins with the problem's own name.
+                show(item.name, style="bold")
+            show(comparison.description, style="bold" if item.name == item.problem.name else "")
             if comparison.reference is None and comparison.reference_note != reason:
                 reason = comparison.reference_note  # Problems that follow usually have the same.
                 show(f"no reference: {reason}")

@@ -266,6 +266,8 @@ class Solution:
         Requested velocity error; None if the solve was to reach a relative residual.
     program_error : float or None, -
         Error of a quadratic program that `solve_qp` solved, to which `tol` and `success` then refer.
+    start : str
+        Start of the solve: "the given impulses", "problem.guess", or "" for zero impulses.
 
     Examples
     --------
@@ -298,6 +300,7 @@ class Solution:
     stages: tuple[SolverStage, ...]
     velocity_tol: float | None = None
     program_error: float | None = None
+    start: str = ""
 
     @classmethod
     def from_fields(cls, values: dict[str, Any]) -> Solution:
@@ -452,7 +455,8 @@ class Solution:
         done = ", ".join(
             format_work_count(n, k) for k, n in (self.work or {"iterations": self.iterations}).items()
         )
-        return f"{done}, order {self.solver.order}" if self.solver.order else done
+        order = f", order {self.solver.order}" if self.solver.order else ""
+        return f"{done}{order}, from {self.start}" if self.start else f"{done}{order}"
 
     @property
     def _time_text(self) -> str:
@@ -468,6 +472,13 @@ class Solution:
             f"{self.solver.name}: {self.status.name}, {judged}, {self._work_text}, "
             f"{self._time_text}{note}{wrong}"
         )
+
+
+def name_start(problem: Any, impulse: Any) -> str:
+    """Return the name of the start of a solve with the argument `impulse`, a value of `Solution.start`."""
+    if impulse is not None and impulse is not problem.guess:
+        return "the given impulses"
+    return "" if problem.guess is None else "problem.guess"
 
 
 def get_order_name(order: Any) -> str:
@@ -505,7 +516,7 @@ def raise_if_interrupted(solution: Solution) -> Solution:
 
 
 for _field in fields(Solution):
-    if _field.name not in ("velocity_tol", "program_error"):
+    if _field.name not in ("velocity_tol", "program_error", "start"):
         setattr(Solution, _field.name, late_field(_field.name))
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import Deadline
 from lavender.judge.residuals import get_zero_impulse_reference, make_residual
-from lavender.judge.solution import CONVERGED, TIME_LIMIT, Claim, Solution, Status
+from lavender.judge.solution import CONVERGED, TIME_LIMIT, Claim, Solution, Status, name_start
 from lavender.problem import Problem
 from lavender.solvers.decisions import DECISIONS, SMALL_ROWS
 from lavender.solvers.registry import SolverSpec
@@ -57,10 +57,8 @@ def solve_small(
     judged.impulse.setflags(write=False)
     start = start if start is None or impulse is None else start.copy()
     rest = compute_postponed_fields, (problem, spec, judged, counts, start, TIME_LIMIT)
-    return (
-        Solution.with_late_fields(judged.impulse, TIME_LIMIT, tol, perf_counter() - begin, rest),
-        None,
-    )
+    solution = Solution.with_late_fields(judged.impulse, TIME_LIMIT, tol, perf_counter() - begin, rest)
+    return solution.with_fields(start=name_start(problem, impulse)), None
 
 
 def compute_postponed_fields(
@@ -83,6 +81,6 @@ def compute_postponed_fields(
 bind_types(
     (
         Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, perf_counter,
-        get_zero_impulse_reference, solve_new_generalized_problem,
+        get_zero_impulse_reference, solve_new_generalized_problem, name_start,
     )
 )  # fmt: skip

@@ -44,6 +44,7 @@ from lavender.judge.solution import (
     TIME_LIMIT,
     Claim,
     Solution,
+    name_start,
     sum_work_counts,
 )
 from lavender.problem import Problem, check_problem
@@ -307,7 +308,9 @@ class Prepared:
             if self.spec.delegates:
                 setup.state.failed_call = arguments.failed_call
                 setup.state.loop = loop if arguments.history else None
-        return self._run(loop, setup, arguments.max_iter, has_default_start)
+        solution = self._run(loop, setup, arguments.max_iter, has_default_start)
+        name = name_start(problem, arguments.impulse)
+        return solution.with_fields(start=name) if name else solution
 
     # -- set-up ----------------------------------------------------------------------------------
 

@@ -439,15 +439,15 @@ cdef class Small:
 cdef double MIN_LONG_LIMIT = 0.1
 cdef tuple NO_CALL = (None, None, None, None), LAWS_OF_ROWS = ("linear", "lcp")
 cdef object Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, read_clock, get_zero_impulse_reference
-cdef object solve_new_generalized_problem
+cdef object solve_new_generalized_problem, name_start
 
 
 def bind_types(types):
     """Set the classes and functions that `solve_compiled` needs; this package does not import them."""
     global Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, read_clock, get_zero_impulse_reference
-    global solve_new_generalized_problem
+    global solve_new_generalized_problem, name_start
     (Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, read_clock, get_zero_impulse_reference,
-     solve_new_generalized_problem) = types
+     solve_new_generalized_problem, name_start) = types
 
 
 cdef bint is_plain_start(impulse, Py_ssize_t m) noexcept:
@@ -501,11 +501,14 @@ def solve_compiled(problem, spec, impulse, tol, deadline=None):
         judged, counts = small.solve_and_judge(problem, first, tol, deadline)
     if judged is not None and (<Judged>judged).relative <= <double>tol and (<Judged>judged).roundoff_floor <= <double>tol:
         kept = first if first is None or impulse is None else first.copy()      # The caller may change the array later.
-        solution = make_instance(Solution, {
+        fields = {
             "impulse": (<Judged>judged).impulse, "status": CONVERGED, "tol": tol, "setup_time": 0.0,
             "solve_time": read_clock() - began, "_late_residual": (make_residual, (problem, judged)),
             "_rest": (compute_postponed_fields, (problem, spec, judged, counts, kept, CONVERGED)),
-        })
+        }
+        if first is not None:
+            fields["start"] = name_start(problem, impulse)
+        solution = make_instance(Solution, fields)
     return solution, judged, counts, first
 
 

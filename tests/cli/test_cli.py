@@ -276,6 +276,11 @@ def test_solve_json_has_the_judged_result(lavender, path):
     assert result["rows"] == problem.m and result["worst_row"] == judged.worst_name
 
 
+def test_check_names_each_case_once(lavender):
+    code, printed, _ = lavender("check", "stack(n=4)", "toy_stack", "--solvers", "pgs")
+    assert code == 0 and printed.count("stack(n=4)") == 1 and printed.count("toy_stack") == 1
+
+
 def test_check_json_is_the_only_output(lavender, path):
     code, out, _ = lavender("check", path, path, "--solvers", "newton", "pgs", "--json")
     entries = json.loads(out, parse_constant=reject_constant)
