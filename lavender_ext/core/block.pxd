@@ -50,6 +50,25 @@ cdef inline double project_normal_update(double lam, double w, double step) noex
     return 0.0 if y < 0.0 else y
 
 
+cdef inline void project_to_disk(double* x, double* y, double radius) noexcept nogil:
+    """Project (x, y) radially to the disk; squares are compared, so that a sticking contact needs no square root."""
+    cdef double square = x[0] * x[0] + y[0] * y[0], scale
+    if square > radius * radius:
+        scale = radius / sqrt(square)
+        x[0] = x[0] * scale
+        y[0] = y[0] * scale
+
+
+cdef inline void project_tangent_update(double* lam, const double* w, double step, double friction_bound, int32_t n) noexcept nogil:
+    """Update the impulses lam of n = 1 or 2 tangent rows with slacks w by (3); both rows have the step 1 / lambda_max."""
+    lam[0] = lam[0] - w[0] * step
+    if n == 1:
+        lam[0] = clip(lam[0], -friction_bound, friction_bound)
+        return
+    lam[1] = lam[1] - w[1] * step
+    project_to_disk(lam, lam + 1, friction_bound)
+
+
 cdef inline double compute_row_error(double lam, double w, double d, double low, double high) noexcept nogil:
     """Return the error (5) of one row, computed as clip(w / d, lam - high, lam - low).
 

@@ -3,10 +3,9 @@
 `number_t` is a double, or a pair (core/pair.pxd) that holds the same quantity of two blocks. Both have the same operations in the
 same order, so that a block gets the same bits alone and in a pair.
 """
-from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport clip
+from lavender_ext.core.block cimport clip, project_to_disk
 from lavender_ext.core.pair cimport LANES, all_within, any_outside, broadcast, clip_at_zero, clip_pair, pair_t
 
 
@@ -54,20 +53,13 @@ cdef inline number_t clip_to_bound(number_t x, number_t bound) noexcept nogil:
 
 
 cdef inline void project_disk(number_t* x, number_t* y, number_t radius) noexcept nogil:
-    """Project (x, y) radially to the disk; squares are compared, so that a sticking contact needs no square root."""
-    cdef number_t square = x[0] * x[0] + y[0] * y[0]
-    cdef double scale
+    """Project (x, y) radially to the disk; a pair whose disks both hold their point needs no square root."""
     cdef int32_t k
     if number_t is double:
-        if square > radius * radius:
-            scale = radius / sqrt(square)
-            x[0] = x[0] * scale
-            y[0] = y[0] * scale
-    else:
-        if all_within(square, radius * radius):
-            return
+        project_to_disk(x, y, radius)
+    elif not all_within(x[0] * x[0] + y[0] * y[0], radius * radius):
         for k in range(LANES):
-            project_disk(<double*>x + k, <double*>y + k, (<double*>&radius)[k])
+            project_to_disk(<double*>x + k, <double*>y + k, (<double*>&radius)[k])
 
 
 cdef inline void compute_relative_angular_velocity(const number_t* va, const number_t* vb, int32_t body_a, int32_t body_b,

@@ -9,11 +9,10 @@ their own (core/contact.pxd). This module contains nothing else, because gcc the
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport clip, project_normal_update, project_row_update
+from lavender_ext.core.block cimport clip, project_normal_update, project_row_update, project_tangent_update
 from lavender_ext.core.block_types cimport blocks_t, friction_components_t, get_friction_components, has_independent_rows
 from lavender_ext.core.contact cimport relax_bodies_block
 from lavender_ext.core.csr cimport csr_row_dot
-from lavender_ext.core.numbers cimport project_disk
 from lavender_ext.core.row_forms cimport (damped_csr_t, find_panel, row_form_t, compute_row_slack, get_row_step,
                                           set_row_impulse, stored_slack_t)
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t
@@ -30,16 +29,6 @@ ctypedef fused form_t:
     stored_slack_t
     generalized_t
     rows_t
-
-
-cdef inline void project_tangent_update(double* lam, const double* w, double step, double friction_bound, int32_t n) noexcept nogil:
-    """Update the impulses lam of n tangent rows with slacks w by (3); both rows have the same scalar step."""
-    lam[0] = lam[0] - w[0] * step
-    if n == 1:
-        lam[0] = clip(lam[0], -friction_bound, friction_bound)
-        return
-    lam[1] = lam[1] - w[1] * step
-    project_disk(lam, lam + 1, friction_bound)
 
 
 cdef inline void relax_rows_block(const blocks_t* p, const row_form_t* form, int32_t i, double* lam, double* v) noexcept nogil:

@@ -4,6 +4,8 @@ import importlib.util
 import os
 import re
 import shutil
+import subprocess
+import sys
 from importlib import metadata
 from pathlib import Path
 
@@ -70,6 +72,52 @@ def test_meets_the_contract_of_every_solver(environment):
     met, total = re.search(r"^apgd meets (\d+) of (\d+) requirements$", report, re.M).groups()
     assert met == total and int(met) == 7  # each requirement of a resumable solver without orders and seeds
     assert "orders_change_the_sweep" in report.splitlines()[-1]
+
+
+COMPILED = FOLDER / "compiled"
+
+
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory):
+    """Variables of a process that finds the plug-in in Cython, built by pip in an environment of its own."""
+    clone = tmp_path_factory.mktemp("clone")
+    source = clone / "examples" / "plugin" / "compiled"
+    shutil.copytree(COMPILED, source, ignore=shutil.ignore_patterns("build", "*.egg-info", "*.c"))
+    headers = ROOT / "lavender_ext"
+    for path in [*headers.rglob("*.pxd"), *headers.rglob("__init__.py")]:
+        copy = clone / path.relative_to(ROOT)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(path, copy)
+    pip = [sys.executable, "-m", "pip", "install", "--no-deps", "--target", clone / "installed", source]
+    done = subprocess.run(pip, capture_output=True, text=True, timeout=600)
+    if done.returncode and re.search(r"No matching distribution found for (setuptools|cython)", done.stdout + done.stderr):
+        pytest.skip("no package index: setuptools and Cython of the build cannot be installed")
+    assert done.returncode == 0, done.stdout + done.stderr
+    paths = [str(clone / "installed"), str(ROOT), os.environ.get("PYTHONPATH", "")]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))}
+
+
+SWEEPS = """
+import numpy as np
+import lavender as lv
+from lavender import suite
+
+simulation = lv.Simulation(lv.Scene("card_house"))
+for _ in range(10):
+    simulation.step()
+for problem in (simulation.constraint_problem(), suite.case("boxed_friction(n=2)").problem):
+    # The first sweep of both is forwards. Impulses of 1e-3 N s and the rounding of a few additions.
+    one, two = (lv.solve(problem, name, tol=0.0, max_iter=1).impulse for name in ("sgs", "pgs"))
+    assert abs(two).max() > 1e-3
+    np.testing.assert_allclose(one, two, rtol=0.0, atol=1e-12)
+"""
+
+
+def test_plugin_in_cython_is_built_in_isolation_and_meets_the_contract(compiled):
+    python("-c", SWEEPS, env=compiled)
+    report = python("-m", "lavender", "contract", "sgs", env=compiled).stdout
+    met, total = re.search(r"^sgs meets (\d+) of (\d+) requirements$", report, re.M).groups()
+    assert "NOT MET" not in report and met == total and int(met) == 7
 
 
 FAULTY = """
