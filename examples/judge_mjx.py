@@ -4,6 +4,7 @@ With elliptic cones pass `contacts=` too: (world, efc_address, dim, friction) wi
 In MJX all worlds have the same contacts.
 """
 
+import importlib.util
 import sys
 
 import numpy as np
@@ -36,6 +37,9 @@ def main():
     """Judge 64 worlds of a model with random velocities."""
     if len(sys.argv) != 2:
         sys.exit("usage: python examples/judge_mjx.py MODEL.xml")
+    for name, package in (("mujoco", "mujoco"), ("jax", "mujoco-mjx"), ("mujoco.mjx", "mujoco-mjx")):
+        if importlib.util.find_spec(name) is None:
+            sys.exit(f"{name} is not installed: pip install {package}")
     import mujoco
 
     model = mujoco.MjModel.from_xml_path(sys.argv[1])

@@ -3,6 +3,7 @@
 python examples/judge_mujoco_warp.py MODEL.xml
 """
 
+import importlib.util
 import sys
 
 import numpy as np
@@ -37,6 +38,9 @@ def main():
     """Judge 64 worlds of a model with random velocities."""
     if len(sys.argv) != 2:
         sys.exit("usage: python examples/judge_mujoco_warp.py MODEL.xml")
+    for name, package in (("mujoco", "mujoco"), ("mujoco_warp", "mujoco-warp")):
+        if importlib.util.find_spec(name) is None:
+            sys.exit(f"{name} is not installed: pip install {package}")
     import mujoco
 
     model = mujoco.MjModel.from_xml_path(sys.argv[1])

@@ -184,7 +184,7 @@ class Recorder:
             Results of `from_kamino`, `from_genesis`, `from_efc`, `from_mujoco_many` and `from_mujoco`.
         impulse : array, N s
             The engine's answer, unless `problems` contains it.
-        velocity : (n, 6) or (nv,), m/s, rad/s, optional
+        velocity : (n, 6), planar (n, 3) or (nv,), m/s, rad/s, optional
             Velocities after the engine's solve, in place of the impulses of a single problem, which `reconstruct`
             computes. Its line has `reconstructed` and `left_over`, the largest velocity that no impulse explains.
         seconds : float, s, optional

@@ -15,12 +15,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lavender.base.arrays import ArrayLike, FloatArray, as_array
+from lavender.base.arrays import ArrayLike, FloatArray, as_array, get_shape
 from lavender.base.errors import CapabilityError
 from lavender.problem import Problem, check_problem
 from lavender.solving.solve import solve
 from lavender_ext.core.problem import multiply_body_jacobian
 
+PLANAR_COLUMNS = [0, 1, 5]  # v_x, v_y and omega of a body in the plane.
 RECONSTRUCTION_TOL = 1e-10  # [-] Relative residual of (1): far below the errors of engines.
 
 
@@ -45,7 +46,7 @@ def reconstruct(problem: Problem, velocity: ArrayLike) -> Reconstruction:
     ----------
     problem : Problem
         Problem of the step, by bodies or J and M, with v* after forces and before constraint impulses.
-    velocity : (n, 6) or (nv,), m/s, rad/s
+    velocity : (n, 6), planar (n, 3) or (nv,), m/s, rad/s
         v+, the engine's velocity after its solve.
 
     Returns
@@ -67,7 +68,12 @@ def reconstruct(problem: Problem, velocity: ArrayLike) -> Reconstruction:
             "this problem was given as a matrix; velocities need J and M: make it with Problem.from_rows, "
             "RowBuilder or Problem.from_jacobian"
         )
-    change = as_array("velocity", velocity, form.v_free.shape, unit="m/s, rad/s") - form.v_free
+    shape = form.v_free.shape
+    if problem.generalized is None and get_shape("velocity", velocity) == (shape[0], 3):
+        planar = as_array("velocity", velocity, (shape[0], 3), unit="m/s, rad/s")
+        velocity = np.zeros(shape)
+        velocity[:, PLANAR_COLUMNS] = planar
+    change = as_array("velocity", velocity, shape, unit="m/s, rad/s") - form.v_free
     if problem.generalized is not None:
         b = problem.generalized.velocity_of(change)
     else:

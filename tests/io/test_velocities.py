@@ -37,6 +37,23 @@ def test_reconstruct_is_the_projection_of_the_motion_on_the_cone():
         assert found.left_over == pytest.approx(np.abs(left).max(), abs=1e-8)
 
 
+def test_reconstruct_reads_planar_velocities():
+    free = [(0.0, -1.0, 0.0), (1.0, -0.5, 0.2)]
+    builder = lv.RowBuilder([1.0, 2.0], [6.0, 6.0], free, 0.01, [(0.0, 0.5), (0.0, 1.5)])
+    for a, b, y in ((-1, 0, 0.0), (0, 1, 1.0)):
+        for x in (-0.5, 0.5):
+            builder.contact(a, b, (x, y), (0.0, 1.0), mu=0.5)
+    problem = builder.problem()
+    velocity = problem.velocity(lv.solve(problem, tol=1e-10).impulse)
+    planar = velocity[:, [0, 1, 5]]
+    assert np.abs(planar).max() > 0.1
+    for known in (velocity, planar):
+        found = lv.io.reconstruct(problem, known)
+        np.testing.assert_allclose(problem.velocity(found.impulse), velocity, atol=1e-8)
+    with pytest.raises(lv.InputError, match="velocity"):
+        lv.io.reconstruct(problem, planar[:1])
+
+
 def test_reconstruct_rejects_wrong_input():
     problem = lv.Problem.from_jacobian(np.eye(2), np.eye(2), [0.0, 0.0], cones=lv.Cones.free(2))
     with pytest.raises(lv.InputError, match="velocity"):

@@ -92,11 +92,40 @@ def test_python_of_a_page_runs(page, files, capsys):
             pytest.importorskip(engine, reason=f"the page steps {engine}")
     names = {"np": np, "lv": lv}
     for line, kind, text in blocks(page, "python", "pycon"):
+        if STEPPED_ENGINE.search(text):
+            continue  # The next test runs it, if its engine is installed.
         where = f"{page.name}:{line}"
         if kind == "pycon":
             run_session(text, names, where)
         else:
             exec(compile("\n" * (line - 1) + text, str(page), "exec"), names)
+
+
+STEPPED_ENGINE = re.compile(r"^import (pybullet|pymunk|Box2D)$", re.MULTILINE)
+ITERATIONS = {
+    "pybullet": "numSolverIterations=",
+    "pymunk": "space.iterations = (0.0, -9.81), ",
+    "Box2D": "world.Step(dt, ",
+}
+
+
+@pytest.mark.parametrize("engine", list(ITERATIONS))
+def test_recording_of_an_engine_has_errors_that_its_iterations_remove(engine, tmp_path, monkeypatch):
+    """Direction of the normal, positions, v* and position correction are right: a wrong one leaves an error."""
+    pytest.importorskip(engine)
+    monkeypatch.chdir(tmp_path)
+    texts = [text for *_, text in blocks(ROOT / "docs" / "engines.md", "python") if f"import {engine}\n" in text]
+    assert len(texts) == 1 and f"{ITERATIONS[engine]}10" in texts[0]
+    errors, left_over = [], []
+    for n in (10, 500):
+        text = texts[0].replace(f"{ITERATIONS[engine]}10", f"{ITERATIONS[engine]}{n}").replace("-steps", f"-{n}")
+        exec(compile(text, "engines.md", "exec"), {})
+        lines = (tmp_path / f"{engine.lower()}-{n}" / "engine.jsonl").read_text().splitlines()
+        assert len(lines) == 30
+        errors.append(np.median([json.loads(line)["velocity"] for line in lines]))
+        left_over += [json.loads(line)["left_over"] for line in lines]
+    assert errors[1] < 0.1 * errors[0], errors
+    assert np.median(left_over) < 1e-3 * errors[0]  # pymunk's friction exceeds the cone in few steps.
 
 
 def test_the_test_of_the_page_on_plug_ins_passes_as_a_file_of_its_own(tmp_path):

@@ -2,8 +2,9 @@
 
 from dataclasses import dataclass
 
-import lavender as lv
 from lavender_sgs_kernel import sweep
+
+import lavender as lv
 
 CHECK_EVERY = 10  # sweeps between two residuals, counted from the first sweep of the state
 
@@ -34,9 +35,9 @@ class SymmetricGaussSeidel:
         """Run n more sweeps on `impulse` in place, fewer only if the residual meets tol."""
         done = 0
         while done < n:
-            if tol > 0.0 and state.done % CHECK_EVERY == 0:
-                if lv.residual(state.problem, impulse).relative <= tol:
-                    return lv.Claim(lv.Status.CONVERGED, done, {"sweeps": done})
+            checks = tol > 0.0 and state.done % CHECK_EVERY == 0
+            if checks and lv.residual(state.problem, impulse).relative <= tol:
+                return lv.Claim(lv.Status.CONVERGED, done, {"sweeps": done})
             count = min(n - done, CHECK_EVERY - state.done % CHECK_EVERY) if tol > 0.0 else n
             sweep(*state.data, impulse, state.done, count)
             state.done += count
