@@ -98,9 +98,7 @@ def print_table(console: Console, frame: pd.DataFrame, optional: Sequence[str] =
         grid = Table(box=None, pad_edge=False, header_style="bold")
         for head, cells in texts.items():
             if head in numbers:
-                lines = textwrap.wrap(
-                    head, max(map(len, ["x" * MIN_HEAD_WIDTH, *cells])), break_long_words=False
-                )
+                lines = textwrap.wrap(head, max(map(len, ["x" * MIN_HEAD_WIDTH, *cells])))
                 smallest = max(map(len, [*cells, *lines]))
                 grid.add_column(Text("\n".join(lines)), justify="right", no_wrap=True)
             else:
