@@ -296,6 +296,7 @@ class Report(Contents):
             *(["Error and robustness without times: runs end by iterations."] if self.is_campaign else []),
             *([f"Not measured to the end: {_join(self.unfinished)}."] if self.unfinished else []),
             *_limit("left out", [f"{cases}: {reason}" for cases, reason in list_cases_not_loaded(self)]),
+            *_limit("gains energy", list_energy_gains(self)),
             *_limit("suspicious", [f"{case}: {reason}" for case, reason in list_diagnostics(self)]),
         ]
 
@@ -711,6 +712,15 @@ def _limit(kind: str, texts: Sequence[str], most: int = 1) -> Iterator[str]:
             else f", the first of {len(texts)}"
         )
         yield f"{kind}{place}: {text}"
+
+
+def list_energy_gains(report: Report) -> list[str]:
+    """Return a sentence for each solver with impulses that add energy beyond the work of the targets."""
+    gains = report.frame[report.frame["energy_gain"] > 0.0]
+    worst = gains.loc[gains.groupby("solver", observed=True)["energy_gain"].idxmax()]
+    counts = gains["solver"].value_counts()
+    return [f"{r.solver} in {format_count(counts[r.solver], 'run')}, at most {r.energy_gain:.2g} J ({r.case})"
+            for r in worst.sort_values("energy_gain", ascending=False).itertuples()]  # fmt: skip
 
 
 def list_diagnostics(report: Report) -> list[tuple[str, str]]:

@@ -56,6 +56,7 @@ RUN_COLUMNS: Row = {
     "velocity": math.inf,
     "roundoff_floor": math.nan,
     "energy_change": math.nan,
+    "energy_gain": math.nan,
     "motion_error": math.nan,
     "worst_row": -1,
     "worst_name": "",

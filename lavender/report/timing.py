@@ -40,6 +40,7 @@ from lavender.solving.solve import solve
 DEFAULT_SEQUENCE_TIME_LIMIT = 5.0  # [s] Time limit of one pass over a sequence.
 UNLIMITED_ITERATIONS = 10_000_000  # Iteration limit of a run to a tolerance; the time limit ends it first.
 HANG_LIMIT = 60.0  # [s] Time limit of a solver of another package in a campaign.
+ENERGY_ROUNDING = 2.0**-48  # Rounding of a sum of products, divided by the sum of their sizes.
 LONG_TIME = 0.05  # [s] A call that took longer is not repeated: caches and the clock hardly affect its time.
 CLAIM_STATUSES = (Status.CONVERGED, Status.ROUNDOFF_LIMIT, Status.INFEASIBLE)
 # A run that missed its tolerance with one of these reaches no tighter tolerance either.
@@ -261,6 +262,19 @@ def _time_call(problem: Problem, task: Task, impulse: Any, limited: bool) -> tup
     return solution, elapsed
 
 
+def compute_energy_gain(problem: Problem, impulse: FloatArray, slack: FloatArray) -> float:
+    """Return the part [J] of the energy change beyond the work of the targets; 0 within its rounding.
+
+    With A lambda = w + b it is lambda.(w - b) / 2 - lambda.diag(compliance) lambda / 2, which is not positive at a
+    solution if the bounds of all rows contain 0, and NaN otherwise.
+    """
+    if (problem.cones.lower > 0.0).any() or (problem.cones.upper < 0.0).any():
+        return math.nan
+    gain = 0.5 * float(impulse @ (slack - problem.b - problem.compliance * impulse))
+    rounding = float(np.abs(impulse) @ (np.abs(slack) + 2.0 * np.abs(problem.b)))
+    return gain if gain > ENERGY_ROUNDING * rounding else 0.0
+
+
 def make_row(
     problem: Problem, task: Task, s: Solution, times: Sequence[float], calibration_time: float
 ) -> Row:
@@ -272,8 +286,10 @@ def make_row(
     return task.make_row(
         times, status=s.status.name, relative=float(r.relative), error_energy=float(r.energy),
         velocity=float(r.velocity), roundoff_floor=float(r.roundoff_floor),
-        energy_change=problem.energy_change(s.impulse) if is_known else math.nan, worst_row=int(r.worst_row),
-        worst_name=r.worst_label, success=bool(s.success) and task.mode == "tol", claim_check=s.claim_check,
+        energy_change=problem.energy_change(s.impulse) if is_known else math.nan,
+        energy_gain=compute_energy_gain(problem, s.impulse, r.slack) if is_known else math.nan,
+        worst_row=int(r.worst_row), worst_name=r.worst_label,
+        success=bool(s.success) and task.mode == "tol", claim_check=s.claim_check,
         status_conflict="; ".join(filter(None, (s.status_conflict, observed))),
         claims=s.status in CLAIM_STATUSES, iterations=int(s.iterations),
         work=json.dumps({k: int(v) for k, v in s.work.items()}), form=s.solver.form, message=s.message[:500],

@@ -319,6 +319,26 @@ def test_read_infinite_and_undefined_numbers_are_kept_to_the_last_bit(tmp_path):
     assert (back.message, back.tol, back.max_iter, back.worst_name) == ("é\n", 0.1 + 0.2, 10_000_000, "a\\n")
 
 
+def test_run_marks_impulses_that_gain_energy():
+    problem = suite.case("box_stack(n=3)").problem
+    exact = lv.solve(problem, "direct").impulse
+    plan = report.Plan(tolerances=(1e-8,), budgets=(1,), repeats=1)
+    lines = report.run([problem.updated(guess=4.0 * exact)], ["pgs"], plan)
+    by = {(r.start, r.mode): r for r in rows_of(lines)}
+    answer = lv.solve(problem, "pgs", impulse=4.0 * exact, tol=0.0, max_iter=1).impulse
+    target = problem.b + problem.jacobian @ problem.rows.v_free.ravel()
+    # 1e-9 is far above the rounding of energies of a few joules.
+    expected = problem.energy_change(answer) - answer @ target
+    assert by["warm", "budget"].energy_gain == pytest.approx(expected, abs=1e-9) and expected > 0.01
+    assert by["cold", "budget"].energy_gain == by["cold", "tol"].energy_gain == by["warm", "tol"].energy_gain == 0.0
+    (warning,) = (text for text in report.Report(lines).warnings if text.startswith("gains energy"))
+    assert warning == f"gains energy: pgs in 1 run, at most {expected:.2g} J ({by['warm', 'budget'].case})"
+    driven = lv.Problem.from_jacobian(
+        np.eye(2), np.eye(2), [-1.0, -1.0], cones=lv.Cones.bounded([0.5, 0.0], [9.0, 9.0])
+    )
+    assert all(math.isnan(r.energy_gain) for r in rows_of(report.run([driven], ["pgs"], plan)))
+
+
 # -- sequences ---------------------------------------------------------------------------------------------
 
 
