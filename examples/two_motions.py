@@ -62,7 +62,7 @@ def main():
     for (solver, start), name in found["picks"].items():
         print(f"{solver:<20} from the impulse of {start!r}: {name}")
     cone = lv.solve(problem.relaxed("cone"), tol=1e-12)
-    print("cone law: one motion, tip at {:.2f}, {:.2f} m/s".format(*cone.slack))
+    print("cone law: one motion, tip at {:.2f}, {:.2f} m/s".format(*(cone.slack.round(2) + 0.0)))  # no -0.00
 
 
 if __name__ == "__main__":

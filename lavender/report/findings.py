@@ -726,14 +726,16 @@ def list_energy_gains(report: Report) -> list[str]:
 def list_diagnostics(report: Report) -> list[tuple[str, str]]:
     """Return (case, possible mistake in its data) for all cases.
 
-    Equal diagnostics of a sequence are one entry, with its first step and the number of further steps.
+    Equal diagnostics of a sequence are one entry, with its first step and its number of steps.
     """
     table = report.cases[["case", "sequence", "diagnostics"]].explode("diagnostics").dropna()
     table["diagnostics"] = table["diagnostics"].map(lambda text: escape_unprintable(str(text)))
     place = table["sequence"].where(table["sequence"] != "", table["case"])
     found, kind = [], table["diagnostics"].map(lambda text: text.partition(":")[0])
-    for _, same in table.groupby([place, kind], sort=False):
-        more = f" and {format_count(len(same) - 1, 'more step')}" if len(same) > 1 else ""
+    steps = report.cases["sequence"].value_counts()
+    for (name, _), same in table.groupby([place, kind], sort=False):
+        n = same["case"].nunique()
+        more = f", {n} of {format_count(steps[name], 'step')}" if n > 1 else ""
         found.append((f"{same['case'].iloc[0]}{more}", str(same["diagnostics"].iloc[0])))
     return found
 

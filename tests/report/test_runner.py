@@ -410,6 +410,18 @@ def test_run_recording_from_step_30_of_a_warm_engine_has_its_error_in_the_table(
     assert study.cold.loc["sequential_impulses", sweeps] > 2.0 * max(errors[1:])
 
 
+def test_run_sequence_names_a_suspicious_step_with_the_number_of_such_steps():
+    cones, eye = lv.Cones.contacts(0.5), np.eye(3)
+    problems = [
+        lv.Problem.from_jacobian(eye, eye, [-1.0, 0.0, 0.0], cones=cones, target=[speed, 0.0, 0.0])
+        for speed in (0.0, 100.0, 0.0, 200.0)
+    ]
+    plan = report.Plan(tolerances=(), budgets=(2,), repeats=1)
+    found = report.Report(report.run(report.make_sequence(problems, "load"), ["pgs"], plan)).warnings
+    (text,) = (text for text in found if text.startswith("suspicious"))
+    assert text.startswith("suspicious: load[1], 2 of 4 steps: targets: 1 contacts have targets up to 100 m/s")
+
+
 def test_run_sequence_pass_ends_at_its_time_limit_with_a_note(tmp_path, monkeypatch):
     items = report.make_sequence(moving_stack(5), "load")
     # No solve takes less than a picosecond: each pass ends after its first step.
