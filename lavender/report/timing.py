@@ -270,7 +270,8 @@ def compute_energy_gain(problem: Problem, impulse: FloatArray, slack: FloatArray
     """
     if (problem.cones.lower > 0.0).any() or (problem.cones.upper < 0.0).any():
         return math.nan
-    gain = 0.5 * float(impulse @ (slack - problem.b - problem.compliance * impulse))
+    soft = 0.0 if problem.compliance is None else problem.compliance * impulse
+    gain = 0.5 * float(impulse @ (slack - problem.b - soft))
     rounding = float(np.abs(impulse) @ (np.abs(slack) + 2.0 * np.abs(problem.b)))
     return gain if gain > ENERGY_ROUNDING * rounding else 0.0
 
