@@ -53,7 +53,7 @@ cdef inline number_t clip_to_bound(number_t x, number_t bound) noexcept nogil:
 
 
 cdef inline void project_disk(number_t* x, number_t* y, number_t radius) noexcept nogil:
-    """Project (x, y) radially to the disk; a pair whose disks both hold their point needs no square root."""
+    """Project (x, y) radially to the disk. A pair needs no square root if both points are inside."""
     cdef int32_t k
     if number_t is double:
         project_to_disk(x, y, radius)

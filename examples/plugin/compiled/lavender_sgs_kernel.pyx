@@ -48,7 +48,7 @@ cdef void relax_block(const blocks_t* p, const matrix_t* a, int32_t i, double* l
         return
     # normal
     lam[first] = project_normal_update(lam[first], compute_slack(a, p.b, first, lam), 1.0 / p.d[first])
-    # friction components, with the step 1 / lambda_max of their part of A, whose diagonal may be 0
+    # friction components, with the step 1 / lambda_max of their part of A; its diagonal may be 0
     get_friction_components(p, i, &q)
     for g in range(q.n):
         row = first + q.first[g]
