@@ -93,7 +93,13 @@ def test_report_write_has_files_of_every_table_figure_and_run(written):
     kinds = {kind: {p.stem for p in (out / "figures").glob(f"*.{kind}")} for kind in drawing.FILE_KINDS}
     assert all(names == {"time-to-accuracy", "profile", "error-against-time"} for names in kinds.values())
     for figure in (out / "figures").glob("*.svg"):
-        assert ElementTree.parse(figure).getroot().tag.endswith("svg")
+        root = ElementTree.parse(figure).getroot()
+        assert root.tag.endswith("svg")
+        # The page's own background is behind a figure, also a dark one; a PNG is pasted elsewhere.
+        background = next(x for x in root.iter() if x.get("id", "").endswith("patch_1"))
+        assert "fill: none" in background[0].get("style")
+        corner = pytest.importorskip("matplotlib.image").imread(figure.with_suffix(".png"))[0, 0]
+        assert (corner == 1.0).all()
     assert (out / "figures" / "profile.pdf").read_bytes().startswith(b"%PDF")
     latex = (out / "tables" / "solvers.tex").read_text(encoding="utf-8")
     assert r"\toprule" in latex and "nan" not in latex.lower()
