@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
     from lavender.audit.page import ResultPage
-    from lavender.report import Event, Item, Plan
+    from lavender.report import Event, Plan
 
 
 PROGRESS_INTERVAL = 10.0  # [s] Time between two lines of progress if the output is not a terminal.
@@ -39,25 +39,6 @@ class Measured(NamedTuple):
     lines: DataFrame
     stopped: bool  # Whether Ctrl-C ended the measurement.
     reuse_note: str = ""  # Sentence on the number of reused runs; empty if this call measured all of them.
-
-
-def check_named_problems_load(items: Sequence[Item]) -> None:
-    """Load each named problem and release its memory.
-
-    Raises
-    ------
-    InputError
-        A problem does not load. Nothing has been measured and no page changed.
-    """
-    from lavender.report.runner import describe_load_error
-
-    for item in items:
-        if item.named:
-            try:
-                _ = item.problem
-            except Exception as error:
-                raise InputError(describe_load_error(item.source, error)) from None
-            item.release_problem()
 
 
 def is_campaign(context: click.Context) -> bool:
@@ -75,7 +56,7 @@ def measure_files(
     Raises
     ------
     InputError
-        A named file does not load, or the folder cannot be written or is in use by another process.
+        The folder cannot be written or is in use by another process.
     """
     from lavender import report
     from lavender.report.store import get_key, make_lines, select_machines
@@ -101,7 +82,6 @@ def measure_files(
                 "--sweeps needs recorded steps in sequence: a folder that lv.io.Recorder(every=1), `lavender record` "
                 "or `lavender run --record` wrote, or --sequence for any folder of consecutive steps"
             )
-        check_named_problems_load(items)
         before = {name: machine["started"] for name, machine in select_machines(store.lines).items()}
         rows: list[dict[str, Any]] = []
 

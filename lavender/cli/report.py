@@ -79,13 +79,14 @@ def report(
 
     Every solver runs on every case, to each tolerance and with each budget.
 
-    FILES are problems (.npz, .hdf5), folders of them, folders of recorded steps, or cases of the built-in suite such as
-    "stack(n=64)"; without any, the built-in suite runs. A MuJoCo model (.xml, .mjb) is simulated, and its steps are
-    recorded in the folder of the report. For a records.jsonl, the report is written again without solving; --solvers
-    then selects the solvers that it shows. After an interruption, the same command continues where it stopped.
+    FILES are problems or quadratic programs (.npz, .hdf5), folders of them, folders of recorded steps, or cases of the
+    built-in suite such as "stack(n=64)"; without any, the built-in suite runs. A MuJoCo model (.xml, .mjb) is
+    simulated, and its steps are recorded in the folder of the report. For a records.jsonl, the report is written again
+    without solving; --solvers then selects the solvers that it shows. After an interruption, the same command continues
+    where it stopped.
 
-    Exit code 1: a file in a folder cannot be read, a step could not be recorded, or nothing was measured. Exit code 2:
-    a named file cannot be read, or another report is writing to the folder.
+    Exit code 1: a file cannot be read (the others are reported), a step could not be recorded, or nothing was measured.
+    Exit code 2: a file does not exist, or another report is writing to the folder.
     """
     reject_options_without_effect(context, is_list=listed)
     if listed:
@@ -151,7 +152,7 @@ def report(
         raise click.exceptions.Exit(EXIT_UNMET)
     if (n_left_out := sum(map(len, shown.left_out.values()))) and not records_files:
         print_escaped(
-            f"{format_count(n_left_out, 'case')} of a folder left out of all numbers",
+            f"{format_count(n_left_out, 'case')} left out of all numbers",
             style="yellow",
         )
         raise click.exceptions.Exit(EXIT_UNMET)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,13 +42,13 @@ SAVED_RESIDUAL_FIELDS = ("error", "relative", "energy", "velocity", "roundoff_fl
 def solve(file: str, solver: str, tol: float, output: Path | None, as_json: bool, **options: Any) -> None:
     """Solve one problem and print the judged result.
 
-    FILE is a file or a case of the suite. Exit code 0: the judge accepts the result (within --tol or --velocity-tol, or
-    at the floor of float64; with --tol 0 always). 1: the judge rejects it. 3: the problem is
-    infeasible, with a certificate that the judge confirms.
+    FILE is a file or a case of the suite. A quadratic program is solved by `lavender.solve_qp`; x, its multipliers y, z
+    and z_box and its error take the place of impulse, slack and residual. Exit code 0: the judge accepts the result
+    (within --tol or --velocity-tol, or at the floor of float64; with --tol 0 always). 1: the judge rejects it. 3: the
+    problem is infeasible, with a certificate that the judge confirms.
     """
     from lavender import report
-    from lavender.judge.residuals import WRONG
-    from lavender.solving.solve import solve as solve_problem
+    from lavender.report.case_kinds import make_case
 
     limit_to_one_thread()
     if output is not None:
@@ -58,17 +59,23 @@ def solve(file: str, solver: str, tol: float, output: Path | None, as_json: bool
     if output is not None and output.exists() and Path(item.source).exists() and output.samefile(item.source):
         raise InputError(f"--output {output} would overwrite the problem: give another file")
     options = {name: value for name, value in options.items() if value is not None}
-    solution = solve_problem(item.problem, solver, tol=tol, **options)
+    case = make_case(item.problem)
+    if "velocity_tol" in options and item.problem.qp is not None:
+        raise InputError(
+            f"{file} is a quadratic program, which has no velocities: give --tol, its largest error"
+        )
+    solution = case.solve(solver, tol=tol, **options)
     if output is not None:
-        results = {name: getattr(solution, name) for name in SAVED_FIELDS}
-        results |= {name: getattr(solution.residual, name) for name in SAVED_RESIDUAL_FIELDS}
-        results |= {"status": solution.status.name, "solver": solution.solver.name}
-        write_arrays(output, results)
+        results = _collect_results(item.problem, solution, SAVED_RESIDUAL_FIELDS)
+        write_arrays(output, results | {"status": solution.status.name, "solver": solution.solver.name})
     if as_json:
         click.echo(format_json(_describe_solution(item.name, item.problem, solution), indent=1))
     else:
         start = "zero impulses" if item.problem.guess is None else "the stored impulses"
-        print_escaped(f"{item.name}: {item.problem.law}, {item.problem.m} rows, starts from {start}")
+        kind = f"{item.problem.law}, {item.problem.m} rows, starts from {start}"
+        if (qp := item.problem.qp) is not None:
+            kind = f"quadratic program, {len(qp.q)} variables, {len(qp.target)} rows"
+        print_escaped(f"{item.name}: {kind}")
         print_escaped(str(solution))
         if output is not None:
             print_escaped(f"written: {output}")
@@ -76,24 +83,32 @@ def solve(file: str, solver: str, tol: float, output: Path | None, as_json: bool
         raise click.exceptions.Exit(EXIT_INTERRUPTED)
     if solution.status.name == "INFEASIBLE" and solution.claim_check == "confirmed":
         raise click.exceptions.Exit(EXIT_INFEASIBLE)
-    judged = solution.residual
-    if judged.nothing_to_do and judged.verdict != WRONG:
-        if as_json:
-            return
-        size = f"{judged.velocity:.1e} {judged.velocity_unit}"
-        click.echo(f"nothing to do: the zero impulse is a solution; this result differs by {size}")
+    if errors := case.describe_zero(solution):
+        if not as_json:
+            click.echo(f"nothing to do: the zero impulse is a solution; this result differs by {errors}")
         return
-    if tol > 0.0 and not (solution.success or judged.at_floor):
+    if tol > 0.0 and not case.is_solved(solution):
         raise click.exceptions.Exit(EXIT_UNMET)
+
+
+def _collect_results(problem: Problem, solution: Solution, names: Sequence[str]) -> dict[str, Any]:
+    """Return the answer, its counts and times, and of its residual the fields `names`; of a program its error."""
+    results = {name: getattr(solution, name) for name in SAVED_FIELDS}
+    if problem.qp is None:
+        return results | {name: getattr(solution.residual, name) for name in names}
+    answer = problem.qp.solution(solution)
+    found = {name: getattr(answer, name) for name in ("x", "y", "z", "z_box", "error", "objective")}
+    del results["impulse"], results["slack"]
+    return results | {name: value for name, value in found.items() if value is not None}
 
 
 def _describe_solution(name: str, problem: Problem, solution: Solution) -> dict[str, Any]:
     """Return the contents of `--json`: the claim of the solver and the numbers of the judge."""
-    judged = solution.residual
+    judged = {} if problem.qp is not None else {
+        "verdict": solution.residual.verdict, "worst_row": solution.residual.worst_label,
+    }  # fmt: skip
     return {
-        "case": name, "law": problem.law, "rows": problem.m, "solver": solution.solver.name,
-        "status": solution.status.name, "success": solution.success, "verdict": judged.verdict,
-        **{name: getattr(judged, name) for name in ("relative", "energy", "velocity", "roundoff_floor")},
-        "worst_row": judged.worst_label,
-        **{name: getattr(solution, name) for name in SAVED_FIELDS},
+        "case": name, "law": problem.law if problem.qp is None else "program", "rows": problem.m,
+        "solver": solution.solver.name, "status": solution.status.name, "success": solution.success, **judged,
+        **_collect_results(problem, solution, ("relative", "energy", "velocity", "roundoff_floor")),
     }  # fmt: skip

@@ -1,6 +1,6 @@
 """Read and write problems in NumPy archives (.npz).
 
-Two formats are read: our own and the plain box format. `docs/formats.md` describes each entry.
+Our own format, quadratic programs and the plain box format are read. `docs/formats.md` describes each entry.
 """
 
 from __future__ import annotations
@@ -8,13 +8,13 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, as_array, check_int
+from lavender.base.arrays import FloatArray, as_array
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import issparse
 from lavender.base.lazy_import import sparse as sp
@@ -23,7 +23,7 @@ from lavender.io.stored import Arrays, read_arrays, write_arrays
 from lavender.problem import Problem, check_problem
 from lavender.problem.cones import Cones, get_block_kinds
 from lavender.problem.generalized import Generalized
-from lavender.problem.program import recover_program
+from lavender.problem.program import QuadraticProgram
 from lavender.problem.rows import Rows
 
 FORMAT_VERSION = 1
@@ -34,7 +34,8 @@ GENERALIZED = (
     "general_v_free",
 )
 CSR = ("A_data", "A_indices", "A_indptr", "A_shape")
-FORMS = ("dense", "csr", "rows", "generalized")
+FORMS = ("dense", "csr", "rows", "generalized", "program")
+PROGRAM = ("P", "q", "G", "h", "A", "b", "lb", "ub")
 MOTION = ("engine_change", "engine_compliance", "engine_momentum")
 
 
@@ -46,7 +47,7 @@ class Stored:
     ----------
     problem : Problem
     format : str
-        "lavender", "box", "fclib_local" or "fclib_global", the last two also with the suffix "_rolling".
+        "lavender", "program", "box", "fclib_local" or "fclib_global", the last two also with the suffix "_rolling".
     impulse : (m,) N s, optional
         Stored solution.
     slack : (m,) m/s, optional
@@ -81,12 +82,14 @@ def read_npz(path: str | os.PathLike[str]) -> Stored:
             return _read_own_format(archive)
         if {"b", "lo", "hi"} <= set(archive):
             return _read_box_format(archive, Path(path).stem)
+        if "q" in archive:
+            return Stored(_read_program(archive, name=Path(path).stem), "program")
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     has = ", ".join(archive) or "nothing"
     raise InputError(
         f"{path} holds the entries {has}; a problem has lavender_format (written by lavender.io.save), or "
-        "b, lo, hi and A"
+        "b, lo, hi and A, or q and P of a quadratic program"
     )
 
 
@@ -100,12 +103,18 @@ def write_npz(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = 
     written, too, so that `residual` judges what moved the bodies.
     """
     check_problem(problem)
-    arrays: dict[str, Any] = {"lavender_format": np.int64(FORMAT_VERSION), "b": problem.b}
-    arrays |= {name: getattr(problem.cones, name.removeprefix("cones_")) for name in CONES}
-    if problem.cones.has_rolling:
-        arrays["cones_rolling"] = problem.cones.rolling
-    rows, general = problem.rows, problem.generalized
-    if rows is not None:
+    arrays: dict[str, Any] = {"lavender_format": np.int64(FORMAT_VERSION)}
+    rows, general, qp = problem.rows, problem.generalized, problem.qp
+    if qp is None:
+        arrays |= {"b": problem.b} | {
+            name: getattr(problem.cones, name.removeprefix("cones_")) for name in CONES
+        }
+        if problem.cones.has_rolling:
+            arrays["cones_rolling"] = problem.cones.rolling
+    if qp is not None:
+        operator = "program"
+        arrays |= _list_program_entries(qp)
+    elif rows is not None:
         operator = "rows"
         arrays |= {name: getattr(rows, name.removeprefix("rows_")) for name in ROWS}
     elif general is not None:
@@ -134,10 +143,8 @@ def write_npz(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = 
     }
     if problem.precision != "float64":
         meta["precision"] = problem.precision
-    if general is not None:
+    if general is not None and qp is None:
         meta["dof_names"] = general.names
-    if problem.has_singular_program:
-        meta["program"] = len(problem.qp.q)
     motion = problem.__dict__.get("engine_motion")
     if motion is not None:
         if impulse is None or not np.array_equal(arrays["impulse"], motion.impulse):
@@ -161,13 +168,19 @@ def _read_own_format(archive: Arrays) -> Stored:
     for name in archive:
         if archive[name].dtype.kind not in "iuf":
             raise InputError(f"entry {name!r} has dtype {archive[name].dtype}; numbers are needed")
+    parts: dict[str, Any] = {name: archive[name] for name in ("guess", "key", "angular") if name in archive}
+    parts |= {name: meta[name] for name in ("friction", "names", "name", "precision") if name in meta}
+    if meta["operator"] in ("rows", "generalized") or (
+        meta["operator"] == "program" and "compliance" in archive
+    ):
+        parts["compliance"] = archive["compliance"]
+    if meta["operator"] == "program":
+        problem = _read_program(archive, **parts)
+        return Stored(problem, "lavender", impulse=_read_vector(archive, "impulse", problem))
     b, ptr = archive["b"], archive["cones_ptr"]
     # Check the number of rows before bounds of that length are allocated.
     if b.ndim != 1 or ptr.ndim != 1 or len(ptr) == 0 or ptr[-1] != len(b):
         raise InputError(f"b has shape {b.shape}; cones.ptr must end with the number of its rows")
-    parts: dict[str, Any] = {name: archive[name] for name in ("guess", "key", "angular") if name in archive}
-    if meta["operator"] in ("rows", "generalized"):
-        parts["compliance"] = archive["compliance"]
     if meta["operator"] == "rows":
         fields_of_rows: dict[str, Any] = {name.removeprefix("rows_"): archive[name] for name in ROWS}
         parts["rows"] = Rows(**fields_of_rows)
@@ -177,11 +190,7 @@ def _read_own_format(archive: Arrays) -> Stored:
         parts["matrix"] = _read_matrix(archive)
     entries = [*CONES, *(["cones_rolling"] if "cones_rolling" in archive else [])]
     cones = Cones(**{name.removeprefix("cones_"): archive[name] for name in entries})
-    parts |= {name: meta[name] for name in ("friction", "names", "name", "precision") if name in meta}
     problem = Problem(b, cones, **parts)
-    if "program" in meta:
-        n = check_int("program", meta["program"], high=problem.m)
-        problem = replace(problem, qp=recover_program(problem.csr, problem.b, problem.cones, n), copy=False)
     impulse = _read_vector(archive, "impulse", problem)
     if "moved_by" in meta:
         moved = _read_vector(archive, "engine_impulse", problem)
@@ -219,11 +228,9 @@ def _read_meta(archive: Arrays) -> dict[str, Any]:
     needed = ("operator", "friction", "name", "names")
     if missing := [name for name in needed if name not in meta]:
         raise InputError(f"entry 'meta' has no {', '.join(missing)}; {', '.join(needed)} are needed")
-    is_valid = meta["operator"] in FORMS and ("program" not in meta or meta["operator"] == "csr")
-    if not is_valid:
+    if meta["operator"] not in FORMS:
         raise InputError(
-            f"entry 'meta' has the operator {meta['operator']!r}; one of {', '.join(FORMS)} is needed, and csr "
-            "for a program"
+            f"entry 'meta' has the operator {meta['operator']!r}; one of {', '.join(FORMS)} is needed"
         )
     return meta
 
@@ -239,6 +246,37 @@ def _build_generalized(archive: Arrays, names: list[str] | None) -> Generalized:
 
     jac, mass = read("jac", m), read("mass", n)
     return Generalized(jac, mass, v_free, names)
+
+
+# -- quadratic programs ------------------------------------------------------------------------
+
+
+def _list_program_entries(qp: QuadraticProgram) -> Arrays:
+    """Return the entries of a program, with matrices in compressed columns."""
+    entries = Arrays()
+    for name, x in qp.arrays.items():
+        if issparse(x):
+            columns = sp.csc_array(x)
+            entries |= {f"{name}_{part}": getattr(columns, part) for part in ("data", "indices", "indptr")}
+            entries[f"{name}_shape"] = np.array(x.shape, np.int64)
+        else:
+            entries[name] = x
+    return entries
+
+
+def _read_program(archive: Arrays, **more: Any) -> Problem:
+    """Build a quadratic program from P, q, G, h, A, b, lb and ub; matrices are dense or in compressed columns."""
+    arrays: dict[str, Any] = {name: archive[name] for name in PROGRAM if name in archive}
+    n = archive["q"].size
+    for name, side in (("P", "q"), ("G", "h"), ("A", "b")):
+        if f"{name}_shape" in archive:
+            m, shape = archive[side].size, tuple(archive[f"{name}_shape"].ravel().tolist())
+            if shape != (m, n):
+                raise InputError(f"{name}_shape is {shape}; ({m}, {n}) is needed, as {side} has {m} entries")
+            indptr, indices, data = (archive[f"{name}_{part}"] for part in ("indptr", "indices", "data"))
+            arrays[name] = build_checked_csr(indptr, indices, data, n, m).T
+    arrays.setdefault("P", sp.csr_array((n, n)))
+    return Problem.from_qp(**arrays, **more)
 
 
 # -- plain box format --------------------------------------------------------------------------

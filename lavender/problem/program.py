@@ -272,6 +272,30 @@ class QuadraticProgram:
         jac = self.generalized.jac
         return jac.indptr, jac.indices, jac.data
 
+    @property
+    def arrays(self) -> dict[str, Any]:
+        """P, q, and of G, h, A, b, lb, ub those that were given, for `Problem.from_qp`; G is 0 where h is infinite."""
+        n, target = len(self.q), self.target
+        P, J = _make_csr(self.hessian, n), _make_csr(self.jacobian, n)
+        arrays = {"P": P, "q": self.q}
+        if self.n_equalities is not None:
+            arrays |= {"A": J[: self.n_equalities], "b": target[: self.n_equalities]}
+        if self.has_bounds:
+            lb, ub, rows = np.full(n, -np.inf), np.full(n, np.inf), np.flatnonzero(self.variable >= 0)
+            sign = J.data[J.indptr[rows]]
+            for side, chosen in ((lb, sign > 0.0), (ub, (sign < 0.0) | (rows < self.free))):
+                side[self.variable[rows[chosen]]] = (sign * target[rows])[chosen]
+            arrays |= {"lb": lb, "ub": ub}
+        if self.n_inequalities is not None:
+            end = self.free + (self.n_inequalities if self.kept is None else len(self.kept))
+            G, h = -J[self.free : end], -target[self.free : end]
+            if self.kept is not None:
+                size, sides = np.zeros(self.n_inequalities, int), np.full(self.n_inequalities, np.inf)
+                size[self.kept], sides[self.kept] = np.diff(G.indptr), h
+                G, h = _make_csr((np.append(0, np.cumsum(size)), G.indices, G.data), n), sides
+            arrays |= {"G": G, "h": h}
+        return arrays
+
     def judge(self, x: FloatArray, multipliers: FloatArray) -> tuple[Any, ...]:
         """Judge x (n,) and the multipliers (m,) of the rows: `judge_program`."""
         return judge_program(
@@ -371,6 +395,12 @@ def _make_program_names(n: int, m: int) -> list[str]:
     return [f"variable {i}" for i in range(n)] + [f"constraint {i}" for i in range(m)]
 
 
+def _make_csr(rows: Any, n: int) -> Any:
+    """Return compressed rows of n columns as `csr_array`."""
+    ptr, idx, value = rows
+    return sp.csr_array((value, idx, ptr), (len(ptr) - 1, n))
+
+
 @lru_cache(maxsize=8)  # A controller solves many programs with equal cones.
 def _make_one_sided_cones(free: int, m: int) -> Cones:
     """Return cones of m rows, the first ones free and the others nonnegative."""
@@ -404,36 +434,6 @@ def make_quadratic_program(arrays: ProgramArrays) -> QuadraticProgram:
         is_singular=is_singular, n_equalities=n_a, n_inequalities=n_g, variable=variable, has_bounds=has_bounds,
         kept=None if h is None or n_kept == n_g else np.flatnonzero(h < INFINITE),
         has_impossible_rows=h is not None and bool(np.isneginf(h).any()),
-    )  # fmt: skip
-
-
-def recover_program(matrix: sp.csr_array, b: FloatArray, cones: Cones, n: int) -> QuadraticProgram:
-    """Return the program of n variables from the matrix, right-hand side and bounds of its problem (5).
-
-    The equations of the problem become A x = b of the program, its other rows become G x <= h.
-
-    Raises
-    ------
-    InputError
-        The arrays do not have the form (5), or P is not positive semidefinite.
-    """
-    jac, hessian = sp.csr_array(matrix[n:, :n]), sp.csr_array(matrix[:n, :n])
-    free = int(np.count_nonzero(np.isneginf(cones.lower[n:])))
-    if (
-        matrix[n:, n:].nnz
-        or abs(matrix[:n, n:] + jac.T).nnz
-        or cones != _make_one_sided_cones(n + free, len(b))
-    ):
-        raise InputError(
-            f"the matrix of the problem does not have the form of a quadratic program of {n} variables; a "
-            "problem of Problem.from_qp with a singular P is needed"
-        )
-    lower = extract_lower_triangle("P", hessian, "give both triangles")
-    general, _ = _factor_hessian(lower, convert_to_compressed_rows("J", jac), -b[:n])
-    return QuadraticProgram(
-        q=mark_read_only(-b[:n]), target=mark_read_only(b[n:].copy()), free=free, generalized=general,
-        is_singular=True, n_equalities=free, n_inequalities=len(b) - n - free,
-        variable=np.full(len(b) - n, -1, np.int32),
     )  # fmt: skip
 
 

@@ -12,15 +12,17 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from lavender.report import tables
-    from lavender.report.cases import Item, classify_structure, make_sequence, resolve_sources
+    from lavender.report.cases import Item, make_sequence, resolve_sources
     from lavender.report.findings import Report, write
     from lavender.report.runner import Event, carry_impulses, run, select_solver_names
     from lavender.report.store import Store, read, select_runs
+    from lavender.report.structure import classify_structure
     from lavender.report.timing import CampaignPlan, Plan
 
 # Module -> public names in it, imported when a name is first used: tables and pages need pandas, solving does not.
 _PUBLIC_NAMES = {
-    "cases": ("Item", "classify_structure", "make_sequence", "resolve_sources"),
+    "cases": ("Item", "make_sequence", "resolve_sources"),
+    "structure": ("classify_structure",),
     "findings": ("Report", "write"),
     "store": ("Store", "read", "select_runs"),
     "timing": ("CampaignPlan", "Plan"),

@@ -6,12 +6,14 @@ errors e1, e2 by the judge, Delta = l1 - l2 and eps = e1 - e2 satisfy
     |Delta|_A^2 <= |Delta|_A |eps|_A + |eps|_D |Delta|_D                                          (1)
 
 Both p = l - e are projections of l - w/d in the metric of D, so (w1 - w2 - D eps).(Delta - eps) <= 0; expand and use
-Cauchy-Schwarz. If A is not symmetric, as in a quadratic program with a singular P, Delta.A Delta >= 0 all the same:
+Cauchy-Schwarz. Two points x1, x2 of a quadratic program with multipliers l, row residuals s = J x - t, violations
+v = max(-s, 0) (|s| of equations) and column residuals r = P x + q - J^T l have
 
-    Delta.A Delta <= |eps.A Delta| + |eps|_D |Delta|_D                                            (2)
+    Delta.P Delta <= |l1|.(|s1| + v2) + |l2|.(|s2| + v1) + |Delta|.|r1 - r2|                      (2)
 
-A breach of this bound means that a residual is computed incorrectly. |Delta|_A [sqrt J] is the energy norm of the
-difference of velocities, which are unique even if impulses are not.
+because Delta.P Delta = Delta.(r1 - r2) + (s1 - s2).(l1 - l2). A breach of (1) means that a residual is computed
+incorrectly. |Delta|_A [sqrt J] is the energy norm of the difference of velocities, which are unique even if impulses
+are not.
 """
 
 from __future__ import annotations
@@ -26,24 +28,19 @@ from lavender.base.arrays import check_sequence
 from lavender.base.errors import InputError, LavenderError, format_error
 from lavender.base.lazy_import import import_numerical_modules
 from lavender.external.backends import explain_contradicted_claim
-from lavender.judge.residuals import MAX_EXCUSED_RESIDUAL, WRONG
+from lavender.judge.residuals import MAX_EXCUSED_RESIDUAL
 from lavender.judge.solution import CONTRADICTED, NOT_PROVEN, Solution, Status, raise_if_interrupted
 from lavender.problem import Problem, check_problem
+from lavender.report.case_kinds import make_case
 from lavender.report.render import format_cells
 from lavender.report.text import format_residual, format_tolerance
 from lavender.solvers.registry import available, get, known, specs
 from lavender.solving.limits import check_time_limit
 from lavender.solving.prepared import check_arguments
-from lavender.solving.solve import solve
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-#: Heads of the numbers of a row.
-NUMBER_COLUMNS = {
-    "relative": "relative [-]", "roundoff_floor": "floor [-]", "velocity": "error [m/s]", "distance": "distance [√J]",
-    "allowed": "allowed [√J]", "objective": "objective [J]", "time": "time [s]",
-}  # fmt: skip
 REFERENCES = ("osqp", "clarabel", "piqp", "direct")
 # Reference solvers, in order, under the law "cone" (relaxed friction), which does not give a QP.
 CONE_REFERENCES = ("clarabel_cone", "block_gauss_seidel")
@@ -53,6 +50,7 @@ REFERENCE_MAX_RESIDUAL = 1e-9
 AGREES = "agrees"
 AGREES_UNCOMPARED = "solved, nothing to compare with"
 PROVED = "no solution, proved"
+UNBOUNDED = "unbounded, proved"
 # A certificate holds up to rounding: any solution has huge impulses.
 NEAR_NONE = "no solution within rounding"
 # A certificate holds, and another solver's answer meets the tolerance nevertheless.
@@ -170,18 +168,20 @@ class CrossCheck:
         """Row for each solver; the bounded variant that ran is named after an arrow."""
         import pandas as pd
 
-        columns = ["solver", "verdict", "status", *NUMBER_COLUMNS, "note"]
+        heads = make_case(self.problem).heads
+        columns = ["solver", "verdict", "status", *heads, "note"]
         rows = [{name: getattr(r, name) for name in columns} for r in self.rows]
-        table = pd.DataFrame(rows, columns=columns).astype(dict.fromkeys(NUMBER_COLUMNS, float))
+        table = pd.DataFrame(rows, columns=columns).astype(dict.fromkeys(heads, float))
         table["solver"] = [f"{r.solver} → {r.ran}" if r.ran else r.solver for r in self.rows]
-        return table.rename(columns=NUMBER_COLUMNS | {"note": "what ran"})
+        return table.rename(columns={**heads, "note": "what ran"})
 
     @property
     def description(self) -> str:
         """Name and law of the problem, tolerance and, if there is one, reference with its residual."""
         name = self.problem.name or f"{self.problem.m} rows"
         reference = f", reference {self.reference}, {self.reference_note}" if self.reference else ""
-        return f"{name} ({self.problem.law}), cold, tol {format_tolerance(self.tol)}{reference}"
+        law = self.problem.law if self.problem.qp is None else "program"
+        return f"{name} ({law}), cold, tol {format_tolerance(self.tol)}{reference}"
 
     def __str__(self) -> str:
         table = format_cells(self.frame).to_string(index=False)
@@ -195,9 +195,10 @@ def cross_check(
 ) -> CrossCheck:  # fmt: skip
     """Solve from the zero impulse with every solver, and compare each with a judged reference.
 
-    The judged relative residual of the reference must be at most max(1e-9, 10 floor), with the round-off floor, and at
-    most 1e-5. Otherwise the next solver of osqp, clarabel, piqp, direct (relaxed friction: clarabel_cone,
-    block_gauss_seidel) computes the reference; the result names it.
+    A quadratic program is solved by `solve_qp` and judged by its error. The error of the reference (of other problems
+    the relative residual) must be at most max(1e-9, 10 floor), with the round-off floor, and at most 1e-5. Otherwise
+    the next solver of osqp, clarabel, piqp, direct (relaxed friction: clarabel_cone, block_gauss_seidel) computes the
+    reference; the result names it.
 
     Parameters
     ----------
@@ -236,14 +237,14 @@ def cross_check(
     if isinstance(solvers, str):
         solvers = [solvers]
     names = available(problem) if solvers is None else check_sequence("solvers", solvers, "names")
-    reasons = known(problem)
+    reasons, case = known(problem), make_case(problem)
     for name in (reference, *names):
         if not isinstance(name, str) or name not in reasons:
             get(name)  # Raises UnknownName with similar names.
 
     def run_solver(name: str, tol: float = tol, max_iter: int | None = max_iter) -> Solution:
         import_numerical_modules(*get(name).requires)  # The first solve's time does not include the import.
-        return solve(problem, name, tol=tol, max_iter=max_iter, time_limit=time_limit)
+        return case.solve(name, tol=tol, max_iter=max_iter, time_limit=time_limit)
 
     optimum, reference_solver, note = solve_reference(problem, reference, reasons, run_solver)
     rows = [_check_solver(problem, name, reasons[name], optimum, run_solver) for name in names]
@@ -281,22 +282,16 @@ def solve_reference(
     problem: Problem, first: str, reasons: dict[str, str | None], run_solver: Callable[..., Solution]
 ) -> tuple[Solution | None, str | None, str]:
     """Return (solution, solver, quality) of the first reference that passes, or (None, None, reason)."""
-    failed, is_program = [], problem.has_singular_program
+    failed = []
     if problem.law == "coulomb":
         reason = reasons.get(first, "not registered")
         if reason is None:
             reason = "solves it, but several motions may be solutions, so a distance to one of them is not an error"
         why = f"({first} {reason}); compare errors in m/s"
         return None, None, f"Coulomb friction is not the optimality condition of a QP {why}"
-    if not (is_program or problem.is_symmetric):
-        by = format_residual(problem.asymmetry)
-        return None, None, f"A is not symmetric (by {by}), so the problem is not a QP"
-    if not (is_program or problem.is_semidefinite):
-        return (
-            None,
-            None,
-            "A is not positive semidefinite: several solutions with different motions may exist",
-        )
+    case = make_case(problem)
+    if reason := case.explain_no_reference():
+        return None, None, reason
     for name in dict.fromkeys([first, *(CONE_REFERENCES if problem.law == "cone" else REFERENCES)]):
         reason = reasons.get(name, "not registered")
         if reason is not None:
@@ -314,12 +309,13 @@ def solve_reference(
                 raise
             failed.append(f"{name}: {format_error(error)}")
             continue
-        r = solution.residual
-        needed = max(REFERENCE_MAX_RESIDUAL, min(10.0 * r.roundoff_floor, MAX_EXCUSED_RESIDUAL))
-        if r.relative <= needed:
-            note = f"relative {format_residual(r.relative)}"
+        judged = case.judge(solution)
+        relative, floor = judged["relative"], judged["roundoff_floor"]
+        needed = max(REFERENCE_MAX_RESIDUAL, min(10.0 * floor, MAX_EXCUSED_RESIDUAL))
+        if relative <= needed:
+            note = f"{case.heads['relative'].split()[0]} {format_residual(relative)}"
             return solution, name, note + (f" ({'; '.join(failed)})" if failed else "")
-        failed.append(f"{name}: relative {format_residual(r.relative)} above {format_residual(needed)}")
+        failed.append(f"{name}: relative {format_residual(relative)} above {format_residual(needed)}")
     return None, None, "; ".join(failed)
 
 
@@ -327,26 +323,21 @@ def compare_with_reference(
     problem: Problem, name: str, solution: Solution, optimum: Solution | None
 ) -> CrossCheckRow:
     """Compare one solver's solution with the optimum and build its row."""
-    r = solution.residual
+    case = make_case(problem)
     note = "; ".join(
         filter(None, (solution.solver.form and f"{solution.solver.form} form", solution.message))
     )
-    fields: dict[str, Any] = {
-        "status": solution.status.name, "relative": r.relative, "roundoff_floor": r.roundoff_floor,
-        "velocity": r.velocity, "time": solution.setup_time + solution.solve_time, "solution": solution,
+    judged = case.judge(solution)
+    fields: dict[str, Any] = {name: judged[name] for name in ("relative", "roundoff_floor", "velocity")} | {
+        "status": solution.status.name, "time": solution.setup_time + solution.solve_time, "solution": solution,
     }  # fmt: skip
     verdict, breached = AGREES_UNCOMPARED, False
     if optimum is not None and np.isfinite(solution.impulse).all():
         with np.errstate(over="ignore", invalid="ignore"):  # Squares of the impulses may overflow.
-            distance, allowed = compute_separation(problem, solution, optimum)
-            values = [
-                problem.qp.solution(s).objective if problem.has_singular_program
-                else 0.5 * (s.impulse @ (s.slack - problem.b))
-                for s in (solution, optimum)
-            ]  # fmt: skip
-            slack = float(np.abs(r.slack - optimum.slack).max(initial=0.0))
-            fields |= {"distance": distance, "allowed": allowed, "slack": slack,
-                       "objective": float(values[0] - values[1])}  # fmt: skip
+            distance, allowed = case.compute_separation(solution, optimum)
+            objective = case.compute_objective(solution) - case.compute_objective(optimum)
+            slack = float(np.abs(solution.slack - optimum.slack).max(initial=0.0))
+            fields |= {"distance": distance, "allowed": allowed, "slack": slack, "objective": objective}
         verdict, breached = AGREES, distance > allowed
     if breached:
         verdict = BREACH
@@ -357,51 +348,10 @@ def compare_with_reference(
         verdict = UNPROVED
     elif solution.status is Status.INFEASIBLE:
         verdict = PROVED if solution.impulse_bound == np.inf else NEAR_NONE
-    elif r.nothing_to_do and r.verdict != WRONG:
-        units = f"{format_residual(r.velocity)} {r.velocity_unit}, {format_residual(r.energy)} sqrt(J)"
-        verdict, note = NOTHING_TO_DO, f"{units}; {note}".rstrip("; ")
-    elif not (solution.success or r.at_floor):
+    elif solution.status is Status.UNBOUNDED:
+        verdict = UNBOUNDED
+    elif errors := case.describe_zero(solution):
+        verdict, note = NOTHING_TO_DO, f"{errors}; {note}".rstrip("; ")
+    elif not case.is_solved(solution):
         verdict = NOT_SOLVED
     return CrossCheckRow(name, verdict, note=note, **fields)
-
-
-def compute_separation(problem: Problem, one: Any, two: Any) -> tuple[float, float]:
-    """Compute |Delta|_A [sqrt J] of two judged answers and the largest value that (1), (2) allow, with rounding."""
-    delta = problem.on_disk(one.impulse - two.impulse)
-    eps = problem.on_disk(one.residual.error - two.residual.error)
-    problem = problem.disk
-    d: Any = problem.d
-    a_delta, a_eps = _multiply_by_a(problem, delta), _multiply_by_a(problem, eps)
-    delta_norm = float(np.sqrt(max(delta @ a_delta, 0.0)))
-    # The errors e are known up to the round-off floors of both residuals, in the norm of D.
-    uncertainty = float(sum(s.residual.floor_energy for s in (one, two)))
-    root = 1.0 / np.sqrt(d)
-    max_stiffness = float(np.sqrt(np.max(root * _multiply_by_a(problem, root, abs), initial=0.0)))
-    eps_d = float(np.sqrt(np.sum(d * eps * eps))) + uncertainty
-    eps_a = float(np.sqrt(max(eps @ a_eps, 0.0))) + max_stiffness * uncertainty
-    delta_d = float(np.sqrt(np.sum(d * delta * delta)))
-    if problem.has_singular_program:
-        allowed_square = (
-            abs(eps @ a_delta) + uncertainty * np.sqrt(np.sum((root * a_delta) ** 2)) + eps_d * delta_d
-        )
-        rounding_square = 2.0**-50 * (max_stiffness * delta_d) ** 2
-        return delta_norm, float(np.sqrt((1.0 + 1e-9) * allowed_square + rounding_square))
-    # x^2 <= x eps_a + eps_d delta_d bounds x = |Delta|_A by the larger root. `rounding` is the error of Delta.A Delta.
-    rounding = 2.0**-50 * max_stiffness * delta_d
-    allowed = 0.5 * (eps_a + np.sqrt(eps_a * eps_a + 4.0 * eps_d * delta_d))
-    return delta_norm, float(allowed * (1.0 + 1e-9) + np.sqrt(rounding * max_stiffness * delta_d))
-
-
-def _multiply_by_a(problem: Problem, x: Any, transform: Callable[[Any], Any] = lambda a: a) -> Any:
-    """Compute A x (m,), without forming A if J and M are known.
-
-    `transform` is applied to the entries of each factor; with `abs`, the result is a bound of |A| x for x >= 0.
-    """
-    if problem.generalized is not None:
-        y = transform(problem.whitened)
-        return y @ (y.T @ x) + problem.compliance * x
-    if problem.rows is None:
-        return transform(problem.csr) @ x
-    assert problem.compliance is not None
-    jac = transform(problem.jacobian)
-    return jac @ (transform(problem.rows.inverse_mass_matrix()) @ (jac.T @ x)) + problem.compliance * x

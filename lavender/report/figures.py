@@ -20,8 +20,8 @@ from lavender.report.drawing import (
     style_line,
     write_label,
 )
-from lavender.report.tables import ENGINE_NAME, Contents, is_plug_in, rank_solvers
-from lavender.report.text import format_count, format_power, format_speed, format_time
+from lavender.report.tables import ENGINE_NAME, Contents, format_size, is_plug_in, rank_solvers
+from lavender.report.text import format_count, format_power, format_residual, format_speed, format_time
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -122,32 +122,36 @@ def draw_profile(
 
 
 def draw_error_against_time(report: Contents, case: str, names: Sequence[str], folder: Path | None) -> str:
-    """Draw the velocity error that each solver reached on one case by a time; an engine's own answer is a star."""
+    """Draw the error that each solver reached on one case by a time; an engine's own answer is a star.
+
+    It is the velocity error in m/s, or the error of a quadratic program, whose limit is the tolerance to reach.
+    """
+    is_program = report.cases.at[case, "law"] == "program"
+    column, show = ("relative", format_residual) if is_program else ("velocity", format_speed)
     frame = report.frame[(report.frame["case"] == case) & (report.frame["order"] == "given")]
     kept = report.ranked_runs[report.ranked_runs["case"] == case]
     starts = dict(zip(kept["solver"].astype(str), kept["start"].astype(str), strict=True))
     lines = {}
     for name in names:
         own = kept if name == ENGINE_NAME else frame[frame["start"].astype(str) == starts.get(name, "")]
-        own = own[(own["solver"] == name) & np.isfinite(own["velocity"]) & (own["time"] > 0.0)]
+        own = own[(own["solver"] == name) & np.isfinite(own[column]) & (own["time"] > 0.0)]
         own = own.sort_values("time")
-        own = own.assign(best=own["velocity"].astype(float).cummin()).drop_duplicates("best")
+        own = own.assign(best=own[column].astype(float).cummin()).drop_duplicates("best")
         if len(own):
             lines[name] = own[["time", "best"]].to_numpy(float)
     if not lines:
         return ""
-    low, limit = 1e-9, report.error_limit
+    low, limit = (1e-12, report.tolerance) if is_program else (1e-9, report.error_limit)
 
     def fill(axes: Any) -> str:
         points = np.concatenate(list(lines.values()))
         axes.set_xscale("log")
         axes.set_xlim(points[:, 0].min() / 1.3, points[:, 0].max() * 1.3)
         mark_errors(axes, low, float(points[:, 1].max()), limit)
-        write_label(axes, 1.02, 0.035, "below 10⁻⁹", fontsize=8.2, color=QUIET)
+        write_label(axes, 1.02, 0.035, f"below {format_power(low)}", fontsize=8.2, color=QUIET)
         place = axes.transAxes.inverted().transform(axes.transData.transform((1.0, 1.35 * limit)))[1]
-        write_label(
-            axes, 0.015, place, f"limit {format_speed(limit)}", color=ORANGE, va="bottom", fontsize=8.2
-        )
+        text = f"to reach: {format_power(limit)}" if is_program else f"limit {format_speed(limit)}"
+        write_label(axes, 0.015, place, text, color=ORANGE, va="bottom", fontsize=8.2)
         for i, (name, own) in enumerate(lines.items()):
             style = style_line(i) | (
                 {"marker": "*", "markersize": 12, "color": INK} if name == ENGINE_NAME else {}
@@ -156,7 +160,7 @@ def draw_error_against_time(report: Contents, case: str, names: Sequence[str], f
         axes.xaxis.set_major_formatter(lambda t, _: format_time(t))
         axes.minorticks_off()
         axes.set_xlabel("time of a call")
-        axes.set_ylabel("largest velocity error [m/s]")
+        axes.set_ylabel("error of the program" if is_program else "largest velocity error [m/s]")
         axes.grid(True, axis="x")
         write_label(axes, 1.04, 1.0, "time of the last run", fontsize=8.2, color=QUIET)
         order = sorted(lines, key=lambda name: lines[name][-1, 0])
@@ -169,14 +173,13 @@ def draw_error_against_time(report: Contents, case: str, names: Sequence[str], f
             weight = "bold" if name == next(iter(lines)) else "normal"
             text = f"{name} {format_time(lines[name][-1, 0])}"
             write_label(axes, 1.1, y, text, color=style["color"], weight=weight)
-        return f"Velocity error against time on {case}. " + ", ".join(
-            f"{name} reaches {format_speed(own[-1, 1])} in {format_time(own[-1, 0])}"
-            for name, own in lines.items()
+        return f"Error against time on {case}. " + ", ".join(
+            f"{name} reaches {show(own[-1, 1])} in {format_time(own[-1, 0])}" for name, own in lines.items()
         )
 
     slowest = "The slowest problem, " if len(report.subject) > 1 else ""
-    rows = format_count(int(report.cases.loc[case, "rows"]), "row")
-    note = f"{slowest}{case} ({rows}). A mark is a run; its error is that of the worst row (records.csv)."
+    error = "" if is_program else "; its error is that of the worst row"
+    note = f"{slowest}{case} ({format_size(report.cases.loc[case])}). A mark is a run{error} (records.csv)."
     texts = ["time of the last run", *(f"{name} {format_time(own[-1, 0])}" for name, own in lines.items())]
     return draw_figure(
         "error-against-time",

@@ -48,15 +48,16 @@ COLUMNS_OF_FILE = (
 MUCH_FASTER = 1.25  # A solver is faster than another on a problem from this ratio of times on.
 LAW_TITLES = {
     "linear": "joints only (linear)", "lcp": "contacts without friction, boxes (LCP)", "coulomb": "Coulomb friction",
-    "cone": "friction cone (relaxed)",
+    "cone": "friction cone (relaxed)", "program": "quadratic programs",
 }  # fmt: skip
 HOW_TO_READ = (
-    "Times are wall-clock times of one call of lv.solve with the judge and Python, whose share below about 0.2 ms is "
-    "as large as the solver's: the minimum of the repetitions. The residual is the judge's relative residual, 1 at the "
-    "zero impulse and 0 exactly at a solution. Means are geometric, shifted by 10 µs; a problem that a solver does not "
-    "solve or does not accept counts as the time limit. Solvers tie if their means differ by less than twice the "
-    "spread of their repetitions. A simulation that reuses a factorisation between steps needs the set-up less often. "
-    "BLAS and OpenMP have one thread. Problems that the zero impulse solves are not ranked."
+    "Times are wall-clock times of one call of lv.solve (of a quadratic program lv.solve_qp) with the judge and "
+    "Python, whose share below about 0.2 ms is as large as the solver's: the minimum of the repetitions. The residual "
+    "is the judge's relative residual, 1 at the zero impulse and 0 exactly at a solution; of a quadratic program it is "
+    "the largest relative error of a row, a column or the gap. Means are geometric, shifted by 10 µs; a problem that a "
+    "solver does not solve or does not accept counts as the time limit. Solvers tie if their means differ by less than "
+    "twice the spread of their repetitions. BLAS and OpenMP have one thread. Problems that the zero impulse solves are "
+    "not ranked."
 )
 
 
@@ -505,7 +506,7 @@ class Report(Contents):
             )
             facts = self.cases.loc[cases[0]]
             cells: list[Any] = [
-                (label, "", f"{label}, {facts['rows']} rows, {facts['structure']}"),
+                (label, "", f"{label}, {tables.format_size(facts)}, {facts['structure']}"),
                 (fastest, "b", ""),
             ]
             for solver in order:

@@ -82,7 +82,7 @@ RUN_COLUMNS: Row = {
 #: Columns of cases with their defaults. The second line of names is not repeated in the rows of runs.
 CASE_COLUMNS: Row = {
     "law": "", "rows": 0, "blocks": 0, "islands": 0, "contacts": 0, "mass_ratio": math.nan, "structure": "",
-    "symmetric": True, "sequence": "", "nothing_to_do": False,
+    "symmetric": True, "sequence": "", "nothing_to_do": False, "variables": 0,
 }  # fmt: skip
 CASE_DETAILS: Row = {
     "run": "", "case": "", "sha": "", "step": -1, "source": "", "identity": "", "guess": "", "stored": math.nan,
@@ -333,6 +333,7 @@ def select_runs(lines: DataFrame) -> DataFrame:
         r: ", ".join(f"{name} {v}" for name, v in machine["versions"].items()) for r, machine in machines.items()
     })  # fmt: skip
     runs = runs.assign(**facts).reset_index(drop=True)
+    runs.loc[runs["law"] == "program", ["velocity", "error_energy"]] = math.nan
     texts = [name for name in facts if runs[name].dtype.kind not in "biuf"]
     return runs.astype(dict.fromkeys(texts, "category"))
 

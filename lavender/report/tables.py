@@ -35,7 +35,7 @@ from lavender.report.store import (
     select_runs,
     select_skips,
 )
-from lavender.report.text import escape_unprintable, format_tolerance
+from lavender.report.text import escape_unprintable, format_count, format_tolerance
 from lavender.solvers import registry
 
 Frame: TypeAlias = pd.DataFrame
@@ -163,6 +163,12 @@ def is_plug_in(solver: str) -> bool:
     """Return whether a solver is not part of lavender: a plug-in of the user, installed here or not."""
     spec = registry.specs().get(solver)
     return solver != ENGINE_NAME and (spec is None or not spec.builtin)
+
+
+def format_size(case: Any) -> str:
+    """Return the size of a case from its facts: "40 rows", of a program also the number of its variables."""
+    rows = format_count(int(case["rows"]), "row")
+    return f"{format_count(int(case['variables']), 'variable')}, {rows}" if case["variables"] else rows
 
 
 # -- answers of engines ------------------------------------------------------------------------------------
@@ -491,7 +497,10 @@ def order_solvers(report: Contents) -> list[str]:
 def tabulate_matrix(report: Contents) -> Frame:
     """Tabulate the time [s] of each solver (columns, in their ranking) on each case to the middle tolerance."""
     times = report.get_times(report.tolerance)
-    facts = report.cases.loc[times.columns, ["case", "law", "rows", "structure"]].reset_index(drop=True)
+    facts = report.cases.loc[times.columns, ["case", "law", "rows", "variables", "structure"]].reset_index(
+        drop=True
+    )
+    facts = facts if facts["variables"].any() else facts.drop(columns="variables")
     return facts.join(times.loc[order_solvers(report)].T.add_suffix(" [s]").reset_index(drop=True))
 
 

@@ -1,9 +1,9 @@
 """Time solves, and define the plan of a run: tolerances, budgets, starts and orders. No other module times solves.
 
-The timed call is the one that a report prints, `lv.solve(problem, "name", tol=...)`, including the judge. The arrays
-of its problem are newly written, as by a simulator, and other work has used the processor's caches since. The first
-call has the time limit; if it ends and is quick, it is repeated. BLAS and OpenMP use one thread, and the garbage
-collector is off.
+The timed call is the one that a report prints, `lv.solve(problem, "name", tol=...)`, of a quadratic program
+`lv.solve_qp(problem, "name", tol=...)`, including the judge. The arrays of its problem are newly written, as by a
+simulator, and other work has used the processor's caches since. The first call has the time limit; if it ends and is
+quick, it is repeated. BLAS and OpenMP use one thread, and the garbage collector is off.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from functools import cache
 from statistics import median
 from time import perf_counter
@@ -29,13 +29,13 @@ from lavender.judge.solution import CONTRADICTED, Solution, Status, raise_if_int
 from lavender.problem import Problem
 from lavender.problem.ordering import SWEEP_ORDERS
 from lavender.report import machine
+from lavender.report.case_kinds import ContactCase, ProgramCase, make_case
 from lavender.report.store import ERROR, RUN_COLUMNS, Row
 from lavender.report.text import format_tolerance
 from lavender.solvers import registry
 from lavender.solvers.registry import SolverSpec
 from lavender.solving.limits import make_deadline
-from lavender.solving.prepared import prepare
-from lavender.solving.solve import solve
+from lavender.solving.singular_programs import program_backends
 
 DEFAULT_SEQUENCE_TIME_LIMIT = 5.0  # [s] Time limit of one pass over a sequence.
 UNLIMITED_ITERATIONS = 10_000_000  # Iteration limit of a run to a tolerance; the time limit ends it first.
@@ -128,22 +128,45 @@ def format_call(record: Any, guessed: bool = False) -> tuple[str, ...]:
     spec = registry.specs().get(record.solver)
     if record.mode == "budget" or (spec is not None and record.iterations > spec.max_iter):
         text += f", max_iter={record.max_iter}"
+    call = ProgramCase.call if getattr(record, "law", "") == "program" else ContactCase.call
     if record.start != "carried":
         cold = (COLD_PROBLEM,) if guessed and record.start == "cold" else ()
-        return (*cold, f'lv.solve(problem, "{record.solver}", {text})')
-    call = f'    solution = lv.solve(problem, "{record.solver}", impulse=start, {text})'
+        return (*cold, f'lv.{call}(problem, "{record.solver}", {text})')
+    call = f'    solution = lv.{call}(problem, "{record.solver}", impulse=start, {text})'
     return (*CARRIED_START, call, "    before, impulse = problem, solution.impulse")
 
 
 @cache
-def _import_solver_code(solver: str) -> None:
-    """Import the code that a solver needs and solve one row, so that no measurement includes imports."""
+def _import_solver_code(solver: str, call: str) -> None:
+    """Make a call with one row, with and without a time limit, so that no measurement includes imports."""
     spec = registry.get(solver)
     make_deadline(spec, 1.0, 0.0)  # Imports the modules that a call with a time limit imports.
-    if spec.builtin or spec.requires:
+    if not (spec.builtin or spec.requires):
+        return
+    if call == "solve":
+        tiny = (Problem.lcp if "lcp" in spec.laws else Problem.linear)(np.eye(1), np.ones(1))
+    else:
+        import_numerical_modules(
+            "scipy.sparse.linalg", "scipy.optimize"
+        )  # The adapter of programs uses them.
+        tiny = Problem.from_qp(np.eye(1), np.ones(1), lb=np.zeros(1))
+        if spec.delegates:
+            for backend in program_backends():
+                _import_solver_code(backend.name, call)
+    for limit in (None, 1.0):
         with suppress(Exception):
-            make = Problem.lcp if "lcp" in spec.laws else Problem.linear
-            prepare(make(np.eye(1), np.ones(1)), solver).solve()
+            make_case(tiny).solve(solver, time_limit=limit)
+
+
+def _start_workers(case: ContactCase, task: Task) -> None:
+    """Start the processes that a call with a time limit uses: a process was ended if its call exceeded the limit."""
+    spec = registry.get(task.solver)
+    if spec.delegates and case.problem.qp is not None:
+        solvers = [backend.load()() for backend in program_backends()]
+    else:
+        solvers = [spec.load()(**task.options)] if spec.external and spec.builtin else []
+    for solver in solvers:
+        solver.start_workers(None, 0.0)
 
 
 @cache
@@ -201,12 +224,13 @@ def measure_task(problem: Problem, task: Task, impulse: Any = None) -> tuple[Row
     times: list[float] = []
     calibration_times: list[float] = []
     try:
-        _import_solver_code(task.solver)
+        case = make_case(problem)
+        _import_solver_code(task.solver, case.call)
         with _stabilise_timing(task.solver):
             begun = perf_counter()
             while len(times) < max(1, task.repeats):
                 calibration_times.append(measure_calibration_time())
-                solution, elapsed = _time_call(problem, task, impulse, limited=task.guarded and not times)
+                solution, elapsed = _time_call(case, task, impulse, limited=task.guarded and not times)
                 times.append(elapsed)
                 late = elapsed > LONG_TIME or perf_counter() - begun > task.time_limit
                 if late or solution.status is Status.TIME_LIMIT:
@@ -232,16 +256,7 @@ def measure_calibration_time() -> float:
     return perf_counter() - start_time
 
 
-def copy_problem_into_new_arrays(problem: Problem, start: str) -> Problem:
-    """Copy the problem into newly written arrays, with nothing derived from them, as a simulator leaves it.
-
-    With `start` "cold", the copy has no guess, as in the printed call.
-    """
-    rows = None if problem.rows is None else replace(problem.rows, copy=True)
-    return replace(problem, rows=rows, guess=None if start == "cold" else problem.guess, copy=True)
-
-
-def _time_call(problem: Problem, task: Task, impulse: Any, limited: bool) -> tuple[Solution, float]:
+def _time_call(case: ContactCase, task: Task, impulse: Any, limited: bool) -> tuple[Solution, float]:
     """Make the call once, with the time limit if `limited`, and return its solution and time [s].
 
     A plug-in may not test convergence and would then use all iterations: it runs with its default limit first.
@@ -249,20 +264,19 @@ def _time_call(problem: Problem, task: Task, impulse: Any, limited: bool) -> tup
     spec, arguments = registry.get(task.solver), task.arguments
     if limited:
         arguments["time_limit"] = task.time_limit
+        _start_workers(case, task)
     if task.start == "carried":
-        arguments["impulse"] = problem.start() if impulse is None else impulse
+        arguments["impulse"] = case.problem.start() if impulse is None else impulse
     limits = [None] if task.mode == "tol" and not spec.builtin and task.max_iter else []
     for max_iter in (*limits, task.max_iter or None):
-        fresh = copy_problem_into_new_arrays(problem, task.start)
+        fresh = case.copy(task.start)
         start_time = perf_counter()
-        solution = solve(fresh, task.solver, **{**arguments, "max_iter": max_iter})
+        solution = fresh.solve(task.solver, **{**arguments, "max_iter": max_iter})
         elapsed = perf_counter() - start_time
         if raise_if_interrupted(solution).status is not Status.MAX_ITERATIONS:
             break
     return solution, elapsed
 
-
-def compute_energy_gain(problem: Problem, impulse: FloatArray, slack: FloatArray) -> float:
     """Return the part [J] of the energy change beyond the work of the targets; 0 within its rounding.
 
     With A lambda = w + b it is lambda.(w - b) / 2 - lambda.diag(compliance) lambda / 2, which is not positive at a
@@ -280,22 +294,15 @@ def make_row(
     problem: Problem, task: Task, s: Solution, times: Sequence[float], calibration_time: float
 ) -> Row:
     """Return the row of a measurement. `times` [s] has its repeats, of which the last returned the solution `s`."""
-    r = s.residual
-    is_known = problem.matrix is None and bool(np.isfinite(s.impulse).all())
     is_false = s.claim_check == CONTRADICTED
     observed = explain_contradicted_claim(task.solver, problem, s.status) if is_false else ""
     return task.make_row(
-        times, status=s.status.name, relative=float(r.relative), error_energy=float(r.energy),
-        velocity=float(r.velocity), roundoff_floor=float(r.roundoff_floor),
-        energy_change=problem.energy_change(s.impulse) if is_known else math.nan,
-        energy_gain=compute_energy_gain(problem, s.impulse, r.slack) if is_known else math.nan,
-        worst_row=int(r.worst_row), worst_name=r.worst_label,
-        success=bool(s.success) and task.mode == "tol", claim_check=s.claim_check,
+        times, status=s.status.name, success=bool(s.success) and task.mode == "tol", claim_check=s.claim_check,
         status_conflict="; ".join(filter(None, (s.status_conflict, observed))),
         claims=s.status in CLAIM_STATUSES, iterations=int(s.iterations),
         work=json.dumps({k: int(v) for k, v in s.work.items()}), form=s.solver.form, message=s.message[:500],
         setup_time=s.setup_time, solve_time=s.solve_time, calibration_time=calibration_time,
-        load=machine.count_runnable_processes(),
+        load=machine.count_runnable_processes(), **make_case(problem).judge(s),
     )  # fmt: skip
 
 

@@ -52,6 +52,18 @@ def test_lists_take_commas_or_blanks_and_files_may_follow(lavender, path, tmp_pa
     assert set(runs.loc[runs["mode"] == "budget", "max_iter"]) == {3, 5}
 
 
+def test_report_leaves_out_a_named_file_that_is_broken_and_ends_with_1(lavender, path, tmp_path):
+    broken = tmp_path / "broken.npz"
+    broken.write_bytes(b"PK no archive")
+    options = ("--solvers", "pgs", "--tolerances", "1e-3", "--repeats", 1, "--no-figures", "--out")
+    code, out, _ = lavender("report", broken, path, *options, tmp_path / "out")
+    assert code == 1 and "1 case left out of all numbers" in out
+    assert set(report.select_runs(report.read(tmp_path / "out"))["case"]) == {"stack8"}
+    assert str(broken) in (tmp_path / "out" / "index.html").read_text()
+    code, out, _ = lavender("report", broken, *options, tmp_path / "other")
+    assert code == 1 and "nothing was measured" in out and str(broken) in out
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 def test_report_stopped_by_ctrl_c_keeps_records_and_writes_the_page(tmp_path):
     # A problem that nothing solves in the time: every run to a tolerance takes its limit.

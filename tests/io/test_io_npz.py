@@ -54,8 +54,9 @@ def variants():
         {"A": [[1.0, 1.0]], "b": [1.0]},
         {"G": [[1.0, -1.0]], "h": [1.0], "lb": [0.0, 1.0], "ub": [2.0, 1.0]},
     ):
-        program = lv.Problem.from_qp(np.diag([1.0, 0.0]), [1.0, -1.0], **rows, name="flat")
-        yield f"a program with a singular P and {', '.join(rows) or 'no rows'}", program
+        for p in ([1.0, 0.0], [3.0, 0.1]):
+            program = lv.Problem.from_qp(np.diag(p), [1.0, -1.0], **rows, name="flat", guess=None)
+            yield f"a program with P = {p} and {', '.join(rows) or 'no rows'}", program
     yield "empty", lv.Problem.linear(np.zeros((0, 0)), [])
     yield "empty csr", lv.Problem.linear(sp.csr_array((0, 0)), [])
     yield (
@@ -167,27 +168,63 @@ def test_load_of_an_npz_with_a_false_size_raises(tmp_path):
         lavender.io.load(path)
 
 
-def test_a_program_with_a_singular_hessian_comes_back_and_its_form_is_checked(tmp_path):
-    given = {
-        "P": np.diag([1.0, 0.0]), "q": [1.0, -1.0], "A": [[1.0, 2.0]], "b": [1.0], "lb": [0.0, 0.0], "ub": [9.0, 9.0],
-    }  # fmt: skip
-    problem = lv.Problem.from_qp(**given)
-    loaded = lavender.io.load(own(tmp_path, problem))
-    answer, before = lv.solve_qp(loaded), lv.solve_qp(problem)
-    assert answer.found
-    np.testing.assert_allclose([*answer.x, *answer.y], [*before.x, *before.y], atol=1e-9)
-    assert (answer.z >= 0.0).all() and answer.z_box is None  # bounds count as rows of G
-    with pytest.raises(lv.CapabilityError, match="singular"):
-        lv.solve(loaded, "newton")
-    meta = {"operator": "csr", "friction": "coulomb", "name": "", "names": None}
-    for n, sign in ((1, "form of a quadratic program of 1 "), (99, "program is 99"), (-1, "program is -1")):
-        changed = {"meta": np.frombuffer(json.dumps(meta | {"program": n}).encode(), np.uint8)}
-        with pytest.raises(lv.InputError, match=sign):
-            lavender.io.load(own(tmp_path, problem, **changed))
-    data = problem.csr.data.copy()
-    data[0] = -1.0  # P
-    with pytest.raises(lv.InputError, match="P is not positive semidefinite"):
-        lavender.io.load(own(tmp_path, problem, A_data=data))
+PROGRAM = {
+    "P": np.array([[2.0, 0.5], [0.5, 1.0]]), "q": np.array([1.0, -3.0]), "A": np.array([[1.0, 2.0]]),
+    "b": np.array([-2.1]), "G": np.array([[1.0, -1.0], [0.3, 1.0], [0.0, 1.0]]), "h": np.array([1.0, np.inf, 0.7]),
+    "lb": np.array([-np.inf, -1.0]), "ub": np.array([5.0, -1.0]),
+}  # fmt: skip
+
+
+def compressed(arrays, keys="PGA"):
+    """The entries of a program with some matrices in compressed columns."""
+    entries = {name: x for name, x in arrays.items() if name not in keys}
+    for key in keys:
+        matrix = sp.csc_array(arrays[key])
+        entries |= {f"{key}_{part}": getattr(matrix, part) for part in ("data", "indices", "indptr", "shape")}
+    return entries
+
+
+def answers_of(problem):
+    """The bytes of x and of the multipliers."""
+    answer = lv.solve_qp(problem, tol=1e-6)
+    return [x if x is None else x.tobytes() for x in (answer.x, answer.y, answer.z, answer.z_box)]
+
+
+@pytest.mark.parametrize("flat", [False, True], ids=["definite", "singular"])
+def test_a_saved_program_goes_back_into_solve_qp_with_the_same_bits(tmp_path, flat):
+    arrays = PROGRAM | ({"P": np.diag([1.0, 0.0])} if flat else {})
+    problem = lv.Problem.from_qp(**arrays, name="small")
+    lavender.io.save(problem, tmp_path / "p.npz", impulse=lv.solve_qp(problem).impulse)
+    stored = lavender.io.read(tmp_path / "p.npz")
+    assert stored.problem == problem and stored.problem.name == "small"
+    assert stored.problem.qp.solution(stored.impulse).error < 1e-9
+    assert answers_of(stored.problem) == answers_of(problem)
+    assert (stored.problem.qp.arrays["h"] == arrays["h"]).all()
+
+
+@pytest.mark.parametrize("keys", ["", "PGA", "G"])
+def test_a_plain_archive_of_arrays_is_a_program(tmp_path, keys):
+    path = archive(tmp_path / "mine.npz", compressed(PROGRAM, keys))
+    stored = lavender.io.read(path)
+    assert (stored.format, stored.problem.name) == ("program", "mine")
+    assert answers_of(stored.problem) == answers_of(lv.Problem.from_qp(**PROGRAM))
+    linear = lavender.io.load(archive(path, {"q": [1.0, 2.0], "lb": [0.0, 3.0]}))
+    assert lv.solve_qp(linear, "highs").x.round(9).tolist() == [0.0, 3.0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "sign"),
+    [
+        ({"G_shape": [3, 3]}, r"G_shape is \(3, 3\); \(3, 2\)"), ({"h": None}, "no entry 'h'"),
+        ({"G_indices": np.array([0, 1, 0, 9, 2])}, "column indices"), ({"G_indptr": np.array([0, 2, 99])}, "pointers"),
+        ({"P_shape": [2**60, 2**60]}, "P_shape"), ({"P_data": np.array([-1.0, 0.5, 0.5, 1.0])}, "not positive semi"),
+        ({"q": np.array(["a", "b"])}, "q"), ({"lb": np.array([np.nan, 0.0])}, "lb"),
+    ],
+)  # fmt: skip
+def test_a_program_with_wrong_entries_names_them(tmp_path, changes, sign):
+    entries = {name: x for name, x in (compressed(PROGRAM) | changes).items() if x is not None}
+    with pytest.raises(lv.InputError, match=rf"(?s)p\.npz.*{sign}"):
+        lavender.io.load(archive(tmp_path / "p.npz", entries))
 
 
 # -- plain box format -----------------------------------------------------------------------------
@@ -255,8 +292,7 @@ META = {"operator": "dense", "friction": "coulomb", "name": "", "names": None}
         *(({"meta": META | change}, words) for change, words in (
             ({"operator": "magic"}, "operator 'magic'"), ({"names": "abc"}, "names of blocks is 'abc'"),
             ({"friction": "glue"}, "'coulomb' or 'cone'"),
-            ({"names": ["one"]}, "entries for 12 blocks"), ({"precision": "float16"}, "precision"),
-            ({"program": 2}, "csr for a program"))),
+            ({"names": ["one"]}, "entries for 12 blocks"), ({"precision": "float16"}, "precision"))),
     ],
 )  # fmt: skip
 def test_load_of_npz_with_other_entries_or_metadata_names_them(tmp_path, changes, sign):

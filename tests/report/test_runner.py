@@ -14,7 +14,7 @@ from worked import python
 
 import lavender as lv
 from lavender import report, suite
-from lavender.report import cases, machine, runner, store, timing, workers
+from lavender.report import case_kinds, cases, machine, runner, store, timing, workers
 from lavender.report.store import KEY, RUN_COLUMNS, make_lines, select_cases, select_runs, select_skips
 from lavender.report.sweeps import SweepStudy
 from lavender.report.timing import format_call
@@ -66,13 +66,14 @@ def test_run_records_have_the_judged_result_of_each_target_and_its_times():
 
 
 def test_run_timed_call_is_the_printed_line(monkeypatch):
-    calls, true = [], timing.solve
+    calls, true = [], case_kinds.solve
 
     def solve(problem, solver, **asked):
-        calls.append((solver, asked, problem.guess))
+        if problem.m > 1:  # A call with one row precedes the timed calls.
+            calls.append((solver, asked, problem.guess))
         return true(problem, solver, **asked)
 
-    monkeypatch.setattr(timing, "solve", solve)
+    monkeypatch.setattr(case_kinds, "solve", solve)
     monkeypatch.setattr(timing, "LONG_TIME", math.inf)
     plan = report.Plan(tolerances=(1.23456e-6,), budgets=(4,), repeats=2)
     found = report.run([stack(6, guess=np.ones(6))], ["pgs"], plan)
