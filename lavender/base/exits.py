@@ -6,7 +6,7 @@ EXIT_INFEASIBLE = 3
 EXIT_INTERRUPTED = 130
 EXIT_CODES = {
     0: "completed",
-    EXIT_UNMET: "completed, but a problem is not solved, a check failed, a run diverged, a step or a file of a folder "
+    EXIT_UNMET: "completed, but a problem is not solved, a check failed, a run diverged, a step or a file "
     "is left out, or too few steps have contact",
     EXIT_BAD_INPUT: "invalid input",
     EXIT_INFEASIBLE: "`solve`: the problem is infeasible, with a certificate that the judge confirms",

@@ -11,6 +11,7 @@ import click
 
 from lavender.base.errors import InputError
 from lavender.base.exits import EXIT_UNMET
+from lavender.cli.completion import complete_file_or_word
 from lavender.cli.measuring import show_page, show_progress
 from lavender.cli.options import (
     FILE,
@@ -20,6 +21,7 @@ from lavender.cli.options import (
     limit_to_one_thread,
     precision_option,
     print_escaped,
+    quiet_option,
     reject_options_without_effect,
     threshold_option,
 )
@@ -37,6 +39,7 @@ from lavender.io.stored import check_writable
 @click.option("--keep", type=int, metavar="N",
               help="Keep the N worst steps; default: the worst step of each of three worlds.")  # fmt: skip
 @click.option("--save-states", type=(click.Choice(["contact", "worst"]), FILE), metavar="contact|worst FILE.npz",
+              shell_complete=complete_file_or_word("contact", "worst"),
               help="Write the states before steps with contact (about 1000 at most), or before the worst steps, for "
               "--states of tune, slip, record and report.")  # fmt: skip
 @threshold_option
@@ -47,12 +50,14 @@ from lavender.io.stored import check_writable
 @click.option("--backend", default="loky", show_default=True, help="A backend of joblib, such as dask.")
 @click.option("--out", type=FOLDER, default=Path("lavender-audit"),
               show_default=True, help="Folder of the page, the records and the worst worlds.")  # fmt: skip
+@quiet_option
 @click.pass_context
 def audit(
     context: click.Context,
     /,
     model: Path,
     out: Path,
+    quiet: bool,
     save_states: tuple[str, Path] | None,
     **options: Any,
 ) -> None:
@@ -82,7 +87,7 @@ def audit(
     reject_options_without_effect(context, other_engine=engine != "mujoco")
     check_writable(out, folder=True)
     limit_to_one_thread()
-    with show_progress() as watch:
+    with show_progress(quiet) as watch:
         result = run(
             model, watch=watch,
             keep_contact_states=save_states is not None and save_states[0] == "contact", **options,
@@ -92,7 +97,8 @@ def audit(
     result.write(out)
     if save_states is not None:
         n = result.save_states(*save_states)
-        print_escaped(f"{save_states[1]}: {format_count(n, 'state')} for --states")
-    show_page(result.page, out)
+        if not quiet:
+            print_escaped(f"{save_states[1]}: {format_count(n, 'state')} for --states")
+    show_page(result.page, out, quiet)
     if result.is_unmet:
         raise click.exceptions.Exit(EXIT_UNMET)

@@ -39,7 +39,7 @@ NARROW_CHECK_OMITS = (
 )
 @click.option("--solvers", type=ListType(str), shell_complete=complete_solver,
               help="Solvers by name; default: all that accept the problem.")  # fmt: skip
-@click.option("--reference", default="osqp", show_default=True,
+@click.option("--reference", default="osqp", show_default=True, shell_complete=complete_solver,
               help="Reference solver, with which the others are compared.")  # fmt: skip
 @click.option("--tol", type=float, default=1e-6, show_default=True, help="Relative residual to reach.")
 @click.option("--time-limit", type=float, metavar="S", help="Time limit of each solve.")

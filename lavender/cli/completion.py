@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import click
 from click.shell_completion import CompletionItem
@@ -29,7 +29,19 @@ def complete_case_or_file(
     from lavender import suite
 
     names = [*suite.FAMILIES, *(f"@{name}" for name in suite.SETS)]
-    return [*_list_matches(names, incomplete), CompletionItem(incomplete, type="file")]
+    # bash forgets the items before a request for files.
+    return [CompletionItem(incomplete, type="file"), *_list_matches(names, incomplete)]
+
+
+def complete_file_or_word(*choices: str) -> Callable[..., list[CompletionItem]]:
+    """Return a function that completes files and these choices."""
+
+    def list_items(
+        context: click.Context, parameter: click.Parameter, incomplete: str
+    ) -> list[CompletionItem]:
+        return [CompletionItem(incomplete, type="file"), *_list_matches(choices, incomplete)]
+
+    return list_items
 
 
 def complete_scene(

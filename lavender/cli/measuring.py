@@ -130,18 +130,27 @@ def _make_plan(context: click.Context, files: Sequence[str]) -> tuple[Plan, dict
     return Plan(**values, repeats=options["repeats"], time_limit=limit), {}
 
 
-def show_page(page: ResultPage, folder: Path) -> None:
-    """Write a page and print its short form; exit if Ctrl-C ended the measurement."""
+def show_page(page: ResultPage, folder: Path, is_quiet: bool = False) -> None:
+    """Write a page and print its short form, or only its path; exit if Ctrl-C ended the measurement."""
     path = page.write(folder)
-    page.print_short(make_console())
-    print_escaped(f"\npage: {path}")
+    if is_quiet:
+        print_escaped(str(path))
+    else:
+        page.print_short(make_console())
+        print_escaped(f"\npage: {path}")
     if page.is_stopped:
         exit_after_interrupt()
 
 
 @contextlib.contextmanager
-def show_progress() -> Iterator[Callable[[Event], None]]:
-    """Yield a callback that shows progress on stderr: on a terminal in one line, else in a line every few seconds."""
+def show_progress(is_quiet: bool = False) -> Iterator[Callable[[Event], None]]:
+    """Yield a callback that shows progress on stderr: on a terminal in one line, else in a line every few seconds.
+
+    With `is_quiet`, the callback shows nothing.
+    """
+    if is_quiet:
+        yield lambda event: None
+        return
     console = make_console(stderr=True)
     interval = REDRAW_INTERVAL if console.is_terminal else PROGRESS_INTERVAL
     # The time of a phase, without results that were reused.

@@ -14,7 +14,7 @@ import click
 
 from lavender.base.errors import InputError, LavenderError
 from lavender.base.exits import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_UNMET
-from lavender.cli.completion import complete_solver
+from lavender.cli.completion import complete_file_or_word, complete_solver
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -207,15 +207,20 @@ LIMIT: Option = (("--max-velocity-error",), {
     "an audit exits with 1 above it, and tune recommends a setting within it.",
 })  # fmt: skip
 limit_option = add_options([LIMIT])
+#: Option of the commands that write a page.
+quiet_option = click.option(
+    "-q", "--quiet", is_flag=True, help="Print only the path of the page, and errors."
+)
 #: Options of all commands that simulate and record a MuJoCo model.
 RECORDING_OPTIONS: tuple[Option, ...] = (
     (("--steps",), {"default": 500, "help": "MODEL.xml: number of simulation steps."}),
     (("--record-every", "every"), {"default": 5, "help": "MODEL.xml: record every n-th step."}),
     (("--controls", "control"), {"default": "random", "metavar": "zero|random|hold|FILE",
+                                 "shell_complete": complete_file_or_word("zero", "random", "hold"),
                                  "help": "MODEL.xml: its controls. hold: those of the start state. FILE: .npy of shape "
                                  "(any, nu), repeated."}),
     (("--seed",), {"default": 0, "help": "MODEL.xml: seed of random controls."}),
-    (("--states",), {"default": None, "metavar": "FILE|keyframes",
+    (("--states",), {"default": None, "metavar": "FILE|keyframes", "shell_complete": complete_file_or_word("keyframes"),
                      "help": "MODEL.xml: start from these states. FILE: an .npz, best with `state`, vectors of "
                      "mjSTATE_INTEGRATION (with warm start and controls) in its rows; else qpos and qvel, and other "
                      "arrays of MjData, such as `lavender audit` writes. keyframes: the keyframes of the model."}),
@@ -227,7 +232,8 @@ recording_options = add_options([THRESHOLD, *RECORDING_OPTIONS], show_default=Tr
 OPTIONS_WITHOUT_EFFECT: dict[str, tuple[str, tuple[str, ...]]] = {
     "is_list": ("with --list", ("all but", "listed")),
     "shows_records": ("if records are shown again, since nothing is solved",
-                      ("all but", "files", "out", "compare", "time_budgets", "tables", "no_figures", "solvers")),
+                      ("all but", "files", "out", "compare", "time_budgets", "tables", "no_figures", "solvers",
+                       "figure_kinds", "columns", "quiet")),
     "is_campaign": ("with --workers, which measures no times and ends by iterations",
                     ("repeats", "time_limit", "sequence_time_limit", "time_budgets", "sequence")),
     "sweeps": ("with --sweeps, which measures fixed numbers of sweeps",

@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from lavender.base.arrays import check_float
+from lavender.base.arrays import check_choice, check_float
 from lavender.base.errors import InputError
 from lavender.base.exits import EXIT_INTERRUPTED, EXIT_UNMET
 from lavender.cli.completion import complete_case_or_file
@@ -26,6 +26,7 @@ from lavender.cli.options import (
     make_console,
     plan_options,
     print_escaped,
+    quiet_option,
     recording_options,
     reject_options_without_effect,
 )
@@ -70,10 +71,16 @@ from lavender.io.stored import check_writable, write_text
 @click.option("--no-reuse", is_flag=True, help="Repeat runs that the folder already holds.")
 @click.option("--no-figures", is_flag=True,
               help="Write no figures; they take the largest part of the time of writing.")  # fmt: skip
+@click.option("--figure-kinds", type=ListType(str), default="pdf,svg,png", show_default=True,
+              help="Formats of the figures in OUT/figures.")  # fmt: skip
+@click.option("--columns", type=ListType(str), default=(), metavar="A,B,...",
+              help="Columns of OUT/tables/solvers.tex: solved, a tolerance such as 1e-6, ratio, slowest, accepted, "
+              "false; default: solved and all tolerances.")  # fmt: skip
+@quiet_option
 @click.option("--list", "listed", is_flag=True, help="List the cases of the built-in suite; measure nothing.")
 @click.pass_context
 def report(
-    context: click.Context, /, files: tuple[str, ...], out: Path, listed: bool, **options: Any
+    context: click.Context, /, files: tuple[str, ...], out: Path, listed: bool, quiet: bool, **options: Any
 ) -> None:
     """Measure the time and the error of solvers on problems.
 
@@ -92,6 +99,8 @@ def report(
     if listed:
         _list_suite()
         return
+    from lavender.report.drawing import FILE_KINDS
+    from lavender.report.page import check_columns
     from lavender.report.store import read, select_solvers
     from lavender.report.text import format_count
 
@@ -100,6 +109,9 @@ def report(
             raise InputError(f"time budget {limit} is not positive; a positive number of seconds is needed")
     if options["max_velocity_error"] is not None:
         check_float("max_velocity_error", options["max_velocity_error"], above=0.0)
+    check_columns(options["columns"])
+    for kind in options["figure_kinds"]:
+        check_choice("figure-kinds", kind, FILE_KINDS)
     _reject_unused_options(context, files, options)
     check_writable(out, folder=True)
     used_folders: set[Path] = set()
@@ -120,7 +132,7 @@ def report(
             )
         if options["solvers"]:
             measured = measured._replace(lines=select_solvers(measured.lines, options["solvers"]))
-    with show_progress() as watch:
+    with show_progress(quiet) as watch:
         if not records_files:
             measured = measure_files(context, files, path, watch)
         # These modules import pandas, which only a report needs.
@@ -131,7 +143,15 @@ def report(
         engines = read_engine_answers(files, measured.lines)
         limit = options["max_velocity_error"]
         limit = DEFAULT_ERROR_LIMIT if limit is None else limit
-        shown = Report(measured.lines, old, options["time_budgets"], engines, limit)
+        shown = Report(
+            measured.lines,
+            old,
+            options["time_budgets"],
+            engines,
+            limit,
+            options["figure_kinds"],
+            options["columns"],
+        )
         # Write the files before printing, as a closed pipe can end the command while it prints. After Ctrl-C, the page
         # has no figures, so that the prompt is back soon.
         try:
@@ -140,10 +160,13 @@ def report(
             raise KeyboardInterrupt(
                 f"the page is not complete; {path} has all runs, and the same command shows them"
             ) from None
-    print_report(shown, make_console(), complete=options["tables"])
-    print_escaped(f"\n{format_count(len(shown.runs), 'run')}; page: {index}")
-    if measured.reuse_note:
-        print_escaped(measured.reuse_note)
+    if quiet:
+        print_escaped(str(index))
+    else:
+        print_report(shown, make_console(), complete=options["tables"])
+        print_escaped(f"\n{format_count(len(shown.runs), 'run')}; page: {index}")
+        if measured.reuse_note:
+            print_escaped(measured.reuse_note)
     if measured.stopped:
         print_escaped("Stopped; the same command continues from here.", style="yellow")
         raise click.exceptions.Exit(EXIT_INTERRUPTED)

@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from lavender.base.exits import EXIT_UNMET
+from lavender.cli.completion import complete_file_or_word
 from lavender.cli.measuring import show_progress
 from lavender.cli.options import FILE, FOLDER, limit_to_one_thread, make_console, print_escaped
 from lavender.io.stored import check_writable
@@ -14,7 +15,7 @@ from lavender.io.stored import check_writable
 
 @click.command()
 @click.argument("model", metavar="MODEL.xml|MODEL.mjb", type=FILE)
-@click.option("--states", metavar="FILE.npz|keyframes",
+@click.option("--states", metavar="FILE.npz|keyframes", shell_complete=complete_file_or_word("keyframes"),
               help="States to explain, such as states.npz of an audit; default: the initial state.")  # fmt: skip
 @click.option("--steps", type=int, default=1, show_default=True,
               help="Steps simulated from each state, with its controls; the last one is explained.")  # fmt: skip

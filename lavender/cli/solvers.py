@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from lavender.cli.completion import complete_solver
 from lavender.cli.options import escape_markup, make_console
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ CAPABILITIES = (
 
 
 @click.command()
-@click.argument("name", required=False)
+@click.argument("name", required=False, shell_complete=complete_solver)
 def solvers(name: str | None) -> None:
     """List the solvers and their capabilities, or describe the solver NAME.
 

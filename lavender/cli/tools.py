@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from lavender.base.exits import EXIT_UNMET
-from lavender.cli.completion import complete_case_or_file
+from lavender.cli.completion import complete_case_or_file, complete_solver
 from lavender.cli.options import (
     FILE,
     FOLDER,
@@ -86,7 +86,7 @@ def record(
 
 
 @click.command()
-@click.argument("name")
+@click.argument("name", shell_complete=complete_solver)
 @click.option(
     "--list", "list_only", is_flag=True, help="List the requirements that apply to the solver; run nothing."
 )

@@ -15,6 +15,7 @@ from lavender.cli.options import (
     add_worlds_options,
     limit_option,
     limit_to_one_thread,
+    quiet_option,
     threshold_option,
 )
 from lavender.io.stored import check_writable
@@ -32,8 +33,11 @@ from lavender.io.stored import check_writable
 @click.option(
     "--no-reuse", is_flag=True, help="Judge all settings again, also settings of an earlier call in OUT."
 )
+@quiet_option
 @click.pass_context
-def tune(context: click.Context, /, model: Path, out: Path, no_reuse: bool, **options: Any) -> None:
+def tune(
+    context: click.Context, /, model: Path, out: Path, no_reuse: bool, quiet: bool, **options: Any
+) -> None:
     """Find faster or more accurate settings of MuJoCo for a model.
 
     MODEL is an MJCF file or an .mjb file. The time and the error of a step are measured with many settings on worlds of
@@ -52,8 +56,8 @@ def tune(context: click.Context, /, model: Path, out: Path, no_reuse: bool, **op
 
     check_writable(out, folder=True)
     limit_to_one_thread()
-    with show_progress() as watch:
+    with show_progress(quiet) as watch:
         tuning = run(model, watch=watch, folder=out, reuse=not no_reuse, **options)
-    show_page(tuning.page, out)
+    show_page(tuning.page, out, quiet)
     if tuning.reason_without_line or (tuning.error_limit is not None and tuning.within_limit is None):
         raise click.exceptions.Exit(EXIT_UNMET)

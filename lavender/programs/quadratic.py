@@ -410,7 +410,7 @@ class _Task:
         proof = self.proof
         return {
             "residual": judged,
-            "iterations": work.get("iterations", 0),
+            "iterations": work.get("iterations", 0 if self.solution is None else self.solution.iterations),
             "work": MappingProxyType(work),
             "solver": SolverRun(self.spec.name, self.options, last.form),
             "message": message,

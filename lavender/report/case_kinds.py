@@ -27,6 +27,7 @@ from lavender.report.text import format_residual
 from lavender.solving.solve import solve
 
 MIN_SPARSE_SIZE, MAX_SPARSE_FILL = 20, 0.2  # P and the rows of a program are "sparse" with at most this fill.
+ENERGY_ROUNDING = 2.0**-48  # Rounding of a sum of products, divided by the sum of their sizes.
 ROUNDING = 2.0**-50  # [-] Rounding error of a sum, relative to the sum of its absolute terms.
 
 
@@ -233,6 +234,20 @@ class ProgramCase(ContactCase):
 def make_case(problem: Problem) -> ContactCase:
     """Return the case of a problem, of its kind."""
     return ContactCase(problem) if problem.qp is None else ProgramCase(problem)
+
+
+def compute_energy_gain(problem: Problem, impulse: FloatArray, slack: FloatArray) -> float:
+    """Return the part [J] of the energy change beyond the work of the targets; 0 within its rounding.
+
+    With A lambda = w + b it is lambda.(w - b) / 2 - lambda.diag(compliance) lambda / 2, which is not positive at a
+    solution if the bounds of all rows contain 0, and NaN otherwise.
+    """
+    if (problem.cones.lower > 0.0).any() or (problem.cones.upper < 0.0).any():
+        return math.nan
+    soft = 0.0 if problem.compliance is None else problem.compliance * impulse
+    gain = 0.5 * float(impulse @ (slack - problem.b - soft))
+    rounding = float(np.abs(impulse) @ (np.abs(slack) + 2.0 * np.abs(problem.b)))
+    return gain if gain > ENERGY_ROUNDING * rounding else 0.0
 
 
 def _measure_point(qp: Any, P: Any, J: Any, impulse: FloatArray) -> tuple[Any, ...]:

@@ -15,7 +15,8 @@ from markupsafe import Markup
 from lavender.base.errors import InputError
 from lavender.problem.derived import cached_property
 from lavender.report import figures, tables
-from lavender.report.page import Page, fold_table, make_table
+from lavender.report.drawing import FigureFolder
+from lavender.report.page import PAPER_COLUMNS, Page, check_columns, fold_table, make_table
 from lavender.report.render import escape_markdown, format_markdown, print_table, write_files
 from lavender.report.runner import Event
 from lavender.report.sweeps import SweepStudy
@@ -46,6 +47,7 @@ COLUMNS_OF_FILE = (
     "worst row",
 )  # runs.csv has these columns, the page has not.
 MUCH_FASTER = 1.25  # A solver is faster than another on a problem from this ratio of times on.
+AUTHOR, TITLE = "The lavender developers", "lavender: solvers of rigid-body contact problems, judged in units"
 LAW_TITLES = {
     "linear": "joints only (linear)", "lcp": "contacts without friction, boxes (LCP)", "coulomb": "Coulomb friction",
     "cone": "friction cone (relaxed)", "program": "quadratic programs",
@@ -53,11 +55,10 @@ LAW_TITLES = {
 HOW_TO_READ = (
     "Times are wall-clock times of one call of lv.solve (of a quadratic program lv.solve_qp) with the judge and "
     "Python, whose share below about 0.2 ms is as large as the solver's: the minimum of the repetitions. The residual "
-    "is the judge's relative residual, 1 at the zero impulse and 0 exactly at a solution; of a quadratic program it is "
-    "the largest relative error of a row, a column or the gap. Means are geometric, shifted by 10 µs; a problem that a "
-    "solver does not solve or does not accept counts as the time limit. Solvers tie if their means differ by less than "
-    "twice the spread of their repetitions. BLAS and OpenMP have one thread. Problems that the zero impulse solves are "
-    "not ranked."
+    "is the judge's relative residual, 1 at the zero impulse and 0 at a solution; of a quadratic program it is the "
+    "largest error of rows, columns and gap. Means are geometric, shifted by 10 µs; a problem that a solver does not "
+    "solve or does not accept counts as the time limit. Solvers tie if their means differ by less than twice the "
+    "spread of their repetitions. Problems that the zero impulse solves are not ranked."
 )
 
 
@@ -360,7 +361,7 @@ class Report(Contents):
 
     # -- page ----------------------------------------------------------------------------------------------
 
-    def make_page(self, folder: Path | None = None, with_figures: bool = True) -> Page:
+    def make_page(self, folder: FigureFolder | None = None, with_figures: bool = True) -> Page:
         """Make the page; with `folder`, the figures are also written there."""
         n, solvers = len(self.frame["case"].unique()), len(self.frame["solver"].unique())
         limit = "" if self.is_campaign or not n else f" · limit {format_time(self.time_limit)} a solve"
@@ -395,7 +396,7 @@ class Report(Contents):
             mark=self.sweeps.mark if self.is_sweep_study else "", is_bad=self.is_sweep_study and self.sweeps.is_bad,
         )  # fmt: skip
 
-    def _make_blocks(self, folder: Path | None, with_figures: bool) -> list[Any]:
+    def _make_blocks(self, folder: FigureFolder | None, with_figures: bool) -> list[Any]:
         """Make the table of solvers, the matrix and the figures."""
         names = figures.select_drawn_solvers(list(map(str, self.ranking.index)))
         times = self.get_times(self.tolerance)
@@ -521,9 +522,11 @@ class Report(Contents):
                 ratio = own.median()
                 if missed:
                     run = best_runs.loc[(solver, cases[0])] if (solver, cases[0]) in best_runs.index else None
-                    why = f"{solver}: {missed} of {len(cases)} not solved, else {ratio:.1f}× the fastest"
+                    why = f"{solver}: {missed} of {len(cases)} not solved"
+                    why += f", else {ratio:.1f}× the fastest" if ratio == ratio else ""
                     if len(cases) == 1 and run is not None:
                         why = f"{solver}: {run['status']}, residual {format_residual(float(run['relative']))}"
+                        why = why.removesuffix(", residual inf")
                     cells.append(("✗" if len(cases) == 1 else f"{missed} ✗", "cx", why))
                 else:
                     text = "1" if ratio < 1.05 else f"{ratio:.1f}" if ratio < 9.95 else f"{ratio:.0f}"
@@ -554,13 +557,18 @@ class Report(Contents):
         run, facts = self.machine, {}
         if run:
             lists = {"versions": {"lavender": run["lavender"], "Python": run["python"], **run["versions"]},
-                     "build": run["build"] | {"load": run["load"]}, "plan": run["plan"]}  # fmt: skip
+                     "build": run["build"] | ({"load": run["load"]} if run["load"] == run["load"] else {}),
+                     "plan": run["plan"]}  # fmt: skip
             counts = format_count(self.frame["case"].nunique(), "case"), format_count(len(self.newest), "run")
             facts = {
                 "run": f"{run['run']}, started {run['started']}; {', '.join(counts)}",
                 "machine": f"{run['cpu']}, {run['cores']} cores; {run['platform']}",
                 "threads": f"{run['threads']} for BLAS and OpenMP while timing; runs are serial",
-                **{name: "; ".join(f"{key} {x}" for key, x in some.items()) for name, some in lists.items()},
+                **{
+                    name: "; ".join(f"{key} {x}" for key, x in some.items())
+                    for name, some in lists.items()
+                    if some
+                },
             }
         return pd.DataFrame(facts.items(), columns=["fact", "value"], dtype=object)
 
@@ -569,7 +577,9 @@ class Report(Contents):
         run = self.machine
         links = [f'<a href="tables/{name}.csv">{name}.csv</a>' for name in self.sections]
         files = Markup(
-            'For a paper: <a href="tables/solvers.tex">solvers.tex</a>, figures/ as PDF, SVG and PNG; '
+            'For a paper: <a href="tables/solvers.tex">solvers.tex</a>, '
+            '<a href="tables/lavender.bib">lavender.bib</a>, '
+            f"figures/ ({', '.join(self.figure_kinds)}); "
             f'data: <a href="records.csv">records.csv</a> (every run), {", ".join(links)}.'
         )
         if not run:
@@ -585,7 +595,7 @@ def write(
     source: pd.DataFrame | Report, folder: str | Path, *, figures: bool = True,
     watch: Callable[[Event], None] = lambda event: None,
 ) -> Path:  # fmt: skip
-    """Write `index.html`, `records.csv`, `tables/*.csv`, `tables/solvers.tex`, `figures/*` and `summary.md`.
+    """Write `index.html`, `records.csv`, `summary.md`, `figures/*` and the files of `tables`: .csv, .tex and .bib.
 
     Parameters
     ----------
@@ -618,35 +628,61 @@ def write(
     if "solvers" in report.sections and len(report.ranked_runs):
         files["tables/matrix.csv"] = lambda: tables.tabulate_matrix(report)
         files["tables/solvers.tex"] = lambda: make_latex_table(report)
+        files["tables/lavender.bib"] = make_bibtex_entry(report)
     files["summary.md"] = lambda: summarise(report)
-    files["index.html"] = lambda: report.make_page(folder / "figures", figures).render()
+    drawn = FigureFolder(folder / "figures", report.figure_kinds)
+    files["index.html"] = lambda: report.make_page(drawn, figures).render()
     order = {name: i for i, name in enumerate(files)}
     write_files(folder, files, lambda name: watch(Event(order[name], len(files), name, "", phase="writing")))
     return folder / "index.html"
 
 
 def make_latex_table(report: Report) -> str:
-    """Return the table of solvers for a paper: solved cases and mean times [ms]; needs the package booktabs."""
+    """Return the table of solvers for a paper with the columns of the report; needs the package booktabs."""
     table = tables.tabulate_solvers(report)
-    solved = table["solved"].astype(str) + "/" + table["cases"].astype(str)
-    paper = pd.DataFrame({"solved": solved.to_numpy()}, index=table["solver"].map(_escape_latex))
+    times = {format_tol(x): f"to {format_tol(x)} [s]" for x in report.tolerances if not report.is_campaign}
+    middle = times.get(format_tol(report.tolerance), "")
+    known: dict[str, Any] = {
+        "solved": table["solved"].astype(str) + "/" + table["cases"].astype(str), "accepted": table["accepted"],
+        "false": table["false claims"],
+        **{f"{word}": 1e3 * table[head] for word, head in times.items()},
+    }  # fmt: skip
+    if times:
+        known |= {"ratio": table[middle] / table[middle].min(), "slowest": 1e3 * table["slowest [s]"]}
+    columns = [x if x in PAPER_COLUMNS else format_tol(float(x)) for x in report.columns] or [
+        "solved",
+        *times,
+    ]
+    check_columns(columns, list(known))
+    heads = {"false": "false claims", "ratio": r"$\times$ best", "slowest": "slowest [ms]"} | {
+        word: f"$10^{{{round(np.log10(float(word)))}}}$" for word in times
+    }
+    paper = pd.DataFrame({heads.get(name, name): known[name].to_numpy() for name in columns})
+    paper.index = pd.Index(table["solver"].map(_escape_latex))
     paper.index.name = None
-    times = [f"to {format_tol(x)} [s]" for x in report.tolerances]
-    for tolerance, name in zip(report.tolerances, times, strict=True):
-        if name in table:
-            paper[f"$10^{{{round(np.log10(tolerance))}}}$"] = 1e3 * table[name].to_numpy()
-    numbers = list(paper.columns[1:])
-    n, run = int(table["cases"].max()), report.machine
-    caption = (
-        f"Problems solved to a residual of {format_tol(report.tolerance)}"
-        + (", and shifted geometric mean of the time [ms] to each residual" if numbers else "")
-        + f" over {format_count(n, 'problem')} (shift 10 µs; unsolved or not accepted at {report.time_limit:g} s). "
-        f"lavender {_escape_latex(str(run.get('lavender', '')))}, {_escape_latex(str(run.get('cpu', '')))}, one thread."
+    paper = paper.where(~paper.isin([np.inf, -np.inf]))
+    numbers = [heads.get(name, name) for name in columns if name in (*times, "ratio", "slowest")]
+    caption = f"Problems solved to a residual of {format_tol(report.tolerance)}"
+    if set(columns) & set(times):
+        caption += ", and shifted geometric mean of the time [ms] to each residual"
+    caption += (
+        f" over {format_count(int(table['cases'].max()), 'problem')} (shift 10 µs; unsolved or not accepted at "
+        f"{report.time_limit:g} s). lavender {_escape_latex(str(report.machine.get('lavender', '')))}, "
+        f"{_escape_latex(str(report.machine.get('cpu', '')))}, one thread."
     )
     style = paper.style.format(precision=3, na_rep="--", subset=numbers)
     style = style.highlight_min(subset=numbers, props="textbf:--rwrap;") if numbers else style
-    return style.to_latex(hrules=True, column_format="lr" + "r" * len(numbers), label="tab:solvers", position="t",
+    return style.to_latex(hrules=True, column_format="l" + "r" * len(columns), label="tab:solvers", position="t",
                           caption=caption)  # fmt: skip
+
+
+def make_bibtex_entry(report: Report) -> str:
+    """Return the entry of BibTeX that cites the version which made the report."""
+    run = report.machine
+    return (
+        f"@software{{lavender, author = {{{{{AUTHOR}}}}}, title = {{{{{TITLE}}}}}, version = {{{run['lavender']}}}, "
+        f"year = {{{run['started'][:4]}}}}}\n"
+    )
 
 
 def _escape_latex(text: str) -> str:

@@ -15,6 +15,7 @@ Columns without texts and numbers are left out.
 from __future__ import annotations
 
 import json
+import math
 import re
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
@@ -49,7 +50,11 @@ def format_cells(frame: pd.DataFrame) -> pd.DataFrame:
     ]
     texts = [
         [
-            NONE if x is None or x != x else f"{x:g}" if is_float[i] else escape_unprintable(str(x))
+            NONE
+            if x is None or x != x or x in (math.inf, -math.inf)
+            else f"{x:g}"
+            if is_float[i]
+            else escape_unprintable(str(x))
             for x in column
         ]
         for i, column in enumerate(columns)

@@ -40,7 +40,6 @@ from lavender.solving.singular_programs import program_backends
 DEFAULT_SEQUENCE_TIME_LIMIT = 5.0  # [s] Time limit of one pass over a sequence.
 UNLIMITED_ITERATIONS = 10_000_000  # Iteration limit of a run to a tolerance; the time limit ends it first.
 HANG_LIMIT = 60.0  # [s] Time limit of a solver of another package in a campaign.
-ENERGY_ROUNDING = 2.0**-48  # Rounding of a sum of products, divided by the sum of their sizes.
 LONG_TIME = 0.05  # [s] A call that took longer is not repeated: caches and the clock hardly affect its time.
 CLAIM_STATUSES = (Status.CONVERGED, Status.ROUNDOFF_LIMIT, Status.INFEASIBLE)
 # A run that missed its tolerance with one of these reaches no tighter tolerance either.
@@ -276,18 +275,6 @@ def _time_call(case: ContactCase, task: Task, impulse: Any, limited: bool) -> tu
         if raise_if_interrupted(solution).status is not Status.MAX_ITERATIONS:
             break
     return solution, elapsed
-
-    """Return the part [J] of the energy change beyond the work of the targets; 0 within its rounding.
-
-    With A lambda = w + b it is lambda.(w - b) / 2 - lambda.diag(compliance) lambda / 2, which is not positive at a
-    solution if the bounds of all rows contain 0, and NaN otherwise.
-    """
-    if (problem.cones.lower > 0.0).any() or (problem.cones.upper < 0.0).any():
-        return math.nan
-    soft = 0.0 if problem.compliance is None else problem.compliance * impulse
-    gain = 0.5 * float(impulse @ (slack - problem.b - soft))
-    rounding = float(np.abs(impulse) @ (np.abs(slack) + 2.0 * np.abs(problem.b)))
-    return gain if gain > ENERGY_ROUNDING * rounding else 0.0
 
 
 def make_row(

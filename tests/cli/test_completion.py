@@ -8,7 +8,8 @@ from lavender.cli.entry import cli
 HAS_ALL_NAMES = {
     "solve x.npz --solver": ("pg", {"pgs"}), "report --solvers": ("auto,sequential_imp", {"auto,sequential_impulses"}),
     "check --solvers": ("nn", {"nncg"}), "run": ("four_b", {"four_bar"}), "run stack --solver": ("ad", {"admm"}),
-    "audit model.xml --engine": ("mujo", {"mujoco", "mujoco_warp"}),
+    "audit model.xml --engine": ("mujo", {"mujoco", "mujoco_warp"}), "check x.npz --reference": ("osq", {"osqp"}),
+    "contract": ("jac", {"jacobi"}), "solvers": ("hig", {"highs"}),
 }  # fmt: skip
 
 
@@ -30,3 +31,13 @@ def test_problems_are_completed_by_cases_sets_and_files(command):
     assert [item.value for item in items if item.type == "plain"] == ["toy_stack"]
     assert [item.value for item in items if item.type == "file"] == ["toy"]
     assert "@hard" in {item.value for item in complete([command], "@h")}
+
+
+@pytest.mark.parametrize("line", ["audit m.xml --states", "slip m.xml --states", "tune m.xml --states",
+    "report --states", "record m.xml --states", "tune m.xml --controls", "audit m.xml --save-states worst",
+    "report --compare", "report --out", "solve x.npz --output", "record"])  # fmt: skip
+def test_options_and_arguments_that_take_files_complete_files(line):
+    items = complete(line.split(), "ke")
+    assert any(item.type in ("file", "dir") for item in items)
+    # bash forgets the names that precede a request for files.
+    assert items[0].type != "plain"

@@ -16,6 +16,7 @@ from lavender.report.case_kinds import make_case
 from lavender.report.cases import hash_problem
 from lavender.report.check import UNBOUNDED, cross_check
 from lavender.report.timing import format_call
+from lavender.solvers import registry
 
 PLAN = report.Plan(tolerances=(1e-3, 1e-8), budgets=(), repeats=1, time_limit=60.0)
 
@@ -56,6 +57,16 @@ def test_run_of_a_program_file_times_solve_qp_and_has_the_error_of_the_program(t
         assert np.isnan(r.velocity) and json.loads(r.work) == dict(answer.solution.work)
     (kind,) = set(report.select_runs(lines)["structure"])
     assert kind == f"{'singular' if singular else 'definite'} P, dense"  # fewer than 20 variables
+
+
+def test_printed_call_of_a_program_has_the_limit_of_iterations_that_it_needs():
+    problem = lv.Problem.from_qp(**control(n=20), name="control")
+    (run,) = report.select_runs(
+        report.run([problem], ["pgs"], dataclasses.replace(PLAN, tolerances=(1e-8,)))
+    ).itertuples()
+    (line,) = format_call(run)
+    assert run.iterations > registry.get("pgs").max_iter and "max_iter=" in line
+    assert eval(line, {"lv": lv, "problem": problem}).error == run.relative
 
 
 def test_report_of_programs_has_its_figure_in_errors_of_the_program(tmp_path):

@@ -4,6 +4,7 @@ import html.parser
 import io
 import re
 import sys
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -105,6 +106,31 @@ def test_report_write_has_files_of_every_table_figure_and_run(written):
     assert r"\toprule" in latex and "nan" not in latex.lower()
     assert EVIL not in (out / "summary.md").read_text(encoding="utf-8")
     assert {e.phase for e in events} == {"writing"} and [e.done for e in events] == list(range(events[0].total))
+
+
+def test_entry_of_bibtex_agrees_with_the_citation_file(written):
+    root = Path(__file__).resolve().parents[2]
+    lines = (root / "CITATION.cff").read_text(encoding="utf-8").splitlines()
+    title, author = (next(x.split(key)[1].strip(' "') for x in lines if key in x) for key in ("title:", "- name:"))
+    entry = (written[1] / "tables" / "lavender.bib").read_text(encoding="utf-8")
+    assert f"title = {{{{{title}}}}}" in entry and f"author = {{{{{author}}}}}" in entry
+    assert "version = {0.1}, year = {2026}" in entry
+
+
+def test_no_cell_of_a_report_says_nan_or_inf(tmp_path):
+    """One solver dies on every problem of a structure, and 45 problems are lines by structure."""
+    made = []
+    for i in range(45):
+        made.append(record(f"case {i}", "auto", 1e-3, 1e-9))
+        made.append(record(f"case {i}", "dead", 1.0, float("inf"), status="ERROR", velocity=float("nan"), times=()))
+        made.append(record(f"case {i}", "slow", 1.0, 0.5))
+    report = report_of(*made)
+    write(report, tmp_path, figures=False)
+    files = [p.read_text(encoding="utf-8") for p in (tmp_path / "index.html", tmp_path / "tables" / "solvers.tex")]
+    for text in (*files, shown(report, complete=True), (tmp_path / "summary.md").read_text(encoding="utf-8")):
+        assert not re.search(r"(?i)(?<![a-z-])(nan|inf)(?![a-z])", text)
+    csv = pd.read_csv(tmp_path / "tables" / "runs.csv", keep_default_na=False).to_numpy().ravel()
+    assert "nan" not in set(map(str, csv))
 
 
 @pytest.mark.parametrize("width", [60, 80, 120])
