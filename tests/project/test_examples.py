@@ -213,3 +213,18 @@ def test_warm_starts_keep_their_matches_for_ten_minutes():
         assert (status, done) == (0, 240)
         head = sim.state.head
         assert head[HEAD["contacts"]] == head[HEAD["matches"]] == 24
+
+
+def test_comparison_of_models_names_the_values_that_a_converter_lost(capsys):
+    mujoco = pytest.importorskip("mujoco")
+    module = example("compare_models")
+    texts = 'frictionloss="0.2" range="-1 1" actuatorfrcrange="-30 30"', 'range="-1 1"'
+    source, other = (
+        mujoco.MjModel.from_xml_string(module.PENDULUM.format(f'{text} limited="true"')) for text in texts
+    )
+    module.compare(source, other)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[:2] == ["hinge: friction 0.2, converted 0.0", "hinge: effort 30.0, converted inf"]
+    assert not any("damping" in line or "limits" in line for line in lines)
+    module.compare(source, source)
+    assert "hinge" not in capsys.readouterr().out

@@ -1,0 +1,52 @@
+"""Compare the joints of a converted MuJoCo model with those of its source, both read by MuJoCo: which values differ?
+
+Converters of URDF files lose values without a message. `lavender audit` judges the steps of the model that it gets, so
+compare first. The two arguments are any files that MuJoCo reads, for example a URDF and the MJCF file made from it;
+without arguments, a pendulum is compared with the same pendulum without its friction loss and its limit of effort.
+
+    python examples/compare_models.py robot.urdf converted.xml
+"""
+
+import sys
+
+import mujoco
+import numpy as np
+
+PENDULUM = """<mujoco><worldbody><body name="arm"><joint name="hinge" damping="0.5" {}/>
+<geom type="sphere" size="0.1" pos="0 0 -1"/></body></worldbody></mujoco>"""
+
+
+def read_joints(model):
+    """Return the values of each slide (type 2) and hinge (type 3) joint, by its name."""
+    joints = {}
+    for i in np.flatnonzero(model.jnt_type >= 2):
+        dof, effort = model.jnt_dofadr[i], model.jnt_actfrcrange[i, 1] if model.jnt_actfrclimited[i] else np.inf
+        drives = (model.actuator_trntype == 0) & (model.actuator_trnid[:, 0] == i) & (model.actuator_forcelimited > 0)
+        joints[model.joint(i).name] = {
+            "damping": model.dof_damping[dof],
+            "friction": model.dof_frictionloss[dof],
+            "effort": min([effort, *model.actuator_forcerange[drives, 1]]),
+            "limits": tuple(map(float, model.jnt_range[i])) if model.jnt_limited[i] else "none",
+        }
+    return joints
+
+
+def compare(source, other):
+    """Print the values of joints that differ, and the counts and masses of both models."""
+    before, after = read_joints(source), read_joints(other)
+    for name in before:
+        for key, value in before[name].items():
+            if name not in after or not np.array_equal(value, after[name][key]):
+                print(f"{name}: {key} {value}, converted {after[name][key] if name in after else 'no such joint'}")
+    for key, count in {"equalities (mimic)": "neq", "joints": "njnt"}.items():
+        print(f"{key}: {getattr(source, count)}, converted {getattr(other, count)}")
+    masses = [model.body_mass.sum() for model in (source, other)]
+    print(f"mass without bodies fixed to the world: {masses[0]:.3f} kg, converted {masses[1]:.3f} kg")
+
+
+if __name__ == "__main__":
+    if len(sys.argv) == 3:
+        compare(*(mujoco.MjModel.from_xml_path(path) for path in sys.argv[1:]))
+    else:
+        texts = PENDULUM.format('frictionloss="0.2" actuatorfrcrange="-30 30"'), PENDULUM.format("")
+        compare(*(mujoco.MjModel.from_xml_string(text) for text in texts))
