@@ -1,4 +1,4 @@
-"""Compare the joints of a converted MuJoCo model with those of its source, both read by MuJoCo: which values differ?
+"""Compare the joints of a converted MuJoCo model with those of its source, both read by MuJoCo.
 
 Converters of URDF files lose values without a message. `lavender audit` judges the steps of the model that it gets, so
 compare first. The two arguments are any files that MuJoCo reads, for example a URDF and the MJCF file made from it;
@@ -20,8 +20,15 @@ def read_joints(model):
     """Return the values of each slide (type 2) and hinge (type 3) joint, by its name."""
     joints = {}
     for i in np.flatnonzero(model.jnt_type >= 2):
-        dof, effort = model.jnt_dofadr[i], model.jnt_actfrcrange[i, 1] if model.jnt_actfrclimited[i] else np.inf
-        drives = (model.actuator_trntype == 0) & (model.actuator_trnid[:, 0] == i) & (model.actuator_forcelimited > 0)
+        dof, effort = (
+            model.jnt_dofadr[i],
+            model.jnt_actfrcrange[i, 1] if model.jnt_actfrclimited[i] else np.inf,
+        )
+        drives = (
+            (model.actuator_trntype == 0)
+            & (model.actuator_trnid[:, 0] == i)
+            & (model.actuator_forcelimited > 0)
+        )
         joints[model.joint(i).name] = {
             "damping": model.dof_damping[dof],
             "friction": model.dof_frictionloss[dof],
@@ -37,7 +44,9 @@ def compare(source, other):
     for name in before:
         for key, value in before[name].items():
             if name not in after or not np.array_equal(value, after[name][key]):
-                print(f"{name}: {key} {value}, converted {after[name][key] if name in after else 'no such joint'}")
+                print(
+                    f"{name}: {key} {value}, converted {after[name][key] if name in after else 'no such joint'}"
+                )
     for key, count in {"equalities (mimic)": "neq", "joints": "njnt"}.items():
         print(f"{key}: {getattr(source, count)}, converted {getattr(other, count)}")
     masses = [model.body_mass.sum() for model in (source, other)]
