@@ -219,9 +219,7 @@ def test_comparison_of_models_names_the_values_that_a_converter_lost(capsys):
     mujoco = pytest.importorskip("mujoco")
     module = example("compare_models")
     texts = 'frictionloss="0.2" range="-1 1" actuatorfrcrange="-30 30"', 'range="-1 1"'
-    source, other = (
-        mujoco.MjModel.from_xml_string(module.PENDULUM.format(f'{text} limited="true"')) for text in texts
-    )
+    source, other = (mujoco.MjModel.from_xml_string(module.PENDULUM.format(f'{text} limited="true"')) for text in texts)
     module.compare(source, other)
     lines = capsys.readouterr().out.splitlines()
     assert lines[:2] == ["hinge: friction 0.2, converted 0.0", "hinge: effort 30.0, converted inf"]
