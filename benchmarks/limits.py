@@ -2,16 +2,20 @@
 
     python -m benchmarks limits [--case 'granularF(n=12)' ...] [--solver auto ...] [--repeats 5]
     python -m benchmarks limits --programs 1000 [--solver auto --solver clarabel ...]
+    python -m benchmarks limits --sheet auto|prepared [--count 400] [--seed 0]
 
 Prints medians of wall and CPU time of cold calls divided by their limit, the number of sweeps or steps, the relative
 residual, and the residual of the start; before the limits the smallest CPU time of one cold sweep without a limit,
 set-up and judge included. With --programs, it prints for each solver in which share of quadratic programs of 5 to 1,000
 variables the CPU time of `solve_qp`, without the time inside of the backend's package and imports, is at most the limit
-plus OVERHEAD. `python -m benchmarks rates` measures the costs that decide what starts under a limit.
+plus OVERHEAD. The sheet `auto` divides the residual of `auto` by that of the best sweeps with the same limit: structures
+of 60 to 4,000 rows, limits of 0.1 to 10 ms, from zero or a stale start. The sheet `prepared` compares the CPU time of
+prepared solves of every own solver, 300 to 3,000 rows, limits L of 1 to 50 ms, with 2 L + 5 ms and 2 L + 25 ms. `python -m benchmarks rates` measures the costs that decide what starts under a limit.
 """
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from statistics import median
@@ -23,16 +27,31 @@ import numpy as np
 import scipy.sparse as sp
 
 import lavender as lv
-from benchmarks.core_problems import forms, fresh
+import lavender.solving.loop
+from benchmarks.core_problems import forms, fresh, lattice_pile, stacks
 from benchmarks.output import markdown
-from lavender import suite
+from benchmarks.scale_structures import STRUCTURES, build
+from lavender import registry, suite
 from lavender.problem import Problem
 from lavender.solvers.registry import get
+from lavender_ext.core.deadline import play_clock
 
 CASES = ("stack(n=64)", "chain(n=33)", "pyramidF(k=6)", "stack(n=5000)", "granular(n=12)", "granularF(n=12)",
          "dense 300 x 100", "dense 3000 x 300", "matrix 300", "matrix 2400")  # fmt: skip
 LIMITS = (1e-3, 1e-2)  # s
 OVERHEAD = 5e-3  # s
+SHEET_SWEEPS = (
+    "pgs",
+    "sequential_impulses",
+    "block_gauss_seidel",
+    "nncg",
+    "anderson",
+)  # Four accept each problem.
+KINDS = {"structure": 0.45, "columns": 0.2, "lattice": 0.1, "granular": 0.1, "chain": 0.1, "dense": 0.05}
+FORM_NAMES = ("bodies", "matrix", "J and M")
+TOLERANCE, REPEATS = 1e-6, 3
+
+Line = dict[str, Any]
 # the first one that accepts the problem's form is used
 SWEEPS = (
     "sequential_impulses",
@@ -200,13 +219,204 @@ def measure_programs(count: int, solvers: tuple[str, ...]) -> list[list[Any]]:
     return rows
 
 
+# -- sheets of drawn contact problems ------------------------------------------------------------------
+
+
+def draw_dense_matrix(rng: np.random.Generator, m: int, shift: float) -> Problem:
+    """Draw contacts of three rows of a full A (m, m) with the least eigenvalue `shift`."""
+    half = rng.normal(size=(m, m // 2))
+    return Problem.contact(half @ half.T / m + shift * np.eye(m), rng.normal(size=m), 0.5)
+
+
+def draw_dense_jacobian(rng: np.random.Generator, m: int, n: int, density: float = 1.0) -> Problem:
+    """Draw contacts of three rows of J (m, n) with this fraction of entries, and a full M."""
+    half, jac, free = rng.normal(size=(n, n)), rng.normal(size=(m, n)), rng.normal(size=n)
+    if density < 1.0:
+        jac *= rng.random((m, n)) < density
+    cones = lv.Cones.contacts(np.full(m // 3, 0.5), 2)
+    return Problem.from_jacobian(jac, half @ half.T / n + np.eye(n), free, cones=cones)
+
+
+def draw_bodies(rng: np.random.Generator, kind: str, rows: int) -> tuple[str, Problem]:
+    """Draw a structure of bodies of about so many rows; return its name and the problem."""
+    seed = int(rng.integers(1000))
+    if kind == "structure":
+        name = str(rng.choice(list(STRUCTURES)))
+        return name, build(name, rows, float(rng.choice([0.0, 0.3])), float(rng.choice([0.0, 1.0])), seed)
+    if kind == "columns":
+        height = int(rng.integers(1, 30))
+        mu = None if rng.random() < 0.25 else 0.5
+        return kind, stacks(
+            max(1, rows // ((4 if mu is None else 12) * height)), height, mu, False, seed=seed
+        )
+    if kind == "lattice":
+        return kind, lattice_pile(max(20, rows // 3), shuffle=rng.random() < 0.5, seed=seed)
+    if kind == "granular":
+        size = max(2, round((rows / 8) ** (1 / 3)))
+        return kind, suite.granular(n=size, friction="coulomb", seed=seed).problem
+    return kind, suite.chain(n=max(20, rows // 3), tip_mass=float(10 ** rng.uniform(-1, 3))).problem
+
+
+def convert(rng: np.random.Generator, problem: Problem, form: str) -> Problem:
+    """Return the problem in this form, one of four contact problems under the cone law."""
+    if problem.rows is not None and form != "bodies" and problem.rows.inv_mass.all():
+        problem = forms(problem)[form]
+    return problem.relaxed("cone") if problem.law == "coulomb" and rng.random() < 0.25 else problem
+
+
+def draw_call(k: int, seed: int) -> tuple[str, Problem, Any, float]:
+    """Draw (name, problem, start or None, limit [s]) of a line of the sheet `auto`."""
+    rng = np.random.default_rng([seed, k])
+    rows = round(np.exp(rng.uniform(np.log(60), np.log(4000))))
+    kind, form = (
+        str(rng.choice(list(KINDS), p=list(KINDS.values()))),
+        str(rng.choice(FORM_NAMES, p=[0.6, 0.2, 0.2])),
+    )
+    if kind == "dense":
+        m = 3 * (min(rows, 600) // 3)
+        is_matrix = rng.random() < 0.5
+        name = "dense A" if is_matrix else "dense J and M"
+        given = draw_dense_matrix(rng, m, 0.01) if is_matrix else draw_dense_jacobian(rng, m, max(12, m // 4))
+    else:
+        name, given = draw_bodies(rng, kind, rows)
+    problem, start = convert(rng, given, form), None
+    if rng.random() < 0.67:
+        noise = 0.3 * problem.b * rng.standard_normal(problem.m)
+        other = problem.updated(
+            b=problem.b + noise + 0.1 * np.abs(problem.b).max() * rng.standard_normal(problem.m)
+        )
+        sweeps = next(name for name in SHEET_SWEEPS if not get(name).refuses(problem))
+        stale = lv.solve(other, sweeps, max_iter=int(rng.integers(5, 60)), tol=0.0).impulse
+        start = float(rng.choice([1.0, 1.0, 3.0])) * stale
+    return (
+        f"{name}, {form}, {problem.law}",
+        problem,
+        start,
+        float(np.exp(rng.uniform(np.log(1e-4), np.log(1e-2)))),
+    )
+
+
+def measure_auto(k: int, seed: int) -> Line:
+    """Measure a line of the sheet `auto`."""
+    name, problem, start, limit = draw_call(k, seed)
+    names = [solver for solver in ("auto", *SHEET_SWEEPS) if not get(solver).refuses(problem)]
+    runs = np.empty((REPEATS, len(names), 2))
+    for i in range(REPEATS):
+        for j, solver in enumerate(names):
+            cold = fresh(problem)
+            begun = thread_time()
+            solution = lv.solve(cold, solver, impulse=start, tol=TOLERANCE, time_limit=limit)
+            time = thread_time() - begun
+            runs[i, j] = solution.residual.relative, time / limit
+    (own, over), others = np.median(runs, axis=0)[0], np.median(runs, axis=0)[1:, 0]
+    at_start = lv.residual(problem, problem.start() if start is None else start).relative
+    ratio = max(own, TOLERANCE) / max(others.min(), TOLERANCE)
+    best = names[1 + int(others.argmin())]
+    return {"name": name, "rows": problem.m, "limit": limit, "residual": own, "best": others.min(), "by": best,
+            "at start": at_start, "ratio": ratio, "time": over}  # fmt: skip
+
+
+def print_auto(lines: list[Line], worst: int) -> None:
+    """Print the figures of the sheet `auto`, and the lines with the largest ratios."""
+    ratio, time = (np.array([line[key] for line in lines]) for key in ("ratio", "time"))
+    click.echo(markdown(["figure", "value"], [
+        ["residual of `auto` over that of the best sweeps, geometric mean", f"{np.exp(np.log(ratio).mean()):.2f}"],
+        ["the same, of ratios above 1", f"{np.exp(np.log(np.maximum(ratio, 1.0)).mean()):.2f}"],
+        ["above 10 times", str(int((ratio > 10.0).sum()))],
+        ["worse than the start", str(sum(line["residual"] > line["at start"] * (1 + 1e-9) for line in lines))],
+        ["time over the limit, median, 95 %, worst", ", ".join(f"{x:.2f}" for x in np.quantile(time, (0.5, 0.95, 1)))],
+    ]))  # fmt: skip
+    head = ["problem", "rows", "limit [ms]", "`auto`", "best sweeps", "start", "time/limit"]
+    click.echo("\n" + markdown(head, [
+        [x["name"], x["rows"], f"{1e3 * x['limit']:.2f}", f"{x['residual']:.1e}", f"{x['best']:.1e} {x['by']}",
+         f"{x['at start']:.1e}", f"{x['time']:.2f}"]
+        for x in sorted(lines, key=lambda x: -x["ratio"])[:worst]]))  # fmt: skip
+
+
+def measure_prepared(k: int, seed: int) -> list[Line]:
+    """Measure the own solvers on a problem of the sheet `prepared`."""
+    rng = np.random.default_rng([seed, k, 1])
+    m = 3 * round(np.exp(rng.uniform(np.log(100), np.log(1000))))
+    name = ("dense A", "sparse A", "bodies", "dense J and M", "sparse J and M", "J and M of bodies")[k % 6]
+    if name == "dense A":
+        problem = draw_dense_matrix(rng, m, 0.05)
+    elif name.endswith("J and M"):
+        problem = draw_dense_jacobian(
+            rng, m, int(m / rng.uniform(0.8, 4.0)), 1.0 if name.startswith("dense") else 0.1
+        )
+    else:
+        kind = str(rng.choice(["structure", "columns"]))
+        form = {"sparse A": "matrix", "J and M of bodies": "J and M"}.get(name, "bodies")
+        problem = convert(rng, draw_bodies(rng, kind, m)[1], form)
+    limit, lines = float(np.exp(rng.uniform(np.log(1e-3), np.log(5e-2)))), []
+    for solver, spec in registry.specs().items():
+        if not spec.builtin or spec.external or spec.refuses(problem):
+            continue
+        prepared = lv.prepare(fresh(problem), solver)
+        for _ in range(3):
+            b, begun = problem.b * (1.0 + 0.01 * rng.random()), thread_time()
+            status = prepared.solve(b=b, tol=1e-8, time_limit=limit).status
+            time = thread_time() - begun
+            lines.append({"name": f"{name}, {problem.law}", "rows": problem.m, "solver": solver, "limit": limit,
+                          "time": time, "excess": time - 2.0 * limit, "status": status.name})  # fmt: skip
+    return lines
+
+
+def print_prepared(lines: list[Line], worst: int) -> None:
+    """Print the figures of the sheet `prepared`, and the lines with the largest times over 2 L."""
+    excess = np.array([line["excess"] for line in lines])
+    click.echo(markdown(["figure", "value"], [
+        ["solves", str(len(lines))],
+        ["CPU time at most 2 L + 5 ms", f"{np.mean(excess <= 5e-3):.2%}"],
+        ["CPU time at most 2 L + 25 ms", f"{np.mean(excess <= 25e-3):.2%}"],
+        ["largest time over 2 L", f"{1e3 * excess.max():.1f} ms"],
+    ]))  # fmt: skip
+    head = ["problem", "rows", "solver", "limit [ms]", "time [ms]", "status"]
+    click.echo("\n" + markdown(head, [
+        [x["name"], x["rows"], x["solver"], f"{1e3 * x['limit']:.1f}", f"{1e3 * x['time']:.1f}", x["status"]]
+        for x in sorted(lines, key=lambda x: -x["excess"])[:worst]]))  # fmt: skip
+
+
+def print_sheet(sheet: str, count: int, seed: int, worst: int = 12) -> None:
+    """Measure and print a sheet; CPU time is the clock, so that other processes do not count."""
+    problems = forms(stacks(2, 3, 0.5, False))
+    for solver in ("auto", *SHEET_SWEEPS):  # Imports do not count.
+        for problem in problems.values():
+            if not get(solver).refuses(problem):
+                lv.solve(problem, solver, tol=1e-12, time_limit=0.05)
+    play_clock(thread_time)
+    lavender.solving.loop.perf_counter = thread_time  # type: ignore[attr-defined]
+    gc.disable()
+    lines: list[Line] = []
+    for k in range(count):
+        lines += [measure_auto(k, seed)] if sheet == "auto" else measure_prepared(k, seed)
+        gc.collect()
+    (print_auto if sheet == "auto" else print_prepared)(lines, worst)
+
+
 @click.command("limits")
 @click.option("--case", "names", multiple=True, help=f"Default: {', '.join(CASES)}.")
 @click.option("--solver", "solvers", multiple=True, default=("auto",), show_default=True)
 @click.option("--repeats", default=5, show_default=True)
 @click.option("--programs", default=0, help="Number of quadratic programs, in place of cases.")
-def command(names: tuple[str, ...], solvers: tuple[str, ...], repeats: int, programs: int) -> None:
+@click.option(
+    "--sheet", type=click.Choice(["auto", "prepared"]), help="Drawn contact problems, in place of cases."
+)
+@click.option("--count", default=400, show_default=True, help="Number of problems of a sheet.")
+@click.option("--seed", default=0, show_default=True)
+def command(
+    names: tuple[str, ...],
+    solvers: tuple[str, ...],
+    repeats: int,
+    programs: int,
+    sheet: str | None,
+    count: int,
+    seed: int,
+) -> None:
     """Measure calls under time limits."""
+    if sheet:
+        print_sheet(sheet, count, seed)
+        return
     if programs:
         head = ["solver", "programs", "within limit + 5 ms", "above the limit in 1 % [ms]", "largest [ms]"]
         click.echo(markdown(head, measure_programs(programs, solvers)))

@@ -8,6 +8,9 @@ nothing reads it.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from threading import local
 from time import perf_counter
 
 from lavender_ext.core.deadline import Deadline as Deadline
@@ -32,6 +35,27 @@ class Stopwatch:
 
 
 NEVER = Deadline()
+
+
+class TooLate(ArithmeticError):
+    """The deadline passed before a matrix was formed."""
+
+
+class _Forming(local):
+    deadline: Deadline | None = None
+
+
+FORMING = _Forming()  # The deadline that forming A reads, of each thread.
+
+
+@contextmanager
+def limit_forming(deadline: Deadline | None) -> Iterator[None]:
+    """Let this thread's forming of A raise TooLate after the deadline; None or no limit: it ends."""
+    before, FORMING.deadline = FORMING.deadline, deadline
+    try:
+        yield
+    finally:
+        FORMING.deadline = before
 
 
 def format_seconds(t: float) -> str:

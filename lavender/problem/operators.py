@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import ArrayLike, FloatArray, IntArray, mark_read_only
+from lavender.base.deadline import FORMING, TooLate
 from lavender.base.errors import CapabilityError, InputError, TooLarge
 from lavender.base.lazy_import import issparse
 from lavender.base.lazy_import import sparse as sp
@@ -67,6 +68,18 @@ class Operators(ProblemData):
             other.__dict__["data"] = known["data"].with_law(law, b)
         if self.derived.view is not None and self.derived.view.ready:
             other.derived.view = self.derived.view.with_law(law, b)
+
+    def has_operator_of(self, other: Operators) -> bool:
+        """Return whether two problems share the arrays of A and of the blocks, as `updated(b=...)` makes them."""
+        p, q = self.generalized, other.generalized
+        return (
+            self.cones is other.cones
+            and self.friction == other.friction
+            and self.matrix is other.matrix
+            and self.rows is other.rows
+            and self.compliance is other.compliance
+            and (p is q or (p is not None and q is not None and p.operator is q.operator))
+        )
 
     def _with_rhs(self, b: FloatArray, generalized: Any, guess: FloatArray | None) -> Any:
         """Return a problem of the same A with another right-hand side b (m,) [m/s], used without a copy."""
@@ -271,7 +284,10 @@ class Operators(ProblemData):
         self._check_entry_count(self.metric.entries_of_matrix)
         # A kernel is used instead of SciPy, which a first solve with a time limit would have to import.
         y = self.metric.whitened()
-        indptr, indices, data = assemble.form_gram_matrix(*y, self.generalized.nv, self.compliance)
+        formed = assemble.form_gram_matrix(*y, self.generalized.nv, self.compliance, FORMING.deadline)
+        if formed is None:
+            raise TooLate("the time limit ended the forming of A")
+        indptr, indices, data = formed
         return mark_read_only(indptr), mark_read_only(indices), mark_read_only(data)
 
     @computed_once

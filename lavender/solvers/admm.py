@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.base.deadline import NEVER, Deadline
+from lavender.base.deadline import NEVER, Deadline, TooLate, limit_forming
 from lavender.base.errors import BREAKDOWN, InputError
 from lavender.base.lazy_import import import_numerical_modules
 from lavender.base.lazy_import import sparse as sp
@@ -72,7 +72,26 @@ class AdmmState:
         self.factorisations = self.reported = 0
         self.watch: Any = None
         self.factor: Any = None
-        self.next_steps = [self._scale_problem, self._analyse_matrix, self.update_factor]
+        self.next_steps = [self._begin_run, self._scale_matrix, self._analyse_matrix, self.update_factor]
+        # Attributes that do not depend on b: of the matrix, and of its factor for the first rho if that is kept.
+        self.operator: dict[str, Any] = {}
+        self.first: dict[str, Any] = {}
+
+    def renew(self, problem: Problem) -> AdmmState:
+        """Return the state for another b, with the scaled matrix and a kept factor of this state."""
+        new = AdmmState(problem, self.memory, self.relaxation)
+        if self.operator:
+            new.operator, new.first = self.operator, self.first
+            vars(new).update(self.operator | self.first)
+            new.next_steps = [new._begin_run, *(() if self.first else (new.update_factor,))]
+            # A claim counts the kept factor as its own, so that it does not depend on the call before.
+            new.factorisations = int(bool(self.first) and new.has_factor)
+        return new
+
+    def keep_factor(self) -> None:
+        """Keep the factor for the first rho for `renew`."""
+        names = ("factor", "lu", "full", "matrix", "system")
+        self.first = {name: getattr(self, name) for name in names}
 
     def scale_and_factor(self) -> None:
         """Scale, analyse and factor, unless that was done; raise `_OutOfTime` after the deadline."""
@@ -82,12 +101,17 @@ class AdmmState:
             self.next_steps[0]()
             del self.next_steps[0]
 
-    def _scale_problem(self) -> None:
-        """Build the stopping test, the splitting and the scaled form of the problem."""
+    def _begin_run(self) -> None:
+        """Build the stopping test and the splitting."""
         problem = self.problem
-        self.data = problem.data
+        with limit_forming(self.deadline if self.deadline.is_set else None):
+            self.data = problem.data
         self.watch = create_stopping_test(problem, problem.data, _ADMM_PATIENCE)
         self.splitting = admm.Splitting(self.data, self.memory, _START_RHO, self.relaxation)
+
+    def _scale_matrix(self) -> None:
+        """Build the scaled form of the problem."""
+        problem = self.problem
         self.matrix: Any = None
         self.system: Any = None  # Linear system of the matrix.
         self.lu = self.full = False  # Whether the factor is L U, and whether its matrix is full.
@@ -112,6 +136,9 @@ class AdmmState:
         """Analyse the matrix, if there is one."""
         if not self.is_over_bodies and self.problem.m:
             _analyse_panels(self.system)
+        names = ["matrix", "system", "lu", "full", "is_over_bodies", "has_factor"]
+        names += ["theta", "jacobian", "body_work", "body_solve"] if self.is_over_bodies else []
+        self.operator = {name: getattr(self, name) for name in names}
 
     @property
     def inner_iterations(self) -> int:
@@ -139,6 +166,11 @@ class AdmmState:
         """Set the factor, or conjugate gradients, for the present rho; raise `_OutOfTime` after the deadline."""
         if self.deadline.has_passed():
             raise _OutOfTime
+        if self.first and self.system is self.first["system"] is not None:
+            pattern = self.problem.m if self.full else get_sorted_csr_arrays(self.matrix)[:2]
+            self.system = LinearSystem(
+                pattern, USE_WIDE_LANES
+            )  # The kept one has the factor for the first rho.
         self.factor = self._factor_with_fallbacks()
         self.factorisations += self.has_factor
 
@@ -248,6 +280,17 @@ class ADMM(Solver):
         return AdmmState(problem, self.memory, self.relaxation)
 
     @np.errstate(all="ignore")  # Results that overflow are judged.
+    def complete(self, state: AdmmState) -> None:
+        """Scale and factor; matrix and factor stay while only b changes."""
+        with suppress(_Breakdown):  # `run` repeats the set-up and reports the error.
+            state.scale_and_factor()
+            state.keep_factor()
+
+    def update(self, state: AdmmState, problem: Problem) -> AdmmState:
+        """Build the state for new numbers; matrix and factor stay if only b is new."""
+        return state.renew(problem) if problem.has_operator_of(state.problem) else self.prepare(problem)
+
+    @np.errstate(all="ignore")  # Results that overflow are judged.
     def set_deadline(self, state: AdmmState, deadline: Deadline) -> None:
         """Set the deadline, and do the set-up now, so that the time of an iteration is measured without it."""
         state.deadline = deadline
@@ -268,7 +311,7 @@ class ADMM(Solver):
             state.scale_and_factor()
         except _Breakdown as failure:
             return Claim(Status.NUMERICAL_ERROR, 0, {}, str(failure))
-        except _OutOfTime:
+        except (_OutOfTime, TooLate):
             return Claim(Status.TIME_LIMIT, 0, {}, _LATE_MESSAGE)
         splitting, inner = state.splitting, state.inner_iterations
         if state.watch.total == 0:

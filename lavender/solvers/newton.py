@@ -42,9 +42,13 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray, check_choice
-from lavender.base.deadline import Deadline
+from lavender.base.deadline import Deadline, TooLate, limit_forming
 from lavender.base.errors import CapabilityError, InputError
-from lavender.judge.residuals import compute_stopping_residual, judge_impulse
+from lavender.judge.residuals import (
+    compute_stopping_residual,
+    get_zero_impulse_reference,
+    judge_impulse,
+)
 from lavender.judge.solution import Claim, Status, format_work_count, sum_work_counts
 from lavender.problem import OPERATORS, Problem
 from lavender.problem.derived import cached_property
@@ -89,6 +93,11 @@ class NewtonState:
     system: System | None  # None if no body in a row can move, or for the driver in generalised coordinates.
     general: Any = None  # Driver in generalised coordinates, or None.
     begun: bool = False  # Whether `advance` has been called, so that the next call continues.
+
+    @property
+    def kernel(self) -> Any:
+        """The compiled method; None if nothing can move."""
+        return self.general if self.system is None else self.system.solve
 
     @cached_property
     def count(self) -> Count:
@@ -222,8 +231,21 @@ class Newton(Solver):
         system = make_system(problem, form, like, bodies)
         return NewtonState(problem, system if system.solve.m else None)
 
+    def complete(self, state: NewtonState) -> None:
+        """Form a dense H of A or of J and M; it stays while only b changes."""
+        kernel = state.kernel
+        if kernel is not None:
+            kernel.keep_matrix()
+            kernel.start(state.problem._start, 0.0, 1)
+
     def update(self, state: NewtonState, problem: Problem) -> NewtonState:
-        """Build the state for new numbers; the elimination order is reused between the same bodies."""
+        """Build the state for new numbers: with the system if only b is new, with the order of the same bodies."""
+        kernel = state.kernel
+        if kernel is not None and problem.has_operator_of(state.problem):
+            get_zero_impulse_reference(problem)
+            kernel.keep_matrix()
+            kernel.use_rhs(problem.metric)
+            return NewtonState(problem, state.system, state.general)
         return self._choose_form_and_build_state(problem, state.system)
 
     def run(
@@ -304,7 +326,11 @@ class Newton(Solver):
         remaining = max_iter - claim.iterations
         if claim.status not in (Status.STALLED, Status.NUMERICAL_ERROR, Status.DIVERGED) or remaining <= 0:
             return claim
-        continuation = self.prepare_continuation(state)
+        try:
+            with limit_forming(deadline):
+                continuation = self.prepare_continuation(state)
+        except TooLate:
+            return replace(claim, status=Status.TIME_LIMIT)
         if continuation is None:
             return claim
         w, e = np.empty(problem.m), np.empty(problem.m)

@@ -90,6 +90,9 @@ class Solver:
         """Return the state for a problem of the same structure with new numbers, without a warm start."""
         return self.prepare(problem)
 
+    def complete(self, state: Any) -> None:
+        """Form and factor now, for `lavender.prepare`, what does not depend on b; `update` may then keep it."""
+
     def run(
         self, state: Any, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None
     ) -> Claim:

@@ -39,26 +39,32 @@ the stages that would run. The decisions depend on these numbers (`decisions.py`
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import inf
+from math import inf, isnan, nan
 
 import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import Deadline
 from lavender.base.errors import BREAKDOWN, format_error
-from lavender.judge.solution import Claim, Status
+from lavender.judge.residuals import (
+    choose_start,
+    find_relative_at_zero,
+    judge_impulse,
+    reuse_or_judge_impulse,
+)
+from lavender.judge.solution import Claim, SolverStage, Status
 from lavender.problem import OPERATORS, Problem
 from lavender.solvers.certify import (
     certify_by_least_violation,
     certify_by_linear_programs,
     certify_infeasibility,
 )
-from lavender.solvers.decisions import DECISIONS, describe_numbers
+from lavender.solvers.decisions import DECISIONS, SMALL_ROWS, describe_numbers
 from lavender.solvers.islands import get_rows_of_blocks, restrict_to_blocks
 from lavender.solvers.registry import Solver, SolverSpec, get
-from lavender.solvers.small import AUTO
+from lavender.solvers.small import AUTO, describe_stages
 from lavender.solving import steps as step_types
-from lavender.solving.compiled_call import choose_call_deadline
+from lavender.solving.compiled_call import choose_call_deadline, fits_in_time
 from lavender.solving.log import Recorder, SolveLog
 from lavender.solving.loop import Loop
 from lavender.solving.singular_programs import program_backends, run_program_backends
@@ -69,7 +75,13 @@ from lavender_ext.judge.measure import residuals_by_island
 assert __doc__ is not None
 __doc__ += describe_numbers() + "\n"
 
+# Under a time limit below this multiple of the least cost of Newton's method, sweeps use their share of the time first.
+AMPLE_TIME = 8.0
 MIN_ITERATIONS_FOR_COMPILED_CALL = 200  # With fewer allowed, the compiled call is not made.
+# Up to so many sweeps under a time limit, the start is returned if its relative residual is lower.
+MIN_DECISIVE_SWEEPS = 64
+# Under a time limit, `admm` follows sweeps if the time of this many sweeps remains.
+MIN_ADMM_SWEEPS = 500.0
 # [ns] Newton's method that has not ended runs on up to this cost: nine rows of masses over many orders took 4.4e7.
 MAX_LAST_NEWTON_COST = 1e8
 
@@ -126,7 +138,15 @@ class Auto(Solver):
         if problem.has_singular_program:
             return run_program_backends(SolveLog(problem, tol, max_iter, deadline), impulse)
         counts: tuple[int, ...] | None = state.failed_call
-        if counts is None and max_iter >= MIN_ITERATIONS_FOR_COMPILED_CALL:
+        can_sweep = deadline.is_set and problem.m > SMALL_ROWS and not problem.cones.has_round
+        first: FirstSweeps | None = None
+        if can_sweep and recorder is None and not (time := FactoringTime(problem, deadline)).fits(AMPLE_TIME):
+            first = FirstSweeps(problem, impulse, tol, time)
+            result_of_sweeps = first.run(max_iter)
+            if result_of_sweeps is not None:
+                return result_of_sweeps
+        may_call = counts is None and max_iter >= MIN_ITERATIONS_FOR_COMPILED_CALL
+        if may_call and fits_in_time(problem, deadline):
             own = choose_call_deadline(problem, deadline)
             result, counts = AUTO.solve_and_judge(problem, impulse, tol, own)
             if result is not None and result.relative <= tol:
@@ -143,6 +163,9 @@ class Auto(Solver):
         tree.started_from_zero = tree.compiled_call_failed and not (impulse - problem._start).any()
         log.start_from_better_impulse(impulse)
         log.recorder = recorder
+        if first is not None:
+            tree.pace, tree.has_swept = first.pace, True
+            log.record_stage("anderson", first.claim, first.before)
         try:
             if max_iter > 0 and log.best > tol and not log.done():
                 for name, claim in failed:
@@ -154,6 +177,76 @@ class Auto(Solver):
             log.failure = format_error(error)
         impulse[:] = log.result if log.best > tol else log.impulse
         return log.make_claim()
+
+
+class FactoringTime:
+    """The least cost of Newton's method on a problem, compared with the remaining time."""
+
+    def __init__(self, problem: Problem, deadline: Deadline) -> None:
+        self.deadline, self.cost = deadline, get("newton").load()().cost(problem)
+        self.total = self.cost.total  # [ns]
+
+    def fits(self, margin: float = 1.0) -> bool:
+        """Return whether this multiple of the cost fits."""
+        fits = self.deadline.fits
+        return fits(margin * self.total) and fits(margin * (self.total + self.cost.setup))
+
+
+class FirstSweeps:
+    """Sweeps under a tight time limit, before the costs of choosing stages, which may exceed the limit.
+
+    They have all of the time if no factorisation fits in it, and else their share. They measure the time of counted
+    work on this machine, and continue if a factorisation would then end too late.
+    """
+
+    def __init__(self, problem: Problem, impulse: FloatArray, tol: float, time: FactoringTime) -> None:
+        deadline = time.deadline
+        self.problem, self.tol, self.time, self.pace = problem, tol, time, 1.0
+        self.start = impulse.copy()
+        at_start = find_relative_at_zero(problem, self.start)
+        self.before = nan if at_start is None else at_start
+        solver = step_types.make_solver("anderson", problem)
+        state = step_types.prepare_sweeps(solver, problem, deadline)
+        self.loop = Loop(problem=problem, solver=solver, state=state, impulse=impulse, tol=tol)
+
+    @np.errstate(all="ignore")  # Results that overflow are judged.
+    def run(self, max_iter: int) -> Claim | None:
+        """Sweep; return the claim of the solve, or None if other solvers continue from the result."""
+        loop, deadline, problem = self.loop, self.time.deadline, self.problem
+        shares = self.time.fits()
+        left = deadline.get_remaining_seconds() or 0.0
+        loop.deadline = Deadline(DECISIONS.time_share * left) if shares else deadline
+        claim = loop.run_chunks(max_iter)
+        if shares and claim.status is Status.TIME_LIMIT:
+            cost = estimate_cost("anderson", problem).iteration
+            self.pace = step_types.measure_pace(loop.time, loop.done, cost)
+            shares = self.time.fits(self.pace)
+            if not shares:
+                loop.deadline = deadline
+                claim = loop.run_chunks(max_iter)
+        if loop.state.watch.has_best:
+            loop._keep_best()
+        else:
+            loop.replace_by_best_impulse(self.start)
+        self.claim = claim
+        is_over = claim.status in (Status.MAX_ITERATIONS, Status.TIME_LIMIT) and not shares
+        if not is_over and claim.status is not Status.CONVERGED:
+            return None
+        judged = reuse_or_judge_impulse(problem, loop.impulse, loop.judged)
+        if loop.done < MIN_DECISIVE_SWEEPS and judged.relative > self.tol:
+            # Few sweeps may raise the error. Nobody whose time is over wants a worse impulse than the start.
+            if isnan(self.before):
+                first = judge_impulse(problem, choose_start(problem, self.start, self.tol))
+                self.before = float(first.relative)
+            if judged.relative > self.before:
+                loop.impulse[:] = choose_start(problem, self.start, self.tol)
+                judged = judge_impulse(problem, loop.impulse.copy())
+        status = Status.CONVERGED if judged.relative <= self.tol else claim.status
+        if claim.status is Status.CONVERGED is not status:
+            return None
+        stages = (SolverStage("anderson", dict(claim.work), self.before, judged.relative),)
+        text = describe_stages(stages)
+        return replace(claim, status=status, message=text, form="", stages=stages, judged=judged)
 
 
 @np.errstate(all="ignore")  # Results that overflow are judged.
@@ -185,7 +278,8 @@ def solve(log: SolveLog, tree: DecisionTree) -> None:
                     return
             elif not tree.leaves_time(stage, step):
                 step.over = step.late = log.timed_out = True
-        if step.over or (isinstance(step, Sweeps) and step.is_hopeless(stage.least)):
+        has_swept = tree.has_swept and not steps.keys() & {"newton", "direct", "newton on the relaxation"}
+        if step.over or (isinstance(step, Sweeps) and (has_swept or step.is_hopeless(stage.least))):
             tree.skip(stage)
         else:
             step.least = stage.least
@@ -201,7 +295,7 @@ def solve(log: SolveLog, tree: DecisionTree) -> None:
     if log.timed_out and not log.done():
         sweep_until_deadline(log, tree, steps)
     can_continue = log.remaining_iterations > 0 or log.last_stage_failed
-    if log.best > log.tol and log.certificate is None and can_continue:
+    if log.best > log.tol and log.certificate is None and can_continue and not log.deadline.has_passed():
         certify_infeasibility(log)
 
 
@@ -228,6 +322,8 @@ def sweep_until_deadline(log: SolveLog, tree: DecisionTree, steps: dict[str, Ste
     log.timed_out = True
     shared = ("anderson", "admm from zero") if starts_relaxed(log.problem) else ()
     for k, name in enumerate((*shared, "anderson")):
+        if name != "anderson" and not log.deadline.fits(MIN_ADMM_SWEEPS * tree.pace * tree.sweep):
+            continue
         step = steps[name] = steps.get(name) or create_solver_step(name, log, tree)
         setup = 0.0 if step.state is not None else estimate_cost(name, log.problem).setup
         if not step.over and (name == "anderson" or log.deadline.fits(setup)):

@@ -11,14 +11,30 @@ from lavender.base.deadline import Deadline
 from lavender.judge.residuals import get_zero_impulse_reference, make_residual
 from lavender.judge.solution import CONVERGED, TIME_LIMIT, Claim, Solution, Status, name_start
 from lavender.problem import Problem
+from lavender.solvers.costs import get_loose_limit
 from lavender.solvers.decisions import DECISIONS, SMALL_ROWS
-from lavender.solvers.registry import SolverSpec
+from lavender.solvers.registry import SolverSpec, get
 from lavender.solving.finish import FinishedRun, make_fields
 from lavender.solving.loop import select_best_impulse
 from lavender_ext.batch.many import solve_new_generalized_problem
 from lavender_ext.small.call import bind_types, solve_compiled
 
 NO_STAGE_MESSAGE = "the time limit was over before its turn: the start"
+
+
+# Under a time limit, the compiled call for more than SMALL_ROWS is made if this multiple of its least cost fits: it
+# may use half of the time, and hands nothing over if it does not end.
+CALL_MARGIN = 3.0
+
+
+def fits_in_time(problem: Problem, deadline: Deadline, loosely: bool = False) -> bool:
+    """Return whether the compiled call of a problem that `auto` may continue ends before the deadline.
+
+    `loosely`: return False unless the limit is so long that no estimate is needed.
+    """
+    if not deadline.is_set or len(problem.b) <= SMALL_ROWS or deadline.fits(get_loose_limit(problem)):
+        return True
+    return not loosely and deadline.fits(CALL_MARGIN * get("newton").load()().cost(problem).total)
 
 
 def choose_call_deadline(problem: Problem, deadline: Deadline) -> Deadline:
@@ -45,6 +61,8 @@ def solve_small(
         Work counts of a call that did not solve the problem. None if the first result is a solution or no call was
         made.
     """
+    if spec.small is None or not (deadline is None or fits_in_time(problem, deadline, spec.delegates)):
+        return None, None
     begin = perf_counter()
     own = None if deadline is None else choose_call_deadline(problem, deadline)
     solution, judged, counts, start = solve_compiled(problem, spec, impulse, tol, own)

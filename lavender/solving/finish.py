@@ -147,11 +147,28 @@ def finish(run: FinishedRun) -> Solution:
         # The other fields are computed when one of them is first read.
         late = make_residual, (problem, judged)
         values |= {"status": CONVERGED, "_late_residual": late, "_rest": (make_fields, (run, judged))}
+    elif (
+        claim.status is TIME_LIMIT
+        and claim.certificate is None
+        and not run.refutation
+        and not min(judged.relative, judged.float64_relative) <= tol
+    ):  # No rule changes this status, so the message is made when it is first read.
+        late = make_residual, (problem, judged)
+        values |= {
+            "status": TIME_LIMIT,
+            "_late_residual": late,
+            "_rest": (make_checked_fields, (run, judged)),
+        }
     else:
         verdict = check_claim(run, make_residual(problem, judged))
         values = make_fields(run, judged, verdict) | values | {"status": verdict.status}
     solution: Solution = make_instance(Solution, values)
     return solution
+
+
+def make_checked_fields(run: FinishedRun, judged: Judged) -> dict[str, Any]:
+    """Return the fields of a solution that are computed at the first access, with the check of the claim."""
+    return make_fields(run, judged, check_claim(run, make_residual(run.problem, judged)))
 
 
 def make_fields(run: FinishedRun, judged: Judged, verdict: Verdict | None = None) -> dict[str, Any]:

@@ -10,7 +10,12 @@ import numpy as np
 from lavender.base.arrays import check_float
 from lavender.base.deadline import Deadline, read_clock
 from lavender.base.lazy_import import import_numerical_modules
+from lavender.problem import Problem
 from lavender.solvers.registry import SolverSpec
+
+# [ns] Cost of two passes of the judge and of the solution, per row and per multiply-add of a product with A.
+JUDGE_COST, JUDGE_COST_PER_ROW, JUDGE_COST_PER_ENTRY = 6e4, 80.0, 2.0
+MAX_JUDGE_SHARE = 0.3  # Largest part of the remaining time that is reserved for the judge.
 
 
 def check_time_limit(time_limit: Any) -> float:
@@ -26,6 +31,13 @@ def check_time_limit(time_limit: Any) -> float:
     if time_limit is None or (isinstance(time_limit, np.floating) and time_limit == np.inf):
         return math.inf
     return check_float("time_limit", time_limit, above=0.0)
+
+
+def reserve_time_of_judge(problem: Problem, deadline: Deadline) -> None:
+    """Move the deadline by the counted cost of the passes of the judge after a solve, at most a part of the time."""
+    cost = JUDGE_COST + JUDGE_COST_PER_ROW * problem.m + JUDGE_COST_PER_ENTRY * problem.metric.work
+    left = deadline.get_remaining_seconds() or 0.0
+    deadline.extend(-min(1e-9 * cost, MAX_JUDGE_SHARE * left))
 
 
 def make_deadline(spec: SolverSpec, limit: float, begun: float) -> Deadline:

@@ -43,6 +43,9 @@ MIN_TIME_LIMIT = 1e-6  # Smallest time limit [s] that is passed to a solver.
 # Largest number of iterations of the first chunk: at 40 us per iteration, as of solvers in Python, it takes 10 ms.
 FIRST_CHUNK_ITERATIONS = 256
 FIRST_LIMITED_ITERATIONS = 16  # The same under a time limit.
+LIMITED_CHUNK_MARGIN = (
+    4  # The first chunk is shorter by this factor then: a sweep may take 4 ns per unit of work.
+)
 Callback = Callable[[int, FloatArray, Residual], Any]
 # The fields are iterations, time [s], relative residual, energy error and velocity error.
 Record = tuple[int, float, float, float, float]
@@ -118,6 +121,8 @@ class Loop:
         if self.deadline is not None:
             seconds, first = self._choose_chunk_time(), FIRST_LIMITED_ITERATIONS
         chunk = min(first, max(1, int(1e9 * seconds) // max(1, self.problem.metric.work)))
+        if self.deadline is not None and self.done == 0:
+            chunk = max(1, chunk // LIMITED_CHUNK_MARGIN)
         records = self.records is not None or self.callback is not None
         claim, deadline = EMPTY_CLAIM, self.deadline
         try:
@@ -174,6 +179,13 @@ class Loop:
             result = select_best_impulse(problem, result, start, self.tol)
         self.judged = result
         self.impulse[:] = result.impulse
+
+    def keep_start(self) -> None:
+        """Judge the start, and let the zero impulse replace it as in a solve."""
+        problem = self.problem
+        if not are_bit_identical(self.impulse, problem._start):
+            self.impulse[:] = combine_best_islands(problem, self.impulse, (), self.tol)
+        self.judged = judge_impulse(problem, self.impulse.copy())
 
     def _keep_best(self) -> None:
         """Replace the last iterate by the best checked iterate."""

@@ -7,6 +7,7 @@ are in `solving/loop.py`, the end is in `finish.py`.
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from threading import Lock
@@ -25,8 +26,9 @@ from lavender.base.arrays import (
     check_int,
     mark_read_only,
 )
-from lavender.base.deadline import NEVER, Deadline, read_clock
+from lavender.base.deadline import NEVER, Deadline, TooLate, limit_forming, read_clock
 from lavender.base.errors import BREAKDOWN, CapabilityError, InputError, InUse, UnknownName, format_error
+from lavender.base.lazy_import import import_numerical_modules
 from lavender.judge.certificates import prove_infeasibility
 from lavender.judge.residuals import (
     Residual,
@@ -49,12 +51,13 @@ from lavender.judge.solution import (
 )
 from lavender.problem import Problem, check_problem
 from lavender.solvers.certify import check_infeasibility_claim
+from lavender.solvers.decisions import SMALL_ROWS
 from lavender.solvers.islands import find_islands
 from lavender.solvers.registry import Solver, SolverSpec, get
 from lavender.solvers.small import NO_TIME_MESSAGE
 from lavender.solving.compiled_call import solve_small
 from lavender.solving.finish import FinishedRun, decide_empty_rows, finish, name_lost_row
-from lavender.solving.limits import check_time_limit, make_deadline
+from lavender.solving.limits import check_time_limit, make_deadline, reserve_time_of_judge
 from lavender.solving.loop import MIN_TIME_LIMIT, Callback, Loop
 from lavender.solving.velocity import accept_velocity, relative_tolerance
 from lavender_ext.judge.measure import residuals_by_island
@@ -102,7 +105,9 @@ def prepare(problem: Problem, solver: str = "auto", **options: Unpack[SolverOpti
     >>> solution.success
     True
     """
-    return Prepared(problem, get(solver), cast("dict[str, Any]", options))
+    prepared = Prepared(problem, get(solver), cast("dict[str, Any]", options))
+    prepared._complete_set_up()
+    return prepared
 
 
 class SolveArguments(NamedTuple):
@@ -305,6 +310,8 @@ class Prepared:
             loop.solver, loop.state = setup.solver, setup.state
             if deadline is not None:
                 self._start_workers(setup, deadline)
+                if self.spec.builtin and not self.spec.external:
+                    reserve_time_of_judge(problem, deadline)
             if self.spec.delegates:
                 setup.state.failed_call = arguments.failed_call
                 setup.state.loop = loop if arguments.history else None
@@ -343,18 +350,35 @@ class Prepared:
             setup = NotSetUp()
         else:
             try:
-                if isinstance(last, SetUp) and not (is_other and not same_structure(self.problem, problem)):
-                    state = solver.update(last.state, problem)
-                else:
-                    state = solver.prepare(problem)
+                with limit_forming(deadline):
+                    if isinstance(last, SetUp) and not (
+                        is_other and not same_structure(self.problem, problem)
+                    ):
+                        state = solver.update(last.state, problem)
+                    else:
+                        state = solver.prepare(problem)
                 setup = SetUp(solver, state)
             except InputError:
                 raise  # The solver does not accept the problem.
+            except TooLate:
+                setup = NotSetUp()
             except BREAKDOWN as error:
                 setup = NotSetUp(failure=format_error(error))
         self._original, self.problem, self._setup = original, problem, setup
         self.setup_time += perf_counter() - begin
         return setup
+
+    def _complete_set_up(self) -> None:
+        """Form and factor what does not depend on b."""
+        begin, setup = perf_counter(), self._setup
+        if not self.problem.has_singular_program:
+            if self.spec.builtin and not self.spec.external and self.problem.m > SMALL_ROWS:
+                import_numerical_modules(*getattr(self.spec.load(), "lazy_modules", ()))
+            with suppress(*BREAKDOWN):  # A solve repeats it and reports the error.
+                get_zero_impulse_reference(self.problem)
+                if isinstance(setup, SetUp):
+                    setup.solver.complete(setup.state)
+        self.setup_time += perf_counter() - begin
 
     def _start_workers(self, setup: SetUp, deadline: Deadline) -> None:
         """Start the worker processes of a solver, without counting their start as time of the solve."""
@@ -385,7 +409,7 @@ class Prepared:
             deadline is not None and deadline.has_passed() and not spec.external
         ):
             claim = Claim(TIME_LIMIT, 0, {}, NO_TIME_MESSAGE)
-            loop.replace_by_best_impulse(loop.impulse)
+            loop.keep_start()
         else:
             has_checks = type(getattr(setup.state, "watch", None)) is StoppingTest
             keeps_best = has_checks or spec.delegates  # Its result is never worse than the start.
@@ -430,7 +454,8 @@ class Prepared:
         spec, problem, refutation = self.spec, self.problem, ""
         claim = name_lost_row(problem, loop.impulse, claim)
         keeps_best = spec.delegates and not problem.has_singular_program
-        if not keeps_best and (claim.status is TIME_LIMIT or not has_checks):
+        checked = has_checks and loop.state.watch.has_best
+        if not keeps_best and not checked and (claim.status is TIME_LIMIT or not has_checks):
             claimed = loop.impulse.copy()
             loop.replace_by_best_impulse(start)
             if claim.status is CONVERGED and not np.array_equal(claimed, loop.impulse):

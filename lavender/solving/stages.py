@@ -42,6 +42,8 @@ class DecisionTree:
     run on a problem with more islands.
     """
 
+    pace = 2.0  # Time of counted work on this machine as a multiple of its cost; assumed until sweeps have measured it.
+    has_swept = False  # Whether sweeps have had their share before the first stage.
     compiled_call_failed = False  # Whether the compiled call over velocities of J and M has failed.
     started_from_zero = False  # Whether that call started from the zero impulse.
     remaining_cost = 0.0  # [ns] Cost that the alternation may still use.
@@ -153,7 +155,7 @@ class DecisionTree:
         """Return whether a factorising solver of this cost [ns] ends in time if it starts after `before` [ns]."""
         if not self.deadline.is_set:
             return True
-        needed = before + cost
+        needed = before + self.pace * cost
         if name == "newton" and "newton_state" in vars(self):
             return self.deadline.fits(needed)
         return self.deadline.fits(get_loose_limit(self.problem) + needed) or self.deadline.fits(

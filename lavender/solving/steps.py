@@ -31,6 +31,8 @@ FIRST_SWEEPS_OF_LARGE_PROBLEM = 8  # Sweeps of `is_large` problems before the fi
 FIRST_RELAXED_FACTORISATIONS = 6  # Interior points on the relaxation need at least as many factorisations.
 RELAXED_TOLERANCE = 0.01  # The relaxation's tolerance relative to tol, since Coulomb's residual is larger.
 FORMATION_COST_RATIO = 4.0  # Sweeps use a formed A only if this multiple of the cost to form it remains.
+# A factorising solver is assumed to take this multiple of the time that sweeps take per counted work, at most MAX_PACE.
+PACE_MARGIN, MAX_PACE = 1.5, 20.0
 HALVING_FACTORISATIONS = 30  # A turn of Newton's method continues while the last ones halve the residual.
 #: Solver of each step, by its name. On large piles, `admm` needs fewer iterations from zero than from sweeps.
 METHODS = {
@@ -65,6 +67,19 @@ def starts_relaxed(problem: Problem) -> bool:
     if not large or problem.cones.has_round or not problem.is_symmetric:
         return False
     return problem.generalized is None or find_bodies(problem) is not None
+
+
+def prepare_sweeps(solver: Any, problem: Problem, deadline: Deadline) -> Any:
+    """Prepare sweeps, over the given form if too little time remains to form A."""
+    too_late = not deadline.fits(get_loose_limit(problem)) and not deadline.fits(
+        FORMATION_COST_RATIO * estimate_formation_cost(problem)
+    )
+    return build_state_in_given_form(solver, problem) if too_late else solver.prepare(problem)
+
+
+def measure_pace(seconds: float, iterations: int, cost: float) -> float:
+    """Return the time of counted work on this machine as a multiple of its cost [ns], with a margin."""
+    return min(max(PACE_MARGIN * seconds / max(1e-9 * iterations * cost, 1e-9), 1.0), MAX_PACE)
 
 
 class Step:
@@ -280,11 +295,7 @@ class Sweeps(Iterations):
 
     def prepare_and_set_start(self) -> None:
         """Prepare the sweeps; start from the best impulse."""
-        p, deadline = self.log.problem, self.log.deadline
-        too_late = not deadline.fits(get_loose_limit(p)) and not deadline.fits(
-            FORMATION_COST_RATIO * estimate_formation_cost(p)
-        )
-        self.state = build_state_in_given_form(self.solver, p) if too_late else self.solver.prepare(p)
+        self.state = prepare_sweeps(self.solver, self.log.problem, self.log.deadline)
         self.impulse = self.log.impulse.copy()
 
     def run_loop(self, loop: Loop, n: int) -> Claim:

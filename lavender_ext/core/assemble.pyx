@@ -12,6 +12,7 @@ import numpy as np
 
 from lavender_ext.core.arrays cimport get_plain_matrix, make_read_only, ndarray
 from lavender_ext.core.csr cimport transpose_csr
+from lavender_ext.core.deadline cimport Deadline, deadline_t, get_pointer, has_passed
 from lavender_ext.core.faults cimport NO_FAULT, find_matrix_fault
 from lavender_ext.core.mass cimport THIN_PADDING, compress_dense_rows
 from lavender_ext.core.validate cimport has_invalid_number
@@ -347,35 +348,50 @@ def stack_csr_matrices(int32_t n, matrices):
     return indptr[:m + 1], indices, data
 
 
-cdef public void lav_count_gram_entries(int32_t m, const int32_t* indptr, const int32_t* indices, const int32_t* ptr,
-                                        const int32_t* row, int32_t* mark, int32_t* count) noexcept nogil:
-    """Write the row pointers of the pattern of Y Y^T + D, diagonal included, into count (m + 1); mark (m) is scratch."""
+cdef inline double sparse_product_cost() noexcept nogil:
+    """Return the time [ns] of a multiply-add of a sparse row by a sparse row."""
+    return 2.0
+
+
+cdef bint count_gram_entries(int32_t m, const int32_t* indptr, const int32_t* indices, const int32_t* ptr,
+                             const int32_t* row, int32_t* mark, int32_t* count,
+                             deadline_t* deadline) noexcept nogil:
+    """Write the row pointers of the pattern of Y Y^T + D, diagonal included, into count (m + 1); mark (m) is scratch.
+
+    Return 0 if the deadline has passed before the end.
+    """
     cdef int32_t i, q, p, k
+    cdef double work
     for i in range(m):
         mark[i] = -1
     count[0] = 0
     for i in range(m):
         mark[i] = i
-        k = 1
+        k, work = 1, 0.0
         for q in range(indptr[i], indptr[i + 1]):
+            work += ptr[indices[q] + 1] - ptr[indices[q]]
             for p in range(ptr[indices[q]], ptr[indices[q] + 1]):
                 if mark[row[p]] != i:
                     mark[row[p]] = i
                     k += 1
         count[i + 1] = count[i] + k
+        if has_passed(deadline, sparse_product_cost() * work):
+            return False
+    return True
 
 
-cdef public int32_t lav_form_gram_matrix(int32_t m, const int32_t* indptr, const int32_t* indices, const double* data,
-                             const int32_t* ptr, const int32_t* row, const double* value, const double* diagonal,
-                             int32_t* next, double* sum_, int32_t* count, int32_t* out, double* entry) noexcept nogil:
-    """Compute Y Y^T + D in compressed rows without zero entries; return the number of entries.
+cdef int32_t form_sparse_gram_matrix(int32_t m, const int32_t* indptr, const int32_t* indices, const double* data,
+                                     const int32_t* ptr, const int32_t* row, const double* value, const double* diagonal,
+                                     int32_t* next, double* sum_, int32_t* count, int32_t* out, double* entry,
+                                     deadline_t* deadline) noexcept nogil:
+    """Compute Y Y^T + D in compressed rows without zero entries; return the number of entries, -1 after the deadline.
 
     Each entry is a sum over the columns of Y in their order, the same for (i, j) and (j, i). count is from
-    `lav_count_gram_entries`; next (2 m) and sum_ (m) are scratch.
+    `count_gram_entries`; next (2 m) and sum_ (m) are scratch.
     """
     cdef int32_t i, j, q, p, k, to = 0, begin
     cdef int32_t* list_ = next + m
-    cdef double y
+    cdef double y, work
     # Row i appends its entries to their columns, so that the rows of each column ascend.
     for i in range(m):
         next[i] = count[i]
@@ -383,10 +399,11 @@ cdef public int32_t lav_form_gram_matrix(int32_t m, const int32_t* indptr, const
         list_[i] = -1
     for i in range(m):
         # The entries of row i are linked through `list_` from the last to the first; their order does not matter.
-        k = i
+        k, work = i, 0.0
         list_[i] = i
         for q in range(indptr[i], indptr[i + 1]):
             y = data[q]
+            work += ptr[indices[q] + 1] - ptr[indices[q]]
             for p in range(ptr[indices[q]], ptr[indices[q] + 1]):
                 j = row[p]
                 if list_[j] < 0:
@@ -405,6 +422,8 @@ cdef public int32_t lav_form_gram_matrix(int32_t m, const int32_t* indptr, const
             if k == i:
                 break
             k = j
+        if has_passed(deadline, sparse_product_cost() * work):
+            return -1
     for i in range(m):
         begin = count[i]
         count[i] = to
@@ -414,6 +433,11 @@ cdef public int32_t lav_form_gram_matrix(int32_t m, const int32_t* indptr, const
             to += 1
     count[m] = to
     return to
+
+
+cdef inline double dense_product_cost() noexcept nogil:
+    """Return the time [ns] of a multiply-add of `form_dense_gram_matrix`."""
+    return 0.5
 
 
 cdef enum:
@@ -432,8 +456,12 @@ cdef bint has_identical_row_columns(int32_t m, const int32_t* indptr, const int3
     return True
 
 
-cdef void form_dense_gram_matrix(int32_t m, int64_t n, const double* y, const double* y_transposed, double* a) noexcept nogil:
-    """Compute a (m, m) = Y Y^T of a dense Y (m, n), summed in the order of the columns, as in `lav_form_gram_matrix`."""
+cdef bint form_dense_gram_matrix(int32_t m, int64_t n, const double* y, const double* y_transposed, double* a,
+                                 deadline_t* deadline) noexcept nogil:
+    """Compute a (m, m) = Y Y^T of a dense Y (m, n), summed in the order of the columns, as in `form_sparse_gram_matrix`.
+
+    Return False if the deadline has passed before the end.
+    """
     cdef int32_t tiles = (m + TILE - 1) // TILE, down, right, i, j, r, c, high, wide
     cdef int64_t k
     cdef double x
@@ -458,6 +486,9 @@ cdef void form_dense_gram_matrix(int32_t m, int64_t n, const double* y, const do
             for r in range(high):
                 for c in range(wide):
                     a[<int64_t>(i + r) * m + j + c] = a[<int64_t>(j + c) * m + i + r] = s[TILE * r + c]
+            if has_passed(deadline, TILE * TILE * n * dense_product_cost()):
+                return False
+    return True
 
 
 cdef int32_t compress_dense_gram_matrix(int32_t m, const double* diagonal, int32_t* count, int32_t* out,
@@ -479,9 +510,13 @@ cdef int32_t compress_dense_gram_matrix(int32_t m, const double* diagonal, int32
 
 
 def form_gram_matrix(const double[::1] data, const int32_t[::1] indices, const int32_t[::1] indptr, int n,
-                     const double[::1] diagonal):
-    """Return (indptr, indices, data) of Y Y^T + D, columns sorted, for Y (m, n) in compressed rows and D = diag(diagonal)."""
+                     const double[::1] diagonal, Deadline deadline=None):
+    """Return (indptr, indices, data) of Y Y^T + D, columns sorted, for Y (m, n) in compressed rows and D = diag(diagonal).
+
+    Return None if the deadline has passed before the end.
+    """
     cdef int32_t m = <int32_t>indptr.shape[0] - 1, nnz = <int32_t>indices.shape[0], total
+    cdef deadline_t* end = get_pointer(deadline)
     cdef int32_t[::1] whole = np.empty(n + 2 + nnz + 2 * m + 1, np.int32), count, out
     cdef double[::1] value = np.empty(nnz + m + 1), entry
     cdef const int32_t* columns = &indices[0] if nnz else NULL
@@ -499,15 +534,22 @@ def form_gram_matrix(const double[::1] data, const int32_t[::1] indices, const i
         full = nnz > 0 and <int64_t>m * m < INT32_MAX and has_identical_row_columns(m, &indptr[0], columns)
         if full:
             count[m] = m * m
+            total = 0
         else:
-            lav_count_gram_entries(m, &indptr[0], columns, ptr, row, scratch, &count[0])
+            total = count_gram_entries(m, &indptr[0], columns, ptr, row, scratch, &count[0], end) - 1
+    if total < 0:
+        return None
     out_array, entry_array = np.empty(count[m], np.int32), np.empty(count[m])
     out, entry = out_array, entry_array
     with nogil:
         if full:
-            form_dense_gram_matrix(m, nnz // m, numbers, &value[0], &entry[0])
-            total = compress_dense_gram_matrix(m, &diagonal[0], &count[0], &out[0], &entry[0])
+            if form_dense_gram_matrix(m, nnz // m, numbers, &value[0], &entry[0], end):
+                total = compress_dense_gram_matrix(m, &diagonal[0], &count[0], &out[0], &entry[0])
+            else:
+                total = -1
         else:
-            total = lav_form_gram_matrix(m, &indptr[0], columns, numbers, ptr, row, &value[0], &diagonal[0], scratch, &value[nnz],
-                             &count[0], &out[0], &entry[0])
+            total = form_sparse_gram_matrix(m, &indptr[0], columns, numbers, ptr, row, &value[0], &diagonal[0], scratch,
+                                            &value[nnz], &count[0], &out[0], &entry[0], end)
+    if total < 0:
+        return None
     return count_array, out_array[:total], entry_array[:total]

@@ -6,6 +6,7 @@ from libc.stdint cimport int32_t
 from lavender_ext.core.deadline cimport get_pointer
 from lavender_ext.core.method cimport (BROKEN, CERTIFICATE, ROUNDOFF_LIMIT, LOST, MORE, REACHED, SPENT, STUCK, UNFIT, info_t,
                                        options_t)
+from lavender_ext.core.view cimport csr_t
 from lavender_ext.host cimport analyse_for_method, free_workspace, grow_workspace_to, start_method
 
 OUTCOMES = {"more": MORE, "reached": REACHED, "floor": ROUNDOFF_LIMIT, "stuck": STUCK, "certificate": CERTIFICATE, "spent": SPENT,
@@ -38,6 +39,13 @@ cdef class Method:
             self.how = start_method(&self.own, &self.view, o, &self.space, &impulse[0], &self.memory, grow_workspace_to)
         if self.how == UNFIT:
             raise MemoryError(f"{self.space.n_real} numbers")
+
+    def use_rhs(self, Data data):
+        """Solve data of the same operator and law with another b from the next `start` on."""
+        cdef const csr_t* a = self.view.a
+        self.data, self.view = data, data.get_pointers()
+        if a != NULL:
+            self.view.a = a
 
     def step(self, int work, double[::1] impulse):
         """Do `work` units of work and return one of `OUTCOMES`.

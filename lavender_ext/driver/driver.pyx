@@ -8,9 +8,9 @@ from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport NEWTON
 from lavender_ext.factor.factors cimport has_wide
 from lavender_ext.host cimport analyse_for_method, start_method, step_method
-from lavender_ext.velocity_newton.method cimport islands_workspace_size, start_islands, advance_islands
+from lavender_ext.velocity_newton.method cimport islands_workspace_size, keep_island_matrix, start_islands, advance_islands
 from lavender_ext.newton.rows cimport are_generalized_rows_faster
-from lavender_ext.newton.solve cimport (bodies_workspace_size, start_newton_over_bodies, rows_workspace_size,
+from lavender_ext.newton.solve cimport (bodies_workspace_size, keep_row_matrix, start_newton_over_bodies, rows_workspace_size,
                                         start_newton_over_rows, step_newton_system)
 from lavender_ext.velocity_newton.soft cimport needs_no_proximal_terms
 
@@ -73,6 +73,13 @@ cdef class Driver(Method):
         self.options.work = work
         self.own = find_method_functions(&self.view)
         self.fits = data.blocks.n_rows > 0 and self.analyse() == NEEDS_WORKSPACE
+
+    def keep_matrix(self):
+        """Let later starts keep a dense H that is formed; only `use_rhs` may change the data then."""
+        if self.own.start == start_newton_over_rows:
+            keep_row_matrix(&self.space)
+        elif self.own.start == start_islands:
+            keep_island_matrix(&self.space)
 
     @property
     def islands(self):

@@ -271,6 +271,11 @@ cdef class StoppingTest:
             return self.state.best_relative, None
         return self.state.best_relative, np.array(self.keep[2])[:self.view.p.n_rows]
 
+    @property
+    def has_best(self):
+        """Whether an impulse was checked, so that `keep_best` returns the best one."""
+        return self.state.best.seen > 0
+
     def keep_best(self, double[::1] lam, double tol):
         """Replace lam (m,), unless its residual is at most tol, by the best impulse of each island, including lam."""
         cdef stopping_test_t* s = &self.state

@@ -9,6 +9,7 @@ from libc.string cimport memset
 
 from lavender_ext.core.arena cimport arena_t, take_doubles, take_integers
 from lavender_ext.core.block_types cimport CONE, COULOMB, blocks_t, has_friction
+from lavender_ext.core.deadline cimport deadline_t, has_passed
 from lavender_ext.core.view cimport csr_t, generalized_t, view_t
 from lavender_ext.factor.linear cimport NO_FACTOR, analyse_dense, analyse_rows, bind_rows_values
 from lavender_ext.factor.tiles cimport combine_rows
@@ -154,11 +155,13 @@ cdef inline void bind_row_values(newton_t* n, int64_t m, bint dense, arena_t* a)
 
 
 cdef inline void form_row_system(newton_t* n, const csr_t* a, int32_t wide) noexcept nogil:
-    """Form H and set whether it is symmetric."""
+    """Form H and set whether it is symmetric; a dense H that is formed may stay."""
     n.linear.wide, n.linear.factored = wide, NO_FACTOR
     if n.s.form == DENSE:
         analyse_dense(&n.linear, n.sc.e.m)
-        n.s.symmetric = form_scaled_matrix(&n.sc, a, n.problem.p.n_rows, n.linear.swap, <double*>n.s.h)
+        if not (n.keeps_matrix and n.has_matrix):
+            n.s.symmetric = form_scaled_matrix(&n.sc, a, n.problem.p.n_rows, n.linear.swap, <double*>n.s.h)
+        n.has_matrix = True
         return
     n.linear.rows.factor.wide, n.linear.tiny, n.linear.shift = wide, pivot_tolerance(), 0.0
     list_unfixed_entries(&n.sc, n.problem.p.n_rows, a, n.linear.swap, &n.s.a)
@@ -209,10 +212,17 @@ cdef inline bint are_generalized_rows_faster(const view_t* v) noexcept nogil:
     return m * m * m / 3.0 <= velocity_steps_per_row_step() * work
 
 
-cdef inline void form_generalized_matrix(newton_t* n, int32_t wide, double* transpose, int32_t* at) noexcept nogil:
-    """Form a dense H with its compliance from Y = J L^-T of M = L D L^T; up to three doubles after H are lost.
+cdef inline double combined_product_cost() noexcept nogil:
+    """Return the time [ns] of a multiply-add of `combine_rows` on rows that exceed the caches."""
+    return 0.3
 
-    transpose (nv, m + 4) and at (nv) are scratch. The rows of Y D^-1/2 are multiplied by the columns of its transpose.
+
+cdef inline bint form_generalized_matrix(newton_t* n, int32_t wide, double* transpose, int32_t* at,
+                                         deadline_t* deadline) noexcept nogil:
+    """Form a dense H with its compliance from Y = J L^-T of M = L D L^T, unless a formed H may stay.
+
+    Return False if the deadline has passed before the end. Up to three doubles after H are lost. transpose (nv, m + 4) and
+    at (nv) are scratch. The rows of Y D^-1/2 are multiplied by the columns of its transpose.
     """
     cdef const scaled_t* s = &n.sc
     cdef const generalized_t* g = n.problem.g
@@ -222,6 +232,10 @@ cdef inline void form_generalized_matrix(newton_t* n, int32_t wide, double* tran
     cdef double* line = transpose + <int64_t>g.n * rows
     analyse_dense(&n.linear, m)
     n.s.symmetric, n.linear.wide, n.linear.factored = 1, wide, NO_FACTOR
+    if n.keeps_matrix and n.has_matrix:
+        memset(<double*>s.e.theta, 0, m * sizeof(double))
+        return True
+    n.has_matrix = False
     memset(transpose, 0, <int64_t>g.n * rows * sizeof(double))
     for _pass in range(2):
         for i in range(s.e.n):
@@ -237,8 +251,12 @@ cdef inline void form_generalized_matrix(newton_t* n, int32_t wide, double* tran
                         transpose[at[c] + j] = line[c]
                 if _pass == 1:
                     combine_rows(wide, rows, nc, transpose, at, line, h + <int64_t>j * m)
+                    if has_passed(deadline, combined_product_cost() * nc * rows):
+                        return False
     for i in range(m):
         for j in range(i):
             h[<int64_t>j * m + i] = h[<int64_t>i * m + j]
         h[<int64_t>i * (m + 1)] += s.e.theta[i]
     memset(<double*>s.e.theta, 0, m * sizeof(double))
+    n.has_matrix = True
+    return True

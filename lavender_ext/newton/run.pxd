@@ -201,6 +201,8 @@ cdef struct newton_t:           # bound to its workspace; it must not move
     int32_t has_convex_start    # Coulomb's law: convex_z solves the convex law, or nearly so if many contacts slide
     int32_t is_at_rest          # Coulomb's law: few contacts of a large problem must slide
     int32_t mostly_slides       # Coulomb's law: many contacts slide at convex_z
+    int32_t keeps_matrix        # the caller starts again with the same A: a formed H stays
+    int32_t has_matrix          # H is formed
     int32_t counts[N_COUNTED]
     int32_t stack[MAX_PHASE_DEPTH]
     int32_t depth

@@ -15,7 +15,7 @@ import numpy as np
 
 from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles, take_integers
 from lavender_ext.core.arrays cimport get_data_pointer
-from lavender_ext.core.method cimport (CERTIFICATE, MORE, NEEDS_WORKSPACE, UNFIT, info_t, Method, method_t, options_t,
+from lavender_ext.core.method cimport (CERTIFICATE, MORE, NEEDS_WORKSPACE, SPENT, UNFIT, info_t, Method, method_t, options_t,
                                        require_workspace, workspace_t)
 from lavender_ext.core.block_types cimport CONE
 from lavender_ext.core.csr cimport measure_asymmetry_and_bandwidth
@@ -204,6 +204,11 @@ cdef inline int32_t analyse_rows_in_workspace(newton_t* n, const view_t* v, cons
     return MORE if r.is_bound else UNFIT
 
 
+cdef void keep_row_matrix(workspace_t* r) noexcept nogil:
+    """Let later starts over rows, with the same A, keep a dense H that is formed."""
+    state_of(r).keeps_matrix = True
+
+
 cdef int32_t start_newton_over_rows(const view_t* v, const options_t* o, workspace_t* r, const double* lam) noexcept nogil:
     cdef newton_t* n = state_of(r)
     cdef const host_t* host = <const host_t*>o.host
@@ -224,7 +229,8 @@ cdef int32_t start_newton_over_rows(const view_t* v, const options_t* o, workspa
     scale_problem(n, &matrix)
     bind_row_values(n, n.sc.e.m, n.s.form == DENSE, &a)
     if v.a == NULL:
-        form_generalized_matrix(n, o.wide, take_doubles(&a, scratch), r.index + head())
+        if not form_generalized_matrix(n, o.wide, take_doubles(&a, scratch), r.index + head(), o.deadline):
+            return SPENT
     else:
         form_row_system(n, v.a, o.wide)
     if host != NULL:
@@ -539,6 +545,11 @@ cdef class Solve(Method):
             self.host.others = external_t(<void*>self, call_linear_factor, call_linear_solve)
         self.prepare_workspace()
         return self
+
+    def keep_matrix(self):
+        """Let later starts keep a dense H that is formed; only `use_rhs` may change the data then."""
+        if self.own.start == start_newton_over_rows:
+            keep_row_matrix(&self.space)
 
     def start(self, const double[::1] impulse, double tol, int budget):
         """Start from impulse (rows,), to a relative residual of tol, with `budget` factorisations."""

@@ -176,6 +176,7 @@ cdef inline void find_islands_and_factor_patterns(flow_t* f, const blocks_t* p, 
     cdef double values
     cdef const int32_t* lptr
     f.p = p[0]
+    f.keeps_matrix = f.has_matrix = False
     f.law = p.law if has_friction(p) else CONE          # Without friction, the laws do not differ.
     f.p.law = f.law
     f.softness = 1e-4 if not has_friction(p) else (3e-2 if f.law == COULOMB else 3e-3)

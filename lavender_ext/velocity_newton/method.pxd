@@ -11,7 +11,7 @@ from lavender_ext.core.view cimport view_t
 from lavender_ext.velocity_newton.flow cimport flow_t
 from lavender_ext.velocity_newton.islands cimport (bind_iterate, bind_structure, find_islands_and_factor_patterns, requirements_t,
                                                    set_required_residual, structure_t)
-from lavender_ext.velocity_newton.newton cimport solve_islands
+from lavender_ext.velocity_newton.newton cimport form_kept_matrix, solve_islands
 from lavender_ext.velocity_newton.sparse cimport initial_entries_per_row
 
 
@@ -46,6 +46,11 @@ cdef inline bint exceeds_limits(const options_t* o, const requirements_t* need, 
     return entries > o.most or 0.0 < o.work < 0.5 * factored * factored / n
 
 
+cdef inline void keep_island_matrix(workspace_t* r) noexcept nogil:
+    """Let later starts, with the same J and M, keep the columns of A of a single island."""
+    (<state_t*>r.index).f.keeps_matrix = True
+
+
 cdef inline int32_t start_islands(const view_t* v, const options_t* o, workspace_t* r, const double* lam) noexcept nogil:
     """Find the structure, then bind the workspace; NEEDS_WORKSPACE, UNFIT or MORE."""
     cdef state_t* s = <state_t*>r.index
@@ -73,7 +78,9 @@ cdef inline int32_t start_islands(const view_t* v, const options_t* o, workspace
         return NEEDS_WORKSPACE
     a = make_arena(r.real, NULL)
     bind_iterate(&s.f, need, &a)
-    s.f.wide = o.wide
+    s.f.wide, s.f.deadline = o.wide, o.deadline
+    s.f.p.b, s.f.p.islands, s.f.g = v.p.b, v.p.islands, v.g      # Another b may have been given since the analysis.
+    form_kept_matrix(&s.f)
     set_required_residual(&s.f, o.tol, 0, o.e0, o.v0)
     s.done = 0
     return MORE

@@ -42,9 +42,10 @@ from lavender_ext.core.method cimport BROKEN, LOST, MORE, REACHED, STUCK
 from lavender_ext.core.block_types cimport CONE, COULOMB, get_friction_components, friction_components_t
 from lavender_ext.core.start cimport is_zero_impulse, clip_zero_to_row_bounds
 from lavender_ext.core.line_search cimport begin_line_search, is_reduction_sufficient, line_t, narrow_line_search
-from lavender_ext.velocity_newton.flow cimport (UNFORMED, multiply_y_transpose, end_block_of_run, first_block_of_run, clear_rows,
-                                                compute_island_impulses, copy_rows, descent_t, flow_t, measure_impulse_errors,
-                                                paused_t, recompute_slack, end_row_of_run, first_row_of_run)
+from lavender_ext.velocity_newton.flow cimport (UNFORMED, form_column_of_a, multiply_y_transpose, end_block_of_run,
+                                                first_block_of_run, clear_rows, compute_island_impulses, copy_rows, descent_t,
+                                                flow_t, measure_impulse_errors, paused_t, recompute_slack, end_row_of_run,
+                                                first_row_of_run)
 from lavender_ext.velocity_newton.normal cimport (FEW_CHANGES, MANY_CHANGES, SAME_V, compare_v, factor_normal_matrix,
                                                  form_normal_matrix, has_nonzero_v, solve_step)
 from lavender_ext.velocity_newton.soft cimport has_bounded_rows_only, min_relative_compliance
@@ -342,6 +343,9 @@ cdef inline int32_t descend_island(flow_t* f, int32_t island, double goal) noexc
             compute_island_impulses(f, island, f.s, f.lam)
         x.response_is_known = 0
         moves = multiply_y_transpose(f, island, f.lam, f.u)
+        if f.deadline != NULL and f.deadline.passed:
+            x.response_is_known = 1
+            return MORE
         size = compute_gradient(f)
         if not rigid and f.law != COULOMB and x.steps > 0 and bounds_errors(f, island, size):
             copy_rows(f, island, f.lam, f.best)
@@ -532,7 +536,20 @@ cdef inline void choose_island_unknowns(flow_t* f, int32_t island) noexcept nogi
             f.n_unknowns += 1
     k, f.rows = f.rows, f.n_unknowns + 3 & ~3
     f.a = f.y_transpose + k * f.rows
-    f.panel_of_column[0] = UNFORMED
+    if not f.has_matrix:
+        f.panel_of_column[0] = UNFORMED
+
+
+cdef inline void form_kept_matrix(flow_t* f) noexcept nogil:
+    """Form every column of A, if the problem has a single island, over rows, and these columns may stay."""
+    cdef int32_t a
+    if not f.keeps_matrix or f.has_matrix or f.n_islands != 1 or not f.over_rows[0]:
+        return
+    f.island = 0
+    choose_island_unknowns(f, 0)
+    for a in range(f.n_unknowns):
+        form_column_of_a(f, a)
+    f.has_matrix = f.deadline == NULL or not f.deadline.passed
 
 
 cdef inline bint is_island_inactive(flow_t* f, int32_t island, double* impulse) noexcept nogil:

@@ -17,7 +17,7 @@ and with contacts, whose blocks of V may be full, with a the rows of the blocks 
 from libc.stdint cimport int32_t
 from libc.string cimport memcpy, memset
 
-from lavender_ext.core.deadline cimport entry_cost, has_passed, product_cost
+from lavender_ext.core.deadline cimport entry_cost, has_passed
 from lavender_ext.core.dot cimport dot
 from lavender_ext.factor.linear cimport (CHOLESKY, LU, analyse_dense, analyse_tree, factor_linear_system_matrix,
                                          solve_linear_system, linear_t)
@@ -73,16 +73,27 @@ cdef inline int32_t append_weighted_block(const flow_t* f, const double* v, int3
     return n
 
 
-cdef inline void multiply_strip(const flow_t* f, int32_t n, int32_t nc, int32_t first, int32_t end) noexcept nogil:
-    """Compute rows [first, first + STRIP_ROWS) of Y^T (V Y), columns before `end`, from n appended rows into `strip`."""
+cdef inline double strip_product_cost() noexcept nogil:
+    """Return the time [ns] of a multiply-add of a strip: "velocities" of the rates."""
+    return 0.15
+
+
+cdef inline bint multiply_strip(const flow_t* f, int32_t n, int32_t nc, int32_t first, int32_t end) noexcept nogil:
+    """Compute rows [first, first + STRIP_ROWS) of Y^T (V Y), columns before `end`, from n appended rows into `strip`.
+
+    Return False, without a result, if the deadline has passed.
+    """
     cdef int32_t stride = nc + 3 & ~3
+    if f.deadline != NULL and has_passed(f.deadline, STRIP_ROWS * end * (entry_cost() + strip_product_cost() * n)):
+        return False
     memset(f.strip, 0, STRIP_ROWS * stride * sizeof(double))
     gemm_subtract_nt(f.wide, end + 3 & ~3, min(STRIP_ROWS, nc - first), n, f.weighted_y, stride, f.used_y + first, nc, f.strip,
                      stride)
+    return True
 
 
 cdef inline void add_panel_to_sparse_matrix(const flow_t* f, int32_t panel, int32_t n, int32_t size) noexcept nogil:
-    """Add Y^T (V Y) of one panel to N in the pattern of L."""
+    """Add Y^T (V Y) of one panel to N in the pattern of L; after the deadline, a part of it."""
     cdef int32_t nc = f.g.pcol[panel + 1] - f.g.pcol[panel], a, b, at, i, k
     cdef int32_t c0 = f.cptr[f.island]
     cdef const int32_t* cols = f.g.cols + f.g.pcol[panel]
@@ -94,8 +105,8 @@ cdef inline void add_panel_to_sparse_matrix(const flow_t* f, int32_t panel, int3
     cdef double* diag = f.normal + (lptr[size] - lptr[0])
     cdef double* to
     for a in range(nc):
-        if a % STRIP_ROWS == 0:
-            multiply_strip(f, n, nc, a, min(a + STRIP_ROWS, nc))
+        if a % STRIP_ROWS == 0 and not multiply_strip(f, n, nc, a, min(a + STRIP_ROWS, nc)):
+            return
         line = f.strip + a % STRIP_ROWS * (nc + 3 & ~3)
         k = local[cols[a]]
         to = val + lptr[k]
@@ -114,7 +125,7 @@ cdef inline void add_panel_to_sparse_matrix(const flow_t* f, int32_t panel, int3
 
 
 cdef inline void add_panel_to_dense_matrix(const flow_t* f, int32_t panel, int32_t n, int32_t size) noexcept nogil:
-    """Add Y^T (V Y) of one panel to the full matrix N.
+    """Add Y^T (V Y) of one panel to the full matrix N; after the deadline, a part of it.
 
     Its first row is that of the last velocity: if leaves are eliminated before their ancestors, most entries of L and U are 0.
     """
@@ -124,8 +135,8 @@ cdef inline void add_panel_to_dense_matrix(const flow_t* f, int32_t panel, int32
     cdef const double* line
     cdef double* row
     for a in range(nc):
-        if a % STRIP_ROWS == 0:
-            multiply_strip(f, n, nc, a, nc)
+        if a % STRIP_ROWS == 0 and not multiply_strip(f, n, nc, a, nc):
+            return
         line = f.strip + a % STRIP_ROWS * (nc + 3 & ~3)
         row = f.normal + <ssize_t>(size - 1 - local[cols[a]]) * size + size - 1
         for b in range(nc):
@@ -288,7 +299,7 @@ cdef inline void form_normal_matrix(flow_t* f, int32_t island, bint square, bint
                 add_panel_to_dense_matrix(f, b, n, size)
             elif n > 0:
                 add_panel_to_sparse_matrix(f, b, n, size)
-            if f.deadline != NULL and has_passed(f.deadline, (entry_cost() + product_cost() * n) * nc * nc):
+            if f.deadline != NULL and f.deadline.passed:
                 return                                  # `factor_normal_matrix` ends the step.
     store_v(f, island, False)
 

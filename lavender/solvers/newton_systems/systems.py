@@ -199,6 +199,8 @@ def run_newton_method(
     method.set_deadline(deadline)
     if not is_continued:
         method.start(impulse, tol, max_iter if max_total is None else UNLIMITED_STEPS)
+        if method.how == SPENT:  # The deadline passed before H was formed.
+            return NewtonRun(Status.TIME_LIMIT, [0, 0, 0, 0] if is_over_velocities else [0])
     if max_total is not None and max_total < UNLIMITED_STEPS:
         method.limit_work(max_total)
     begin = list(method.counts) if is_over_velocities else [method.done]

@@ -52,9 +52,9 @@ def test_factor_after_breakdown_of_panels_is_full_and_ends_at_the_deadline(clock
     x = state.factor[0].solve(r)
     np.testing.assert_allclose(state.matrix @ x + state.splitting.rho * x, r, atol=1e-12)
     clock.now = 2.0
-    late = lv.prepare(problem, "admm")
-    late.solver.set_deadline(late.state, Deadline(1.0, 0.5))
-    assert late.state.factor is None
+    late = prepared.solver.prepare(problem)
+    prepared.solver.set_deadline(late, Deadline(1.0, 0.5))
+    assert late.factor is None
 
 
 def test_admm_factor_beyond_index_range_raises(monkeypatch):

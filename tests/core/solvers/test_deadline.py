@@ -13,7 +13,7 @@ from worked import python
 import lavender as lv
 from benchmarks.core_problems import fresh
 from lavender import registry, suite
-from lavender.base.deadline import Deadline
+from lavender.base.deadline import Deadline, limit_forming
 from lavender.base.rates import RATES
 from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import make_system, run_newton_method
@@ -306,3 +306,60 @@ def test_modules_are_imported_before_the_clock_of_the_first_limit(name, tmp_path
     paths = os.pathsep.join([str(tmp_path), *filter(None, sys.path)])
     done = python("-c", f"import lavender as lv; print({solve})", env={**os.environ, "PYTHONPATH": paths})
     assert f"{name}: CONVERGED" in done.stdout
+
+
+def draw_jacobian_problem(seed, m=240, n=150, law="coulomb"):
+    """Contacts, or bounded rows, over a full J and M."""
+    rng = np.random.default_rng(seed)
+    half, jac, free = rng.normal(size=(n, n)), rng.normal(size=(m, n)), rng.normal(size=n)
+    cones = lv.Cones.contacts(np.full(m // 3, 0.5), 2)
+    if law == "lcp":
+        cones = lv.Cones.bounded(np.zeros(m), np.full(m, np.inf))
+    return lv.Problem.from_jacobian(jac, half @ half.T / n + np.eye(n), free, cones=cones)
+
+
+@pytest.mark.parametrize("law", ["coulomb", "lcp"])
+@pytest.mark.parametrize("name", ["newton", "admm", "pgs", "auto"])
+def test_prepared_solves_with_other_b_have_the_bits_of_fresh_solves(name, law):
+    """The matrices that `prepare` forms stay, also after a solve that a limit ended."""
+    problem, rng = draw_jacobian_problem(3, law=law), np.random.default_rng(1)
+    prepared = lv.prepare(fresh(problem), name)
+    for scale in (1.0, 0.5, 2.0):
+        b = problem.b * (scale + 0.1 * rng.random(problem.m))
+        prepared.solve(b=-b, time_limit=1e-9)
+        kept, other = prepared.solve(b=b, tol=1e-9), lv.solve(fresh(problem).updated(b=b), name, tol=1e-9)
+        assert kept.impulse.tobytes() == other.impulse.tobytes() and kept.status is other.status
+
+
+def test_forming_a_matrix_of_j_and_m_reads_the_clock_and_ends_at_the_deadline(readings):
+    problem = draw_jacobian_problem(0, 600, 300)
+    for name in ("newton", "admm", "pgs"):
+        cold = fresh(problem)
+        solution = lv.solve(cold, name, time_limit=4.5)
+        assert solution.status is lv.Status.TIME_LIMIT and "_compressed" not in cold.__dict__
+        assert solution.iterations == 0
+
+
+@pytest.mark.parametrize("law", ["coulomb", "lcp"])
+def test_starts_over_j_and_m_read_the_clock_within_two_milliseconds_and_then_keep_the_matrix(law):
+    kernel = general.prepare_islands(fresh(draw_jacobian_problem(0, 600, 300, law)))
+    first, second = counted_deadline(), counted_deadline()
+    for deadline in (first, second):
+        kernel.set_deadline(deadline)
+        kernel.keep_matrix()
+        kernel.start(np.zeros(600), 1e-6, 1)
+    total, longest = first.counted
+    assert total >= 600 * 600 * 300 * 0.1 and longest <= MAX_WORK
+    assert second.counted[0] <= 1e-3 * total
+
+
+def test_forming_a_reads_the_clock_within_two_milliseconds_of_counted_work():
+    for density in (1.0, 0.2):
+        problem = draw_jacobian_problem(0, 600, 300)
+        jac = problem.generalized.jac.toarray() * (np.random.default_rng(0).random((600, 300)) < density)
+        problem = lv.Problem.from_jacobian(jac, np.eye(300), np.ones(300), cones=problem.cones)
+        deadline = counted_deadline()
+        with limit_forming(deadline):
+            problem.csr  # noqa: B018 - forms A
+        total, longest = deadline.counted
+        assert total >= 600 * 600 * 300 * 0.1 * density**2 and longest <= MAX_WORK
