@@ -8,9 +8,11 @@ Prints medians of wall and CPU time of cold calls divided by their limit, the nu
 residual, and the residual of the start; before the limits the smallest CPU time of one cold sweep without a limit,
 set-up and judge included. With --programs, it prints for each solver in which share of quadratic programs of 5 to 1,000
 variables the CPU time of `solve_qp`, without the time inside of the backend's package and imports, is at most the limit
-plus OVERHEAD. The sheet `auto` divides the residual of `auto` by that of the best sweeps with the same limit: structures
-of 60 to 4,000 rows, limits of 0.1 to 10 ms, from zero or a stale start. The sheet `prepared` compares the CPU time of
-prepared solves of every own solver, 300 to 3,000 rows, limits L of 1 to 50 ms, with 2 L + 5 ms and 2 L + 25 ms. `python -m benchmarks rates` measures the costs that decide what starts under a limit.
+plus OVERHEAD. `python -m benchmarks rates` measures the costs that decide what starts under a limit.
+
+The sheet `auto` divides the residual of `auto` by that of the best sweeps with the same limit: structures of 60 to
+4,000 rows, limits of 0.1 to 10 ms, from zero or a stale start. The sheet `prepared` compares the CPU time of prepared
+solves of every own solver, 300 to 3,000 rows, limits L of 1 to 50 ms, with 2 L + 5 ms and 2 L + 25 ms.
 """
 
 from __future__ import annotations

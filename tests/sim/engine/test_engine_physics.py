@@ -53,6 +53,24 @@ def test_scene_restitution_gives_its_speed_and_slow_contacts_do_not_bounce():
         assert v == pytest.approx(2.0 * expected, abs=1e-12)
 
 
+@pytest.mark.parametrize("e", [1.0, 0.5])
+def test_scene_restitution_under_gravity_returns_the_speed_before_the_step_in_fifty_bounces(e):
+    """Each bounce returns e times the speed of the step before; with e = 1 the ball never climbs."""
+    scene = lv.Scene(restitution=e, friction=0.0, dt=1.0 / 240.0, substeps=1, restitution_threshold=0.0, slop=0.0)
+    scene.add_plane()
+    scene.add_sphere(0.5, position=(0, 0, 1.5))
+    sim, before, speeds = lv.Simulation(scene), 0.0, []
+    while len(speeds) < 50:
+        after = float(run(sim, 1)["velocities"][1, 2])
+        if before < 0.0 < after:
+            assert after == pytest.approx(-e * before, rel=1e-9, abs=1e-14)
+            speeds.append(after)
+        before = after
+    if e == 1.0:
+        np.testing.assert_allclose(speeds, speeds[0], rtol=1e-9)
+        assert speeds[0] < np.sqrt(2.0 * 9.81)
+
+
 @pytest.mark.parametrize("kind", ["collisions", "joints"])
 def test_a_closed_system_keeps_its_momentum(kind):
     scene = lv.Scene(gravity=0.0, friction=0.5, position_iterations=0)
