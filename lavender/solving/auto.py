@@ -234,7 +234,7 @@ class FirstSweeps:
             return None
         judged = reuse_or_judge_impulse(problem, loop.impulse, loop.judged)
         if loop.done < MIN_DECISIVE_SWEEPS and judged.relative > self.tol:
-            # Few sweeps may raise the error. Nobody whose time is over wants a worse impulse than the start.
+            # Few sweeps may raise the error.
             if isnan(self.before):
                 first = judge_impulse(problem, choose_start(problem, self.start, self.tol))
                 self.before = float(first.relative)

@@ -263,7 +263,7 @@ def test_deadline_that_passes_inside_a_compiled_world_of_a_batch_ends_it(rows, r
     assert whole.success and count >= 3  # the first is that of the deadline, the last that after the world
     for limit in np.arange(0.5, count - 1):
         late = solve(limit)[0]
-        # A step whose matrix is factored ends, and may be the last one.
+        # A step with a factored matrix ends, and may be the last one.
         assert late.status is lv.Status.TIME_LIMIT or (late.success and limit > count - 2)
         assert late.residual.relative == lv.residual(problem, late.impulse).relative
 
