@@ -26,6 +26,7 @@ NAMES = (
     "recompute",
     "regret",
     "scale",
+    "score",
     "stability",
     "stand",
 )

@@ -153,11 +153,12 @@ ENGINES: dict[str, Contestant] = {
     "mujoco_pgs": Contestant("mujoco PGS", "mujoco", "mujoco", 100, options=_ELLIPTIC),
     "pybullet": Contestant("pybullet", "bullet", "pybullet", 50, substeps=True),
     "rapier": Contestant(
-        "rapier", "node", PACKAGES_OF_NODE["rapier"], 4, sweeps="iterations", options={"engine": "rapier"}
+        "rapier", "node", PACKAGES_OF_NODE["rapier"], 4, sweeps="iterations",
+        options={"engine": "rapier", "sleep": False},
     ),
     "jolt": Contestant(
         "jolt", "node", PACKAGES_OF_NODE["jolt"], 10,
-        options={"engine": "jolt", "substeps": 1, "gyroscopic": False},
+        options={"engine": "jolt", "substeps": 1, "gyroscopic": False, "sleep": False, "damping": 0},
     ),
 }  # fmt: skip
 

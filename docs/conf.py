@@ -58,7 +58,7 @@ CONTENTS = {
     "Start": "install quickstart concepts error sweep",
     "Solve": "choose solvers failures quadratic-programs",
     "Your data": "own-engine c formats derivatives",
-    "Judge engines": "audit mujoco worlds engines report commands",
+    "Judge engines": "audit mujoco worlds engines report commands scorecard",
     "LavenderSim and the course": "engine chapter chapter-answers generated/examples",
     "Background": "residual methods comparison guarantees generated/cases generated/measured generated/engine-arrays",
     "Project": "plugin architecture generated/api",

@@ -32,10 +32,10 @@ class JsonLines:
     It has no time limit.
     """
 
-    def __init__(self, command: Sequence[str]) -> None:
+    def __init__(self, command: Sequence[str], cwd: Path | None = None) -> None:
         self._name = command[0]
         self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, encoding="utf-8"
+            command, cwd=cwd, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, encoding="utf-8"
         )
 
     def request_answer(self, message: Any) -> Any:
@@ -51,9 +51,13 @@ class JsonLines:
             raise EOFError(f"{self._name} ended with status {self._process.wait()}")
         return json.loads(line)
 
+    def kill(self) -> None:
+        """Kill the program; a request that waits for its answer then raises EOFError."""
+        self._process.kill()
+
     def close(self) -> None:
         """Kill the program; it has no data to save."""
-        self._process.kill()
+        self.kill()
         with contextlib.suppress(OSError):  # The program closed a pipe itself.
             self._process.communicate()
 
@@ -86,7 +90,7 @@ class Engine(Stepping):
             raise LavenderError(str(answer["error"]))
         self.cpu_time += float(answer["cpu"])
         # null, a number that is not finite, becomes nan.
-        self.states = np.array(answer["state"], float).reshape(-1, 13)
+        self.states = np.array(answer["states"][-1], float).reshape(-1, 13)
 
     def step(self) -> None:
         """See `Stepping.step`."""

@@ -1,0 +1,159 @@
+"""`python -m benchmarks score`: run cells of the scorecard and add them to the table of results."""
+
+from __future__ import annotations
+
+import json
+import math
+import tempfile
+from collections.abc import Iterator
+from itertools import product
+from pathlib import Path
+
+import click
+
+from benchmarks.output import markdown
+from benchmarks.score.adapters import CannotExpress
+from benchmarks.score.records import PATH, Record, read_records, write_records
+from benchmarks.score.scenes import SCENES, classify
+from benchmarks.score.settings import ENGINES, Entry
+from benchmarks.score.simulate import Failed, Simulator, create_environment, find_program, split_requirement
+from lavender._version import __version__
+from lavender.base.errors import InputError, UnknownName
+from lavender.cli.options import ListType
+
+LEVELS, STEP_RATES = ("default", "accurate"), (240, 1000)
+CLASSES = ("good", "fair", "poor", "wrong")
+
+
+def get_settings(entry: Entry, level: str) -> dict[str, object]:
+    """Return the options of an engine in a column."""
+    return {**entry.common, **(entry.accurate if level == "accurate" else {})}
+
+
+def get_version(entry: Entry) -> str:
+    """Return the pinned version of an engine's first package."""
+    return split_requirement(entry.packages[0])[1] if entry.packages else __version__
+
+
+def measure_cell(
+    simulator: Simulator, scene: str, rate: int, runs: int
+) -> tuple[list[float], list[float], float, str, str]:
+    """Return errors, costs [µs], residual, note and curve of the runs of a cell."""
+    errors: list[float] = []
+    costs: list[float] = []
+    curve, residual = "", math.nan
+    for _ in range(runs):
+        simulator.start_cell()
+        try:
+            found = SCENES[scene].measure(simulator.run, 1.0 / rate)
+        except CannotExpress as error:
+            return [math.nan], [math.nan], math.nan, f"cannot: {error}", ""
+        except Failed as error:
+            cost = 1e6 * simulator.cpu / simulator.steps if simulator.steps else math.nan
+            return [math.nan], [cost], residual, str(error), ""
+        error, values = found if isinstance(found, tuple) else (found, None)
+        if values and not curve:
+            curve = json.dumps([round(v, 5) if math.isfinite(v) else None for v in values])
+        residual = simulator.residual if math.isnan(residual) else residual
+        simulator.residuals = False  # The first run reads them.
+        errors.append(error if math.isfinite(error) else math.inf)
+        costs.append(1e6 * simulator.cpu / max(1, simulator.steps))
+    return errors, costs, residual, "", curve
+
+
+def run_cells(
+    name: str, cells: list[tuple[str, int, str]], envs: Path, runs: int, limit: float
+) -> Iterator[Record]:
+    """Yield the record of each cell (column, rate, scene) of an engine."""
+    entry = ENGINES[name]
+    command = find_program(name, entry, envs)
+    if command is None:
+        create_environment(name, entry, envs)
+        command = find_program(name, entry, envs)
+        assert command is not None
+    simulator = Simulator(command, {}, limit)
+    try:
+        for level, rate, scene in cells:
+            curve = SCENES[scene].curve
+            simulator.settings, simulator.residuals = get_settings(entry, level), not curve
+            simulator.limit = limit * (4 if curve else 1)
+            errors, costs, residual, note, values = measure_cell(simulator, scene, rate, runs)
+            if entry.fresh:
+                simulator.close()
+            spread = max(errors) - min(errors) if all(map(math.isfinite, errors)) else math.nan
+            version = get_version(entry)
+            yield Record(
+                name, version, level, rate, scene, runs, errors[0], spread, min(costs), max(costs), residual,
+                note[:200].replace("\n", " "), values,
+            )  # fmt: skip
+    finally:
+        simulator.close()
+
+
+def make_table(rows: dict[tuple[str, str, int, str], Record], level: str, rate: int) -> str:
+    """Return one table of engines and scenes: errors with the initial of their class."""
+    names = [n for n in ENGINES if any(key[0] == n for key in rows)]
+
+    def describe(name: str, scene: str) -> str:
+        """Return the text of a cell."""
+        row = rows.get((name, level, rate, scene))
+        if row is None or row.note:
+            return "" if row is None else row.note.split(":")[0]
+        return f"{row.error:.2g} {CLASSES[classify(scene, row.error)][0]}"
+
+    head = ("engine", *(f"{name} [{scene.unit}]" for name, scene in SCENES.items()))
+    return markdown(head, [(ENGINES[n].title, *(describe(n, scene) for scene in SCENES)) for n in names])
+
+
+@click.command("score")
+@click.option("--engine", type=ListType(str), help="Names with commas between; default: all.")
+@click.option("--scene", type=ListType(str), help="Names with commas between; default: all.")
+@click.option("--level", type=ListType(str), default=",".join(LEVELS), show_default=True)
+@click.option("--rate", type=ListType(int), default="240,1000", show_default=True, help="Steps a second.")
+@click.option("--repeat", type=click.IntRange(1), default=1, show_default=True, help="Runs of each cell.")
+@click.option(
+    "--limit", type=click.FloatRange(0.1), default=10.0, show_default=True, help="CPU time of a cell [s]."
+)
+@click.option("--again", is_flag=True, help="Run cells that the table has.")
+@click.option(
+    "--envs", type=click.Path(path_type=Path), help="Folder of the engines' environments; default: temporary."
+)
+@click.option(
+    "--out", type=click.Path(path_type=Path), default=PATH, help="Table; default: the one of the repository."
+)
+def command(
+    engine: tuple[str, ...] | None, scene: tuple[str, ...] | None, level: tuple[str, ...], rate: tuple[int, ...],
+    repeat: int, limit: float, again: bool, envs: Path | None, out: Path,
+) -> None:  # fmt: skip
+    """Run engines on contact scenes with truth formulas and add the cells that are missing to the table of results.
+
+    Each engine runs in its own environment with pinned packages, which is created in --envs if it does not exist.
+    """
+    for kind, names, known in (
+        ("engine", engine, ENGINES),
+        ("scene", scene, SCENES),
+        ("level", level, LEVELS),
+    ):
+        for name in names or ():
+            if name not in known:
+                raise UnknownName(kind, name, known)
+    if not set(rate) <= set(STEP_RATES):
+        raise InputError(f"--rate: {rate}; 240 and 1000 are possible")
+    rows = read_records(out)
+    with tempfile.TemporaryDirectory() as temporary:
+        for name in engine or ENGINES:
+            cells = [
+                cell
+                for cell in product(level, rate, scene or SCENES)
+                if (again or (old := rows.get((name, *cell))) is None or old.runs < repeat)
+                and (cell[1] == 240 or not SCENES[cell[2]].curve)
+            ]
+            for row in run_cells(name, cells, envs or Path(temporary), repeat, limit) if cells else ():
+                rows[row.key] = row
+                write_records(rows.values(), out)
+                text = row.note or f"{row.error:.3g} {SCENES[row.scene].unit}, {row.cost:.0f} µs a step"
+                click.echo(
+                    f"{name} {row.version}, {row.level}, 1/{row.rate} s, {row.scene}: {text}", err=True
+                )
+    for column, steps in product(level, rate):
+        click.echo(f"\n{column} settings, 1/{steps} s\n\n{make_table(rows, column, steps)}")
