@@ -142,9 +142,7 @@ def solve(
         if x is None and i > 3:
             arguments[i] = torch.zeros(J.shape[-2:-1], dtype=torch.float64)
         elif not isinstance(x, torch.Tensor):
-            raise InputError(
-                f"{name} is {type(x).__name__}; a tensor of float64 is needed: torch.as_tensor({name})"
-            )
+            raise InputError(f"{name} is {type(x).__name__}; a float64 tensor is needed: torch.as_tensor")
         elif x.dtype != torch.float64 or x.device.type != "cpu":  # pyright: ignore[reportOptionalMemberAccess]
             raise InputError(
                 f"{name} is {x.dtype} on {x.device}; a tensor of float64 on the CPU is needed: {name}.double().cpu()"  # pyright: ignore[reportOptionalMemberAccess]

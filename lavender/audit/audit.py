@@ -167,9 +167,7 @@ def audit(
         raise InputError(f"njmax is {njmax} and engine is {engine!r}; 'mujoco_warp' is needed for it")
     if engine in CLAIM_ENGINES:
         if control != "random":
-            raise InputError(
-                f"control needs a model of MuJoCo; scenes of {engine} set their own: leave it out"
-            )
+            raise InputError(f"control needs a model of MuJoCo; scenes of {engine} have their own: leave it")
         start = {"states": states, "spread": SPREADS[0] if spread is None else spread, "seed": seed}
         n = DEFAULT_JOINT_WORLDS if worlds is None else worlds
         stepped = step_scene(model, engine, worlds=n, steps=steps, **start)
@@ -415,7 +413,7 @@ def _audit_frames(frames: Iterable[Frame], judging: Judging) -> Iterator[Piece]:
         diverged = np.zeros(n, bool) if diverged is None else diverged
         if n != len(diverged):
             raise InputError(
-                f"step {k} has {n} worlds, and the first step {len(diverged)}; equal numbers are needed"
+                f"step {k} has {n} worlds, the first one {len(diverged)}; equal numbers are needed"
             )
 
         def state_of(i: int, state: Any = frame.state) -> dict[str, Any]:

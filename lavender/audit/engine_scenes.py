@@ -125,7 +125,7 @@ def read_engine_states(source: Any, names: tuple[str, ...]) -> EngineState:
         source = read_arrays(source)
     if not isinstance(source, Mapping):
         raise InputError(
-            f"states is a {type(source).__name__}; the path of an .npz, or a dict of arrays, is needed"
+            f"states is a {type(source).__name__}; a path of an .npz or a dict of arrays is needed"
         )
     check_array_names(label, source, names)
     arrays = {
@@ -152,7 +152,7 @@ def load_build_function(scene: str | os.PathLike[str], engine: str) -> Any:
         return build
     if engine == "genesis":
         raise InputError(
-            f"scene is {str(scene)!r}; a Python file with a function build(worlds) is needed for genesis"
+            f"scene is {str(scene)!r}; genesis needs a Python file with a function build(worlds)"
         )
     try:
         from newton.tests.utils import basics
@@ -292,9 +292,7 @@ class NewtonScene:
             try:
                 self.solver._update_mjc_data(self.solver.mjw_data, self.model, self.before)
             except AttributeError as error:
-                raise CapabilityError(
-                    f"SolverMuJoCo cannot start from a state: {error}. {NEWTON_ADVICE}"
-                ) from None
+                raise CapabilityError(f"SolverMuJoCo takes no state: {error}. {NEWTON_ADVICE}") from None
 
 
 class GenesisScene:

@@ -143,7 +143,7 @@ def make_audit_page(audit: Any, folder: Path | None) -> Page:
         code = [f"lavender tune {model} --max-velocity-error {counts.limit:g} --states {states}"]
     starts = f"seed {runs.seed}, start velocities ± {runs.spread:g} m/s"
     footer = [
-        f"{starts}. Files: records.npz (every step), numbers.json, states.npz, worst/, figures/ (PDF, SVG, PNG).",
+        f"{starts}. Files: records.npz (every step), numbers.json, states.npz, worst/, figures/ (PDF, SVG, PNG)."
     ]
     return Page("lavender audit", source, counts.verdict, counts.sentences, code, mark=counts.mark,
                 is_bad=counts.is_bad, warnings=audit.advice, blocks=blocks, footer=footer)  # fmt: skip

@@ -427,7 +427,7 @@ def _choose_contacts(problem: Problem, contacts: Any) -> list[int]:
             if not fitting:
                 known = ", ".join(problem.block_name(k) for k in sliding[:8])
                 raise InputError(
-                    f"contacts names {entry!r}, but no contact's name contains it; they are {known}"
+                    f"contacts names {entry!r}, which no contact's name contains; they are {known}"
                 )
             chosen += fitting
         elif entry in sliding:

@@ -188,9 +188,7 @@ def explain_slip_of_states(
     for entry in entries:
         if model.nflex == 0 and not any(entry in name for name in geoms):
             known = ", ".join(geoms[:8])
-            raise InputError(
-                f"contacts names {entry!r}, but no geom's name contains it; the geoms are {known}"
-            )
+            raise InputError(f"contacts names {entry!r}, which no geom's name contains; geoms are {known}")
     starts = None if states is None else read_states(mj, model, states)
     vectors = [None] if starts is None else list(starts.vectors)
     misfit = "" if starts is None else starts.misfit

@@ -52,9 +52,7 @@ def _to_torch(array: np.ndarray, like: Any) -> Any:
 
     is_float = array.dtype.kind == "f" and like.dtype.is_floating_point
     if like.device.type == "meta":
-        raise InputError(
-            "like is on the device meta, which holds no numbers: give a tensor of another device"
-        )
+        raise InputError("like is on the device meta, which holds no numbers: give one of another device")
     return torch.from_dlpack(np.array(array)).to(device=like.device, dtype=like.dtype if is_float else None)
 
 
@@ -66,9 +64,7 @@ def _to_jax(array: np.ndarray, like: Any) -> Any:
     # An abstract array, as JAX passes while tracing, has no devices.
     devices = getattr(like, "devices", None)
     if isinstance(like, jax.core.Tracer) or devices is None:
-        raise InputError(
-            "like is an abstract array of a JAX transformation: use lavender.jax inside of jit or grad"
-        )
+        raise InputError("like is an abstract array of JAX: use lavender.jax inside of jit or grad")
     if values.dtype.kind in "iu" and not jax.config.jax_enable_x64:
         values = values.astype(np.int32)
     return jax.device_put(values, next(iter(devices())))

@@ -60,9 +60,7 @@ def to_numpy(name: str, value: Any) -> np.ndarray:
         try:
             return np.asarray(value)
         except (TypeError, ValueError) as error:
-            raise InputError(
-                f"{name} cannot be converted to an array ({error}); an array of numbers is needed"
-            ) from None
+            raise InputError(f"{name} is no array ({error}); an array of numbers is needed") from None
     if getattr(value, "requires_grad", False):
         raise InputError(
             f"{name} requires a gradient, which would be lost: give {name}.detach(), or use lavender.torch to "
@@ -213,9 +211,7 @@ def get_shape(name: str, value: Any) -> tuple[int, ...]:
     try:
         return np.shape(value)
     except ValueError as error:
-        raise InputError(
-            f"{name} cannot be converted to an array ({error}); an array of numbers is needed"
-        ) from None
+        raise InputError(f"{name} is no array ({error}); an array of numbers is needed") from None
 
 
 def resolve_index(i: Any, n: int, thing: str = "world") -> int | list[int]:
@@ -327,9 +323,7 @@ def as_csr(name: str, value: Any, *, copy: bool = True, unit: str = "", too_many
         a = sp.csr_array(value, copy=copy)
         a.check_format(full_check=True)  # Check all indices here, since the kernels do not.
     except ValueError as error:
-        raise InputError(
-            f"{name} is not a valid compressed matrix ({error}); check its indices and pointers"
-        ) from None
+        raise InputError(f"{name} is not a valid compressed matrix ({error}); check its indices") from None
     if not a.has_canonical_format:
         a = a if copy else a.copy()
         a.sum_duplicates()

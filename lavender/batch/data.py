@@ -347,9 +347,7 @@ def check_shared_lower_triangles(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return (indptr, indices) of lower triangles that worlds of nvs velocities share, from (indices, indptr)."""
     if len(arrays) != 2:
-        raise InputError(
-            f"M is a tuple of {1 + len(arrays)} arrays; three are needed: (values, indices, indptr)"
-        )
+        raise InputError(f"M is a tuple of {1 + len(arrays)} arrays; (values, indices, indptr) are needed")
     col, ptr = (
         as_array(name, x, (None,), dtype=np.int32)
         for name, x in zip(("indices of M", "indptr of M"), arrays, strict=True)
@@ -423,6 +421,6 @@ def _concatenate_cones(cones: Any, n: int) -> Cones:
     cones_of_worlds = check_sequence("cones", cones, f"Cones, one for each of {n} worlds,")
     if len(cones_of_worlds) != n or not all(isinstance(c, Cones) for c in cones_of_worlds):
         raise InputError(
-            f"cones has {len(cones_of_worlds)} entries; a Cones, or one for each of {n} worlds, is needed"
+            f"cones has {len(cones_of_worlds)} entries; a Cones, or one for each world, is needed"
         )
     return Cones._concatenate(cones_of_worlds)

@@ -371,17 +371,13 @@ def _convert_starts(
     parts: Iterable[tuple[int, Any]] = ()
     if type(worlds) is Batch:
         if impulses is not None:
-            raise InputError(
-                "impulses= needs a list of problems; a batch takes impulse=, one array for all worlds"
-            )
+            raise InputError("impulses= needs a list of problems; a batch takes impulse=, one for all worlds")
         starts = None if impulse is None else worlds.flatten_impulses("impulse", impulse)
         if starts is not None and not all_finite(starts):
             parts = ((i, starts[worlds.rows_of(i)]) for i in range(len(worlds)))
     else:
         if impulse is not None:
-            raise InputError(
-                "impulse= needs a batch; a list of problems takes impulses=, one for each problem or None"
-            )
+            raise InputError("impulse= needs a batch; a list of problems takes impulses=, one for each")
         starts = (
             [p.guess for p in worlds] if impulses is None else convert_impulses_or_guesses(worlds, impulses)
         )

@@ -171,9 +171,7 @@ def _decompose_rows(rows: sp.csr_array, tol: float) -> tuple[npt.NDArray[np.bool
     m, n = rows.shape
     size, r = min(m, n), 0
     if size * (n + size) > MAX_BASIS_NUMBERS:
-        raise CapabilityError(
-            f"{m} rows over {n} velocities are coupled; their rank would take too much memory"
-        )
+        raise CapabilityError(f"{m} rows over {n} velocities are coupled; their rank takes too much memory")
     tol = max(tol, m * 2.0**-53)  # Rounding leaves about m 2^-53.
     basis, lower = np.zeros((size, n)), np.zeros((size, size))  # independent rows = lower basis
     y, dependent_sum = np.random.default_rng(0).normal(size=(2, m)), np.zeros((2, size))

@@ -220,9 +220,7 @@ class Gradient(GradientArrays):
             The problem has no such matrix, or the derivative does not exist.
         """
         if name not in MATRICES:
-            raise InputError(
-                f"full needs one of {', '.join(MATRICES)}; {name!r} is not a matrix with a pattern"
-            )
+            raise InputError(f"full needs one of {', '.join(MATRICES)}; {name!r} has no pattern")
         getattr(self, name)  # Raises CapabilityError if the gradient does not exist.
         return np.asarray(sum(np.outer(u, v) for u, v in self._list_outer_product_pairs(name)))
 

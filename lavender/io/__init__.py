@@ -108,11 +108,7 @@ def load_solution(path: str | os.PathLike[str]) -> FloatArray | None:
 
 
 def save(
-    problem: Problem,
-    path: str | os.PathLike[str],
-    *,
-    impulse: Any = None,
-    drop: Collection[str] = (),
+    problem: Problem, path: str | os.PathLike[str], *, impulse: Any = None, drop: Collection[str] = ()
 ) -> None:
     """Write a problem; the suffix selects the format. An existing file is replaced atomically.
 
@@ -146,6 +142,4 @@ def save(
     elif suffix in HDF5:
         fclib.write(problem, path, impulse=impulse, drop=drop)
     else:
-        raise InputError(
-            f"{path} ends with {suffix!r}; a suffix .npz or .hdf5 is needed, which selects the format"
-        )
+        raise InputError(f"{path} ends with {suffix!r}; .npz or .hdf5 is needed, which selects the format")

@@ -108,9 +108,7 @@ def _build_problem(
     """Build the problem and SAP's impulses (m,) [N s]; raise an error for a plant that cannot be converted."""
     step = float(plant.time_step())
     if not step > 0.0:
-        raise InputError(
-            "the plant is continuous; one with a time step is needed (MultibodyPlant(time_step=dt))"
-        )
+        raise InputError("the plant is continuous; a time step is needed: MultibodyPlant(time_step=dt)")
     dt = step if dt is None else check_float("dt", dt)
     if not math.isclose(dt, step, rel_tol=1e-12):
         raise InputError(f"dt is {dt:g} s, the plant's own step {step:g} s; they must be equal")

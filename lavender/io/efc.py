@@ -544,7 +544,7 @@ def _convert_mass(values: Any, n: int, nv: int) -> Any:
         return values
     if values.ndim != 2 or len(values) != n:
         raise InputError(
-            f"values of M have shape {values.shape}; ({n}, entries) is needed, one row for each world"
+            f"values of M have shape {values.shape}; ({n}, entries) is needed, a row for a world"
         )
     ptr, col = check_shared_lower_triangles(pattern, np.full(n, nv), values)
     row, full = np.repeat(np.arange(nv), np.diff(ptr)), np.zeros((n, nv, nv), values.dtype)

@@ -141,9 +141,7 @@ def form_dense_a(mass: sp.csr_array, jt: sp.csr_array, f: FloatArray) -> tuple[s
     """
     entries = _bound_factor_entries(mass)
     if entries > MAX_MASS_FACTOR_ENTRIES:
-        raise InputError(
-            f"the factors of M may have {entries:.3g} entries; at most {MAX_MASS_FACTOR_ENTRIES} are computed"
-        )
+        raise InputError(f"the factors of M may have {entries:.3g} entries, above {MAX_MASS_FACTOR_ENTRIES}")
     try:
         solve = factor_sparse_lu(mass).solve
     except RuntimeError as error:
@@ -297,9 +295,7 @@ def write(
         raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
     unknown = sorted(set(drop) - {"names", "key", "precision"})
     if unknown:
-        raise InputError(
-            f"drop names {', '.join(unknown)}; only 'names', 'key' and 'precision' may be left out"
-        )
+        raise InputError(f"drop names {', '.join(unknown)}; only 'names', 'key' and 'precision' may be")
     obstacles = _list_unsupported_data(problem, drop)
     if obstacles:
         raise CapabilityError(f"FCLIB cannot hold {'; '.join(obstacles)}. An .npz holds everything")

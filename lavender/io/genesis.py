@@ -174,9 +174,7 @@ def _check_configuration(scene: Any, solver: Any) -> None:
          "contact_resolution=signorini with torsional or rolling friction is another friction law"),
     ):  # fmt: skip
         if is_used:
-            raise CapabilityError(
-                f"{name}, which this importer does not support: change this setting of the scene"
-            )
+            raise CapabilityError(f"{name}, which is not supported: change this setting of the scene")
 
 
 def _copy_to_host(array: Any, rows: int | None = None) -> Any:

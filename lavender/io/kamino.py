@@ -109,9 +109,7 @@ def from_kamino(solver: Any, *, verify: bool = False) -> EngineStep:
         claims = _make_claims(solver.status.numpy())
         _verify_delassus_matrix(solver, engine, worlds, verify)
     except AttributeError as error:
-        raise CapabilityError(
-            f"an attribute of this SolverKamino is missing: {error}. {KAMINO_ADVICE}"
-        ) from None
+        raise CapabilityError(f"this SolverKamino lacks an attribute: {error}. {KAMINO_ADVICE}") from None
     return EngineStep(*step, claims)
 
 
@@ -131,9 +129,7 @@ def _check_configuration(engine: Any) -> None:
     if engine.problem_fd is None or (
         not config.sparse_jacobian and engine._jacobians.data.J_cts_data is None
     ):
-        raise InputError(
-            "this model has no joints, limits or contacts: there is no constraint problem to convert"
-        )
+        raise InputError("this model has no joints, limits or contacts: there is no problem to convert")
 
 
 def _make_claims(status: Any) -> Claims:

@@ -359,9 +359,7 @@ def _read_mass(step: Step, data: Any) -> tuple[Any, Any]:
         difference = f"M qacc_smooth differs from qfrc_smooth by {gap:.1e} of their size"
         if gap <= FLOAT32_GAP:
             raise CapabilityError(f"{difference}, {FLOAT32_ADVICE}")
-        raise CapabilityError(
-            f"{difference}: the problem was built with another matrix than M. {CHANGED_ADVICE}"
-        )
+        raise CapabilityError(f"{difference}: the problem was built with another M. {CHANGED_ADVICE}")
     return mass, None
 
 
@@ -382,9 +380,7 @@ def _find_mass_pattern(model: Any) -> tuple[IntArray, IntArray]:
         or np.any(columns[indptr[1:] - 1] != np.arange(len(count)))
         or np.any((np.diff(columns) <= 0)[~np.isin(np.arange(1, len(columns)), indptr)])
     ):
-        raise InputError(
-            f"M_rowadr, M_rownnz and M_colind do not describe a lower triangle of M. {OTHER_MODEL_ADVICE}"
-        )
+        raise InputError(f"M_rowadr, M_rownnz and M_colind are no lower triangle of M. {OTHER_MODEL_ADVICE}")
     return mark_read_only(indptr), columns
 
 
@@ -459,9 +455,7 @@ def _get_velocity_before(step: Step) -> FloatArray | None:
     if v is None or not isinstance(v, int):
         return v
     if v == -1:
-        raise InputError(
-            f"dof_bodyid and body_parentid do not describe a tree of these bodies. {OTHER_MODEL_ADVICE}"
-        )
+        raise InputError(f"dof_bodyid and body_parentid are no tree of these bodies. {OTHER_MODEL_ADVICE}")
     raise CapabilityError(
         "the velocity before the step cannot be computed from cvel and cdof: joints of one body have "
         "dependent axes, or MjData was changed since its forward pass: run mj_forward"
@@ -521,9 +515,7 @@ def make_blocks(step: Step, data: Any, max_equality_rows: int = mujoco_rows.MAX_
             f"{counts[kind]}{dim}, which does not exist or has fewer rows. {CHANGED_ADVICE}"
         )
     if result.fault:
-        raise InputError(
-            f"efc_frictionloss, or the friction of a contact, is negative or not finite. {CHANGED_ADVICE}"
-        )
+        raise InputError(f"efc_frictionloss or contact friction is negative or not finite. {CHANGED_ADVICE}")
     return result
 
 

@@ -107,9 +107,7 @@ def import_mujoco() -> Any:
     try:
         import mujoco
     except ImportError:
-        raise InputError(
-            "mujoco cannot be imported: pip install mujoco, which provides models and data"
-        ) from None
+        raise InputError("mujoco cannot be imported; it has models and data: pip install mujoco") from None
     if not hasattr(mujoco.MjModel, "M_rowadr"):
         raise InputError(f"mujoco is {mujoco.__version__}; 3.4 or later is needed: pip install -U mujoco")
     return mujoco

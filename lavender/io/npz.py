@@ -161,9 +161,7 @@ def _read_own_format(archive: Arrays) -> Stored:
     """Read a problem in our own format."""
     version = archive.read_scalar("lavender_format")
     if version != FORMAT_VERSION or isinstance(version, bool):
-        raise InputError(
-            f"lavender_format is {version!r}; this lavender reads {FORMAT_VERSION}: update it, or save again"
-        )
+        raise InputError(f"lavender_format is {version!r}; this lavender reads {FORMAT_VERSION}: update it")
     meta = _read_meta(archive)
     for name in archive:
         if archive[name].dtype.kind not in "iuf":

@@ -388,9 +388,7 @@ def _convert_constraint(
     if kind == "JointFrictionConstraintModel":
         low, high = np.array(model.getFrictionLowerLimit()), np.array(model.getFrictionUpperLimit())
         return Cones.bounded(dt * low, dt * high), np.zeros(n), order
-    raise CapabilityError(
-        f"a {kind} is not supported; anchors, point contacts, joint limits and joint friction are"
-    )
+    raise CapabilityError(f"a {kind} is not supported; anchors, points, joint limits and joint friction are")
 
 
 def compute_target_velocity(gap: Any, dt: float, correction: float) -> Any:

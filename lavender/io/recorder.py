@@ -134,10 +134,7 @@ class Recorder:
         if when is not None and not callable(when):
             raise InputError(f"when is {when!r:.60}; a function of a StepVerdict is needed")
         if self.every is None and not self.keep_worst and when is None:
-            raise InputError(
-                "no condition selects steps, so that nothing would be recorded: give every=, keep_worst= "
-                "or when="
-            )
+            raise InputError("no condition selects steps to record: give every=, keep_worst= or when=")
         self.when, self.solver, self.n_steps = when, solver, 0
         self.folder = prepare_step_folder(folder, replace)
         self.lines: dict[str, dict[str, Any]] = {}  # Lines of `engine.jsonl` by file.
@@ -208,9 +205,7 @@ class Recorder:
             cannot be judged raise no error; their first step has a line with the reason.
         """
         if self._is_closed:
-            raise InputError(
-                f"the recording {self.folder} is closed: call add before close, or make another Recorder"
-            )
+            raise InputError(f"the recording {self.folder} is closed: call add before close")
         if isinstance(problems, EngineStep):
             state = problems.state if state is None else state
             problems, impulse, claims = problems[:3]
@@ -221,9 +216,7 @@ class Recorder:
         }
         if velocity is not None:
             if impulse is not None or not isinstance(problems, Problem):
-                raise InputError(
-                    "velocity is given with impulse, or for a batch; it replaces the impulse of one problem"
-                )
+                raise InputError("velocity replaces the impulse of one problem: leave impulse out")
             impulse, left_over = reconstruct(problems, velocity)
             facts |= {"reconstructed": True, "left_over": left_over}
         if impulse is None:
@@ -310,7 +303,7 @@ class Recorder:
             isinstance(name, str) and name and not set(name) & {"/", "\\", "\0"} for name in state
         ):
             raise InputError(
-                f"state is {state!r:.60}; a dict of arrays is needed, with texts without / and \\ as names"
+                f"state is {state!r:.60}; a dict of arrays with names without / and \\ is needed"
             )
         arrays = {name: np.asarray(to_numpy(f"state {name!r}", x)) for name, x in state.items()}
         for name, x in arrays.items():
@@ -323,9 +316,7 @@ class Recorder:
             return lambda i: arrays
         for name, x in arrays.items():
             if x.ndim == 0 or len(x) != n:
-                raise InputError(
-                    f"state {name!r} has shape {x.shape}; a first dimension of {n} worlds is needed"
-                )
+                raise InputError(f"state {name!r} has shape {x.shape}; ({n} worlds, ...) is needed")
         return lambda i: {name: x[i] for name, x in arrays.items()}
 
     def _record_selected_world(

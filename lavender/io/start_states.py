@@ -134,7 +134,7 @@ def make_controller(model: Any, control: Control, seed: int) -> Callable[[Any, i
     if isinstance(control, str):
         if control not in CONTROLS:
             raise InputError(
-                f"control is {control!r}; one of {', '.join(CONTROLS)}, an array or a function is needed"
+                f"control is {control!r}; {', '.join(CONTROLS)}, an array or a function is needed"
             )
         if control == "zero":
             return lambda data, step: np.zeros(n)
@@ -324,7 +324,7 @@ def _read_arrays(mj: Any, model: Any, arrays: Mapping[str, Any], source: str) ->
     missing = [name for name in NEEDED if name not in arrays]
     if missing:
         raise InputError(
-            f"{source} has no {' and no '.join(missing)}; {VECTOR!r}, or qpos and qvel, are needed"
+            f"{source} has no {' and no '.join(missing)}; {VECTOR!r}, or qpos and qvel, is needed"
         )
     data = mj.MjData(model)
     parts: dict[str, FloatArray] = {}

@@ -413,11 +413,7 @@ def judge_impulse(problem: Problem, impulse: FloatArray) -> measure.Judged:
 
 
 def combine_best_islands(
-    problem: Problem,
-    start: FloatArray,
-    impulses: Sequence[FloatArray],
-    tol: float,
-    by_energy: bool = False,
+    problem: Problem, start: FloatArray, impulses: Sequence[FloatArray], tol: float, by_energy: bool = False
 ) -> FloatArray:
     """Return the best of a start and impulses (m,) [N s] in each island (`lavender_ext/judge/best.pxd`).
 

@@ -110,9 +110,7 @@ class ProblemData:
         precision: str = "", qp: Any = None, angular: ArrayLike | None = None,
     ) -> None:  # fmt: skip
         if not isinstance(cones, Cones):
-            raise InputError(
-                f"cones is a {type(cones).__name__}; a Cones is needed (Cones.bounded, Cones.contacts)"
-            )
+            raise InputError(f"cones is a {type(cones).__name__}; a lavender.Cones is needed: Cones.contacts")
         m, k = cones.n_rows, cones.n_blocks
         rhs = as_array("b", b, (m,), unit="m/s", copy=copy)
         check_rhs(rhs)
@@ -442,7 +440,7 @@ def _convert_flags(angular: ArrayLike, m: int) -> npt.NDArray[np.bool_]:
     values = as_array("angular", angular, (m,))
     if not np.isin(values, (0.0, 1.0)).all():
         raise InputError(
-            f"angular holds {values[~np.isin(values, (0.0, 1.0))][0]:g}; True or False is needed for each row"
+            f"angular holds {values[~np.isin(values, (0.0, 1.0))][0]:g}; True or False is needed"
         )
     mask = values.astype(bool)
     mask.setflags(write=False)

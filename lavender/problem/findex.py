@@ -25,9 +25,7 @@ def order_findex_rows(findex: Any, count: int | None = None) -> IntArray:
         if j >= m:
             raise InputError(f"findex[{i}] is {j}; a row below {m} is needed, or -1 for constant bounds")
         if j == i:
-            raise InputError(
-                f"findex[{i}] is {i}, its own row; the row of its normal is needed, or -1 for constant bounds"
-            )
+            raise InputError(f"findex[{i}] is {i}, its own row; the row of its normal is needed, or -1")
         if findex[j] >= 0:
             raise InputError(
                 f"findex[{i}] is {j}, but row {j} is not a normal, because its own findex is {findex[j]}; "

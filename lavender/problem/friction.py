@@ -42,9 +42,7 @@ def check_friction_combination(
             "neither spin nor rolling: leave patch_radius, rolling and tangents out, or give one mu for each contact"
         )
     if tangents > 2 and spin:
-        raise InputError(
-            f"{tangents} tangents make a round cone, which includes spin: leave patch_radius out"
-        )
+        raise InputError(f"{tangents} tangents make a round cone, which has spin: leave patch_radius out")
     if rolling and tangents != 2:
         raise InputError(
             f"rolling needs tangents=2, because the rolling rows rotate about two tangents; tangents is {tangents}"

@@ -231,9 +231,7 @@ class Generalized:
             )
 
     def __setattr__(self, name: str, value: Any) -> None:
-        raise AttributeError(
-            f"{name} of a Generalized cannot be set, because the object is immutable: make another one"
-        )
+        raise AttributeError(f"{name} of a Generalized cannot be set: make another one")
 
     def __delattr__(self, name: str) -> None:
         raise AttributeError(f"{name} of a Generalized cannot be deleted, because the object is immutable")

@@ -100,9 +100,7 @@ def compute_block_order(
         return Order(np.arange(k, dtype=np.int32), split, GIVEN, np.zeros(1, np.uint64), is_given=True)
     rng = np.array([check_int("seed", seed, high=None) % 2**64], np.uint64)
     if seed and not (isinstance(order, str) and order == "random"):
-        raise InputError(
-            f"seed={seed} is given for an order that is not random: give order='random', or leave seed out"
-        )
+        raise InputError(f"seed={seed} needs order='random': leave seed out")
     if not isinstance(order, str):
         if ground is not None:
             raise InputError(

@@ -87,7 +87,7 @@ def _check_dimensions(position: tuple[int, ...], velocity: tuple[int, ...], iner
         )
     if len(position) != 2 or position[1] not in (2, 3):
         raise InputError(
-            f"position [m] has shape {position}; (n, 2) is needed in two dimensions, (n, 3) in three"
+            f"position [m] has shape {position}; (n, 2) in two dimensions, (n, 3) in three is needed"
         )
     n = position[0]
     if position[1] == 3 and velocity == (n, 3) and len(inertia) < 2:
@@ -690,9 +690,7 @@ class RowBuilder:
         if feature is None:
             number: int = self._blocks.next_feature.get(key, 0)
             if number > MAX_FEATURE:
-                raise InputError(
-                    f"feature is None; after {number} blocks of one pair of bodies it must be given"
-                )
+                raise InputError(f"feature is None; after {number} blocks of a pair of bodies, one is needed")
         else:
             number = check_int("feature", feature, high=MAX_FEATURE)
         if key | number in self._blocks.keys:

@@ -109,11 +109,7 @@ class NewtonState:
             return Count("bodies", system.work, float(problem.metric.work), float(problem.m))
         set_up = 0.0 if problem.generalized is None else estimate_formation_cost(problem, False)
         return Count(
-            "dense" if system.dense else "panels",
-            system.work,
-            system.entries,
-            float(problem.m),
-            set_up,
+            "dense" if system.dense else "panels", system.work, system.entries, float(problem.m), set_up
         )
 
     @property
@@ -340,14 +336,7 @@ class Newton(Solver):
         before = impulse.copy()
         if not best <= WARM_START_MAX_RESIDUAL:
             impulse[:] = problem.start()
-        second = self._run_system(
-            problem,
-            continuation.system,
-            impulse,
-            remaining,
-            tol,
-            deadline,
-        )
+        second = self._run_system(problem, continuation.system, impulse, remaining, tol, deadline)
         if not compute_stopping_residual(problem, impulse, w, e)[0] <= best:
             impulse[:] = before
         work = sum_work_counts((claim.work, second.work))

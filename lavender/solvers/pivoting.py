@@ -9,10 +9,7 @@ from lavender.base.deadline import Deadline
 from lavender.base.lazy_import import import_numerical_modules
 from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.problem import Problem
-from lavender.solvers.costs import (
-    estimate_dense_factor_cost,
-    estimate_sparse_work,
-)
+from lavender.solvers.costs import estimate_dense_factor_cost, estimate_sparse_work
 from lavender.solvers.factors import (
     MAX_COMPILED_FACTOR_ROWS,
     PIVOT_TOLERANCE,

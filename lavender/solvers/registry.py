@@ -489,13 +489,9 @@ def _add_spec(spec: SolverSpec, replace: bool) -> None:
     if not isinstance(spec, SolverSpec):
         raise InputError(f"spec is a {type(spec).__name__}; a lavender.SolverSpec is needed")
     if not re.fullmatch(r"[A-Za-z0-9_.-]+", spec.name):
-        raise InputError(
-            f"the name {spec.name!r} of a solver needs letters, digits and the characters _ . - only"
-        )
+        raise InputError(f"name of solver {spec.name!r} is not of letters, digits and the characters _ . -")
     if spec.name in registered and not replace:
-        raise InputError(
-            f"a solver named {spec.name!r} is registered already; pass replace=True to take its place"
-        )
+        raise InputError(f"a solver named {spec.name!r} is registered already; replace=True replaces it")
     registered[spec.name] = spec
 
 

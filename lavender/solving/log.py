@@ -24,11 +24,7 @@ from lavender.problem import Problem
 from lavender.problem.cones import project_impulse
 from lavender.solvers.small import NO_TIME_MESSAGE, NO_WORK_MESSAGES, describe_stages
 from lavender.solving.loop import Loop, Record
-from lavender_ext.judge.measure import (
-    BestImpulse,
-    are_bit_identical,
-    residuals_by_island,
-)
+from lavender_ext.judge.measure import BestImpulse, are_bit_identical, residuals_by_island
 
 # Key in `Derived.cache` of the problem's convex relaxation.
 RELAXATION_KEY = "lavender.solving.log: relaxation"

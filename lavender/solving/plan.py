@@ -116,9 +116,7 @@ def explain(problem: Problem, tol: float = 1e-6) -> Plan:
         raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
     tol = check_float("tol", tol, above=0.0)
     if problem.m == 0:
-        raise InputError(
-            "the problem has no rows, so there is nothing to plan; a problem with at least one row is needed"
-        )
+        raise InputError("the problem has no rows; at least one is needed for a plan")
     reason = get("auto").refuses(problem)
     if reason is not None:
         raise CapabilityError(f"solver 'auto' {reason}")

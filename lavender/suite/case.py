@@ -247,9 +247,7 @@ def parse_case_name(text: str) -> tuple[str, dict[str, Any]]:
     parameters = [part.partition("=") for part in body.split(",")] if body else []
     values = {name.strip(): _parse_value(value.strip()) for name, _, value in parameters}
     if match is None or len(values) < len(parameters) or "" in values or None in values.values():
-        raise InputError(
-            f"{text!r} is not a case; write a name with parameters, such as pyramid(k=10, mass_ratio=1e6)"
-        )
+        raise InputError(f"{text!r} is not a case, such as toy_stack or pyramid(k=10, mass_ratio=1e6)")
     return match[1], values
 
 

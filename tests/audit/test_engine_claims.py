@@ -138,7 +138,7 @@ def test_step_scene_of_a_wrong_scene_raises(tmp_path):
 def test_audit_steps_of_other_sizes_or_none_raises():
     with pytest.raises(lv.InputError, match="steps is empty"):
         audit_steps([])
-    with pytest.raises(lv.InputError, match="2 worlds, and the first step 1"):
+    with pytest.raises(lv.InputError, match="2 worlds, the first one 1"):
         audit_steps([step_of([0.0], [1]), step_of([0.0, 0.0], [1, 1])])
 
 

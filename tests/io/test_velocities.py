@@ -72,7 +72,7 @@ def test_recorder_with_velocities_stores_impulses_and_marks_them(tmp_path):
         velocity = problem.velocity(answer.impulse)
         velocity[0, 0] += 1.0  # A force that the problem does not have.
         recorder.add(problem, velocity=velocity)
-        with pytest.raises(lv.InputError, match="velocity is given with impulse"):
+        with pytest.raises(lv.InputError, match="velocity replaces the impulse"):
             recorder.add(problem, answer.impulse, velocity=velocity)
     lines = [json.loads(line) for line in (tmp_path / "a" / "engine.jsonl").read_text().splitlines()]
     assert [line["reconstructed"] for line in lines] == [True, True]

@@ -228,9 +228,7 @@ class Simulation(Stepping):
             simulation is unchanged.
         """
         if not isinstance(snapshot, Snapshot):
-            raise InputError(
-                f"snapshot is a {type(snapshot).__name__}; a Snapshot is needed (sim.snapshot())"
-            )
+            raise InputError(f"snapshot is a {type(snapshot).__name__}; a Snapshot is needed: sim.snapshot()")
         if snapshot.fingerprint != self._fingerprint:
             raise InputError(
                 "the snapshot belongs to another scene, because bodies, joints or parameters differ; a "

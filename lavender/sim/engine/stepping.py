@@ -41,9 +41,7 @@ R = TypeVar("R")
 S = TypeVar("S", bound="Stepping")
 
 
-def run_exclusively(
-    method: Callable[Concatenate[S, P], R],
-) -> Callable[Concatenate[S, P], R]:
+def run_exclusively(method: Callable[Concatenate[S, P], R]) -> Callable[Concatenate[S, P], R]:
     """Decorate a method so that only one thread at a time runs it.
 
     A call from inside a step, or after `close`, raises LavenderError.
@@ -63,11 +61,7 @@ class Stepping:
     """Base class of `Simulation`: the step loop of a scene, without records and snapshots."""
 
     def __init__(
-        self,
-        scene: Scene | str,
-        *,
-        report_residual: bool = False,
-        report_motion: bool = False,
+        self, scene: Scene | str, *, report_residual: bool = False, report_motion: bool = False
     ) -> None:
         if isinstance(scene, str):
             scene = Scene(scene)
@@ -204,9 +198,7 @@ class Stepping:
         if body not in self._names:
             raise UnknownName("body", body, self._names)
         if self._names.count(body) > 1:
-            raise InputError(
-                f"{self._names.count(body)} bodies are named {body!r}; give the number of the body"
-            )
+            raise InputError(f"{self._names.count(body)} bodies are named {body!r}; give the number of one")
         return self._names.index(body)
 
     @run_exclusively

@@ -346,9 +346,7 @@ class Scene:
             else _check_common_point(label, *ends)
         )
         if (axis is None) == (kind == HINGE):
-            raise InputError(
-                f"{label}: axis= is missing for a hinge, or given for another joint; only a hinge needs it"
-            )
+            raise InputError(f"{label}: axis= is needed for a hinge, and only for a hinge")
         world_axis = (
             check_unit_vector(f"axis of {label}", axis) if kind == HINGE else np.array([0.0, 0.0, 1.0])
         )
@@ -358,9 +356,7 @@ class Scene:
                 "out, or make it a hinge"
             )
         if (motor_speed is None) != (motor_torque is None):
-            raise InputError(
-                f"{label}: only one of motor_speed and motor_torque is given; a motor needs both"
-            )
+            raise InputError(f"{label}: one of motor_speed and motor_torque is given; a motor needs both")
         joint = Joint(
             kind=kind,
             name=label,
@@ -391,7 +387,7 @@ class Scene:
                 )
         if a == b or all(i < 0 or self.bodies[i].is_static for i in (a, b)):
             raise InputError(
-                f"{label} joins {a} and {b}; two bodies are needed, at least one of them dynamic"
+                f"{label} joins {a} and {b}; two bodies, at least one of them dynamic, are needed"
             )
         return int(a), int(b)
 

@@ -112,9 +112,7 @@ def compare_with_native_kernels(say: Callable[[str], Any] = lambda text: None) -
         )
     node = shutil.which("node")
     if node is None:
-        raise LavenderError(
-            "node, which runs the check, is not installed: install Node 18 or newer (nodejs.org, or apt)"
-        )
+        raise LavenderError("node, which runs the check, is not installed: install Node 18 or newer")
     modules = {name: get_or_build_module(say, name) for name in wasm.PARTS}
     with TemporaryDirectory(prefix="lavender-web-") as folder:
         for name, data in modules.items():

@@ -92,9 +92,7 @@ def write_scene(scene: Scene, path: str | PathLike[str], title: str = "") -> Non
         The scene uses another solver, is not valid, or the file cannot be written.
     """
     if not isinstance(scene, Scene):
-        raise InputError(
-            f"scene is a {type(scene).__name__}; a lavender.Scene is needed: lv.Scene({scene!r:.40})"
-        )
+        raise InputError(f"scene is a {type(scene).__name__}; a Scene is needed: lv.Scene({scene!r:.40})")
     if scene.parameters.solver != "sequential_impulses":
         raise InputError(
             f"the scene uses {scene.parameters.solver!r}, and the page sweeps: pass a scene with the default solver "
