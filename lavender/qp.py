@@ -21,14 +21,8 @@ __all__ = ["available_solvers", "solve_problem", "solve_qp"]
 DEFAULT_TOL = 1e-6
 
 
-def _list_available_solvers() -> list[str]:
-    """Return the names of the installed solvers of quadratic programs."""
-    program = Problem.from_qp(np.eye(1), np.zeros(1), lb=np.zeros(1))
-    return available(program)
-
-
 #: Names of the installed solvers that `solve_qp` accepts.
-available_solvers: list[str] = _list_available_solvers()
+available_solvers: list[str] = available(Problem.from_qp(np.eye(1), np.zeros(1), lb=np.zeros(1)))
 
 
 def solve_qp(

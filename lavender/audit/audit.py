@@ -248,7 +248,8 @@ def _audit_model(
     audit_worlds(timed, judging, [0])
     duration = (perf_counter() - begin) / timed.steps * one.steps
     if worlds is None:
-        worlds = choose_world_count(duration, processes)
+        expected = int(DEFAULT_DURATION * processes / max(duration, 1e-6))
+        worlds = max(1, min(MAX_DEFAULT_WORLDS, expected))
     if workers == -1 and backend == "loky" and duration * worlds < MIN_DURATION_OF_WORKERS:
         workers = 1
     runs, note = replace(one, worlds=worlds).choose_spread(spread, watch)
@@ -317,14 +318,6 @@ def _make_empty_audit(runs: Runs, engine: str, common: dict[str, Any], *notes: s
 def count_processes(workers: int) -> int:
     """Return the number of processes of `workers` (-1: one for each core)."""
     return workers if workers > 0 else max(1, (os.cpu_count() or 1) + 1 + workers)
-
-
-def choose_world_count(duration: float, processes: int) -> int:
-    """Return the number of worlds that take about `DEFAULT_DURATION` in `processes` processes.
-
-    `duration` [s] is the time in which one world was simulated and judged.
-    """
-    return max(1, min(MAX_DEFAULT_WORLDS, int(DEFAULT_DURATION * processes / max(duration, 1e-6))))
 
 
 def _audit_mujoco(

@@ -7,7 +7,7 @@ that hold for the data of real bodies:
                 n.(c_b - c_a) > 0 between convex bodies                                                 (1)
     size        the radius of gyration k, k^2 = tr(I) / 2m, has the order of magnitude of the arms      (2)
     targets     target = b + J v*: zero on tangents, not negative if bodies overlap                     (3)
-    speeds      v* is a velocity, not g = 9.81 m/s^2; targets and approach speeds are plausible         (4)
+    speeds      targets and approach speeds are plausible; with the state, v* = v + dt a                    (4)
 
 For a problem in J and M, (1) is checked if all contacts belong to free rigid bodies: six velocities in the world frame,
 coupled to no others, three of them with equal mass. A row of direction d then has J = (d, r x d) with the arm r.

@@ -10,13 +10,12 @@ import numpy.typing as npt
 
 from lavender.base.arrays import FloatArray, as_array, check_float, get_shape
 from lavender.base.errors import InputError
-from lavender.diagnostics.bodies import MAX_DENSE_VELOCITIES, find_free_bodies, reconstruct_bodies
+from lavender.diagnostics.bodies import MAX_DENSE_VELOCITIES, find_free_bodies
 from lavender.diagnostics.diagnostic import Diagnostic, make_diagnostic
 from lavender.problem import Problem
 from lavender.problem.rows import Rows
 
 G = 9.81  # [m/s^2]
-MAX_GRAVITY_DEVIATION = 0.05  # [-] A common v* that is this near to 9.81 m/s is an acceleration without dt.
 # [m/s] A larger target would separate bodies by more than 6 cm in a step of 2 ms.
 MAX_SEPARATION_TARGET = 30.0
 # [m/s] A larger target would allow an approach of more than 2 m in a step of 2 ms.
@@ -90,35 +89,6 @@ def diagnose_targets(p: Problem) -> Iterator[Diagnostic]:
         reason = f"{np.count_nonzero(wild)} contacts have targets up to {largest:.3g} m/s: divide a penetration depth "
         reason += "or a gap in m by dt once, and count a gap as negative"
         yield make_diagnostic(p, "targets", reason, np.flatnonzero(contact)[wild], target=largest)
-
-
-def diagnose_flipped_normals(p: Problem) -> Iterator[Diagnostic]:
-    """Yield a diagnostic if static bodies push falling bodies further down, or if bodies fall with g in m/s.
-
-    The check is made only if most bodies have the same v*. This v* is the velocity change by gravity in one step, and
-    static bodies must then support the others from below.
-    """
-    r = reconstruct_bodies(p)
-    if r is None or np.count_nonzero(r.inv_mass) < 2:
-        return
-    body = r.moving_block_bodies[r.n_joints :]
-    still = np.flatnonzero((body < 0).any(axis=1))
-    v = r.v_free[r.inv_mass > 0.0, :3]
-    fall = np.median(v, axis=0)
-    size = float(np.linalg.norm(fall))
-    if len(still) < 4 or size == 0.0 or np.median(np.abs(v @ fall / size - size)) > 0.6 * size:
-        return
-    if abs(size - G) <= MAX_GRAVITY_DEVIATION * G:
-        reason = (
-            f"most bodies have v* of {size:.3g} m/s, as many m/s as g has m/s^2: do accelerations lack dt?"
-        )
-        yield make_diagnostic(p, "v_free", reason, change=size)
-    toward = np.where(body[still, 1:] < 0, -1.0, 1.0) * r.normal[still] @ fall[:, None] / size
-    if toward.mean() > 0.3 and (toward > -0.1).mean() > 0.9:
-        reason = "static bodies push others in the direction of their fall: are normals flipped, or bodies swapped?"
-        yield make_diagnostic(
-            p, "normals", reason, np.flatnonzero(p.cones.is_contact)[still], along=float(toward.mean())
-        )
 
 
 def check_state_arguments(
@@ -225,4 +195,4 @@ def _find_bounces(target: FloatArray, before: FloatArray) -> npt.NDArray[np.bool
     return bounces & (np.abs(e - np.median(e[bounces])) <= RESTITUTION_ROUNDING) if bounces.any() else bounces
 
 
-CHECKS = (diagnose_joint_targets, diagnose_targets, diagnose_flipped_normals)
+CHECKS = (diagnose_joint_targets, diagnose_targets)

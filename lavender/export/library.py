@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import lavender_ext
@@ -44,12 +44,6 @@ def source() -> str:
     ).decode()
 
 
-def _collect_existing_files(folder: Path) -> Iterator[Path]:
-    return (
-        p for p in sorted(folder.rglob("*")) if p.suffix in TEXTS and p.name != "lavender.c" and p.is_file()
-    )
-
-
 def write(out: Path, *, replace: bool = False) -> list[Path]:
     """Write the C library into a folder.
 
@@ -76,7 +70,8 @@ def write(out: Path, *, replace: bool = False) -> list[Path]:
     folder = HERE / "c"
     contents = {
         p.relative_to(folder).as_posix(): p.read_text(encoding="utf-8")
-        for p in _collect_existing_files(folder)
+        for p in sorted(folder.rglob("*"))
+        if p.suffix in TEXTS and p.name != "lavender.c" and p.is_file()
     }
     contents["lavender.c"] = source()
     sums = "".join(

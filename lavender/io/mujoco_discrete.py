@@ -79,7 +79,8 @@ def compute_discrete_matrix(mj: Any, model: Any, data: Any, advice: str) -> Disc
     limit = TOLERANCE_RATIO * model.opt.tolerance if is_iterative else 0.0
     rounding = MASS_TOLERANCE * np.linalg.norm(abs(whole) @ abs(data.qacc_smooth))
     if not (gap <= limit * size + rounding or (is_iterative and is_warned and gap < np.inf)):
-        names = ", ".join(name for name in _list_arrays(data) if np.any(getattr(data, name)))
+        added = (name for name in dir(data) if name.startswith("efm_") and name != "efm_active")
+        names = ", ".join(name for name in added if np.any(getattr(data, name)))
         relative = gap / max(size, np.finfo(float).tiny)
         raise CapabilityError(
             f"(M + h D + h^2 K) qacc_smooth differs from qfrc_smooth + efm_c + efm_ca by {relative:.1e} of its "
@@ -88,11 +89,6 @@ def compute_discrete_matrix(mj: Any, model: Any, data: Any, advice: str) -> Disc
     arrays = matrix.indptr.astype(np.int32), matrix.indices.astype(np.int32), matrix.data
     result = DiscreteMatrix(arrays, None)
     return result._replace(change=result.solve(residual)) if is_iterative else result
-
-
-def _list_arrays(data: Any) -> list[str]:
-    """Return the names of the arrays of the added terms."""
-    return [name for name in dir(data) if name.startswith("efm_") and name != "efm_active"]
 
 
 def _iterate_terms(model: Any, data: Any) -> Iterator[tuple[Any, Any, Any]]:

@@ -173,7 +173,10 @@ def _prove_with_polished_directions(problem: Problem, y: FloatArray, tol: float,
                     break
         if inner is not problem:
             proof = replace(proof, y=problem.cones.stretch * proof.y)
-        return proof if proof.reason else replace(proof, conflict=_describe_conflict(problem, proof.y))
+        if proof.reason:
+            return proof
+        sides = (_format_block_names(problem, blocks) for blocks in list_conflicting_blocks(problem, proof.y))
+        return replace(proof, conflict=" against ".join(filter(None, sides)))  # "joint 7 against contact 11"
 
 
 def list_conflicting_blocks(problem: Problem, y: Any) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -186,12 +189,6 @@ def list_conflicting_blocks(problem: Problem, y: Any) -> tuple[tuple[int, ...], 
         for kind in (False, True)
     )
     return tuple(map(int, joints)), tuple(map(int, contacts))
-
-
-def _describe_conflict(problem: Problem, y: FloatArray) -> str:
-    """Name the conflicting blocks, e.g. "joints 7 and 9 against contact 11"."""
-    sides = (_format_block_names(problem, blocks) for blocks in list_conflicting_blocks(problem, y))
-    return " against ".join(side for side in sides if side)
 
 
 def _format_block_names(problem: Problem, blocks: tuple[int, ...]) -> str:

@@ -513,7 +513,9 @@ def residual(
         )
     if tol != TOL and not (type(tol) is float and tol >= 0.0):
         tol = check_float("tol", tol, low=0.0)
-    result = refine_residual(problem, judge_impulse(problem, impulse), tol)
+    result = make_residual(
+        problem, judge_impulse(problem, impulse).refine(tol)
+    )  # Refined if M is ill-conditioned.
     if type(threshold) is not float or threshold != DEFAULT_THRESHOLD:
         result = replace(result, threshold=check_float("threshold", threshold, low=0.0))
     if precision != "float64":
@@ -601,11 +603,6 @@ def estimate_float32_slack_errors(
 def _square_entries(a: Any) -> Any:
     """Square every entry of a sparse matrix."""
     return a.multiply(a).tocsr()
-
-
-def refine_residual(problem: Problem, judged: measure.Judged, tol: float) -> Residual:
-    """Build a `Residual` from a raw judge pass, which is refined first if M is too ill-conditioned."""
-    return make_residual(problem, judged.refine(tol))
 
 
 def make_residual(problem: Problem, judgement: measure.Judged) -> Residual:

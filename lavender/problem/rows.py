@@ -188,9 +188,8 @@ class Rows:
                 f"moving body is needed: leave this {name} out"
             )
         check_nonnegative_magnitudes("inv_mass", self.inv_mass, UNITS["inv_mass"])
-        check_nonnegative_magnitudes(
-            "largest entry of inv_inertia", compute_max_abs_entries(self.inv_inertia), UNITS["inv_inertia"]
-        )
+        largest = np.abs(self.inv_inertia).max(axis=(1, 2), initial=0.0)
+        check_nonnegative_magnitudes("largest entry of inv_inertia", largest, UNITS["inv_inertia"])
         if copy:
             object.__setattr__(
                 self, "inv_inertia", check_and_symmetrise_inertia("inv_inertia", self.inv_inertia)
@@ -321,11 +320,6 @@ def _check_joint_counts(ptr: IntArray, jac: Any, joint_body: Any) -> None:
             f"{ptr.tolist()!s:.60}, default [0]; the first row of each joint, then the number of rows is needed: "
             f"joint_ptr=[0, {rows[0]}] and joint_body=[[a, b]] for one joint of {rows[0]} rows"
         )
-
-
-def compute_max_abs_entries(tensors: FloatArray) -> FloatArray:
-    """Return the largest absolute entry of each tensor (n, 3, 3)."""
-    return np.abs(tensors).max(axis=(1, 2), initial=0.0)
 
 
 def check_and_symmetrise_inertia(name: str, tensors: FloatArray) -> FloatArray:

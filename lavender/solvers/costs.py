@@ -169,12 +169,6 @@ def estimate_formation_cost(problem: Problem, known: bool | None = None) -> floa
     return float(RATES["set-up"] + RATES["form row"] * problem.m + entries)
 
 
-def estimate_symmetry_cost(problem: Problem) -> float:
-    """Estimate the cost to check whether A is symmetric [ns]; 0 if it is known."""
-    is_known = problem.matrix is None or "_matrix_asymmetry" in problem.__dict__
-    return 0.0 if is_known else float(RATES["judge entry"] * problem.max_entries)
-
-
 def estimate_matrix_setup_cost(problem: Problem) -> float:
     """Estimate the cost to form A, check its symmetry, and copy it into a solver's layout [ns]."""
     entries = problem.max_entries
@@ -183,7 +177,9 @@ def estimate_matrix_setup_cost(problem: Problem) -> float:
     else:
         layout = RATES["scipy calls"] + RATES["layout entry"] * entries
     form = estimate_formation_cost(problem)
-    return float(RATES["set-up"] + form + estimate_symmetry_cost(problem) + layout)
+    is_symmetry_known = problem.matrix is None or "_matrix_asymmetry" in problem.__dict__
+    symmetry = 0.0 if is_symmetry_known else float(RATES["judge entry"] * problem.max_entries)
+    return float(RATES["set-up"] + form + symmetry + layout)
 
 
 def estimate_analysis_cost(problem: Problem) -> float:

@@ -35,12 +35,6 @@ RAY_MESSAGE = (
 MAX_LEMKE_ROWS = 2000  # Problems with more rows are refused; the dictionary of this many rows takes 32 MB.
 
 
-def _count_dictionary_rows(problem: Problem) -> int:
-    """Return the number of rows of the dictionary."""
-    c = problem.cones
-    return problem.m + int(np.count_nonzero(np.isfinite(c.lower) & np.isfinite(c.upper)))
-
-
 @dataclass(frozen=True)
 class Lemke(Solver):
     """Lemke's complementary pivoting, without options."""
@@ -68,7 +62,9 @@ class Lemke(Solver):
         paths = lemke.Lemke(state.rows)
         paths.set_start(impulse)
         try:
-            entries = _count_dictionary_rows(state.problem) ** 2
+            c = state.problem.cones
+            rows = len(c.lower) + int(np.count_nonzero(np.isfinite(c.lower) & np.isfinite(c.upper)))
+            entries = rows**2  # of the dictionary
             chunk = max(1, int(CHUNK_TIME / (1e-9 * RATES["dictionary pivot"] * entries)))
             claim = self._follow_paths(state, paths, max_iter, tol, deadline, chunk)
         finally:
@@ -88,7 +84,8 @@ class Lemke(Solver):
             code = paths.run(min(chunk, max_iter - paths.pivots))
             if code == RAY:
                 message = RAY_MESSAGE
-                certificate = _normalise_ray(paths.ray)
+                size = np.abs(paths.ray).max(initial=0.0)
+                certificate = paths.ray / size if 0.0 < size < np.inf else None
             is_proof = certificate is not None and (
                 check_certificate(state.problem, certificate, tol, deadline) is None
             )
@@ -121,12 +118,6 @@ def _find_certificate_by_linear_program(
         return None
     y = find_certificate_by_linear_program(problem, deadline)
     return y if y is not None and check_certificate(problem, y, tol, deadline) is None else None
-
-
-def _normalise_ray(y: FloatArray) -> FloatArray | None:
-    """Return the direction y (m,) of a ray with its largest entry 1, or None if it is zero or not finite."""
-    size = np.abs(y).max(initial=0.0)
-    return y / size if 0.0 < size < np.inf else None
 
 
 def _get_refusal_reason(problem: Problem) -> str | None:

@@ -152,8 +152,10 @@ class Newton(Solver):
         if self.form != "impulse":
             if problem.generalized is not None:
                 rows = 0.0
-                if self.form == "auto" and _has_sparse_coulomb_rows(problem):
-                    rows = estimate_matrix_setup_cost(problem) + estimate_analysis_cost(problem)
+                if self.form == "auto" and problem.law == "coulomb":
+                    entries = float(problem.metric.entries_of_matrix)
+                    if not uses_dense_rows(entries, float(problem.m), False):
+                        rows = estimate_matrix_setup_cost(problem) + estimate_analysis_cost(problem)
                 return rows + estimate_elimination_cost(problem, "velocity elimination")
             if problem.rows is not None and problem.rows.n_bodies > 0:
                 return estimate_elimination_cost(problem, "body elimination")
@@ -400,12 +402,6 @@ def _estimate_full_matrix_cost(problem: Problem) -> float:
         return inf
     form = estimate_formation_cost(problem, False)
     return estimate_newton_cost(Count("dense", count_dense_work(problem.m), m * m, m, form), problem)
-
-
-def _has_sparse_coulomb_rows(problem: Problem) -> bool:
-    """Return whether J and M under Coulomb's law have a sparse A, on which Newton's method may run."""
-    entries = float(problem.metric.entries_of_matrix)
-    return problem.law == "coulomb" and not uses_dense_rows(entries, float(problem.m), False)
 
 
 def _is_sparse_matrix_faster(problem: Problem, work: float) -> bool:

@@ -178,14 +178,6 @@ def test_diagnose_of_a_stack_with_a_planted_mistake_reports_it(scenes, mistake):
     assert found and SHOWN_BY_STATE.get(mistake, "") in {*found, ""}
 
 
-@pytest.mark.parametrize("form", ["bodies", "J and M"])
-def test_velocity_of_gravity_without_dt_is_reported_without_the_state(scenes, form):
-    """21 of the 30 steps show it; in the others, bodies move, or few contacts are with a static body."""
-    step = scenes["stack 0 2"] if form == "bodies" else replace(scenes["stack 0 2"], rows=None)
-    wrong = MISTAKES["v* = v + a instead of v + dt a"](step)
-    assert kinds(step.problem) == set() and kinds(wrong.problem) == {"v_free"}
-
-
 @pytest.mark.parametrize("has_round_inertia", [True, False])
 def test_diagnose_of_a_kinematic_tree_does_not_assume_rigid_bodies(scenes, has_round_inertia):
     """A base that hangs below its feet is no mistake if there are joints in between."""

@@ -66,12 +66,6 @@ CONVERGED_OPTIONS = {"solver": "Newton", "iterations": 300, "tolerance": 0.0, "l
                      "ls_tolerance": 1e-4}  # fmt: skip
 
 
-def get_default_options(mj: Any) -> dict[str, Any]:
-    """Return MuJoCo's default values of `OPTIONS`."""
-    default = SimpleNamespace(opt=mj.MjOption())
-    return {name: get_option_value(mj, default, name) for name in OPTIONS}
-
-
 class Progress:
     """Number of measurements that are done and, estimated, to come.
 
@@ -223,7 +217,9 @@ def list_first_settings(mj: Any, model: Any) -> list[MujocoSetting]:
     tried = [{**f.fixed, f.name: x} for f in MUJOCO for x in f.values]
     tried = [enough | x if "tolerance" in x else x for x in tried]
     own = MujocoSetting.from_options(mj, model)
-    default = replace(MujocoSetting.from_options(mj, model, **get_default_options(mj)), is_default=True)
+    mujoco_own = SimpleNamespace(opt=mj.MjOption())
+    options = {name: get_option_value(mj, mujoco_own, name) for name in OPTIONS}
+    default = replace(MujocoSetting.from_options(mj, model, **options), is_default=True)
     return list(dict.fromkeys([own, default, *(MujocoSetting.from_options(mj, model, **x) for x in tried)]))
 
 
