@@ -22,9 +22,8 @@ MAX_SEPARATION_TARGET = 30.0
 MAX_APPROACH_TARGET = 1000.0
 # [-] A smaller ratio of target to approach speed is not a bounce: dt is a factor too many.
 MIN_RESTITUTION = 0.05
-RESTITUTION_ROUNDING = (
-    1e-6  # [-] Coefficients of restitution that are computed from velocities differ by this.
-)
+# [-] Coefficients of restitution that are computed from velocities differ by this.
+RESTITUTION_ROUNDING = 1e-6
 
 
 def get_row_velocities_and_targets(p: Problem) -> tuple[FloatArray, FloatArray, FloatArray] | None:
@@ -133,8 +132,7 @@ def embed_planar_velocities(rows: Rows, velocity: Any) -> FloatArray:
         n = rows.n_bodies
         raise InputError(
             f"velocity [m/s] has shape ({n}, 3); ({n}, 6) is needed, because the problem is not in the xy plane: "
-            "numpy.hstack([v, omega]) of the linear and the angular velocities, or of (v_x, v_y, omega_z) as v: "
-            "numpy.insert(v, [2, 2, 2], 0.0, axis=1)"
+            "numpy.insert(v, [2, 2, 2], 0.0, axis=1) converts (v_x, v_y, omega_z)"
         )
     return np.insert(as_array("velocity", velocity, (rows.n_bodies, 3), unit="m/s"), [2, 2, 2], 0.0, axis=1)
 

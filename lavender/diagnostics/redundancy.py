@@ -27,14 +27,12 @@ MAX_BASIS_NUMBERS = (
     2**27
 )  # Largest number of entries of the orthonormal rows of an island and their coefficients.
 CHUNK_ROWS = 64  # Number of rows that one matrix product makes orthogonal to the rows before them.
-MIN_INVERSE_NORM = (
-    1e-9  # An island has full rank if 1 / |A^-1| exceeds this and 1e3 tol^2, with A scaled to 1.
-)
+# An island has full rank if 1 / |A^-1| exceeds this and 1e3 tol^2, with A scaled to 1.
+MIN_INVERSE_NORM = 1e-9
 # Rows with smaller new parts wait until all rows with larger ones are in the basis, so that rounding is not amplified.
 MIN_PARTS = (1e-2, 1e-5, 0.0)
-NULL_VECTOR_TOL = (
-    1e-9  # A row with relative entries of up to this in random null vectors is not moved by them.
-)
+# A row with relative entries of up to this in random null vectors is not moved by them.
+NULL_VECTOR_TOL = 1e-9
 # A new part below this is made orthogonal to all rows once more, because its rounding is relative to the whole row.
 MIN_ACCURATE_PART = 1e-3
 

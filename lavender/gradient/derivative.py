@@ -272,10 +272,9 @@ class Derivative:
         if len(rows):
             names = ", ".join(self.problem.row_name(int(i)) for i in rows[:3])
             raise CapabilityError(
-                f"{message}: {names}{', ...' if len(rows) > 3 else ''} share a load with other rows. Data "
-                "of one such row cannot change alone, because another row would then open. Use derivatives "
-                "by v_free and M, by mu under Coulomb's law, or give these rows compliance, which "
-                "allows derivatives by all data"
+                f"{message}: {names}{', ...' if len(rows) > 3 else ''} share a load with other rows, of "
+                "which another opens if the data of one change: use derivatives by v_free and M, by mu under "
+                "Coulomb's law, or give these rows compliance"
             )
 
     def _check_coefficient_changes(self, name: str) -> None:
@@ -619,8 +618,7 @@ def derivative(problem: Problem, solution: Any) -> Derivative:
         if not (error.nothing_to_do and error.rounds):
             raise InputError(
                 "the impulse is not a solution of this problem: its relative residual is "
-                f"{error.relative:.2e}; a derivative needs at most {MAX_ACCEPTED_RESIDUAL:g}, or the "
-                f"round-off floor ({error.roundoff_floor:.1e}): solve with tol=1e-10, or give the problem "
-                "that the impulse solves"
+                f"{error.relative:.2e}; at most {MAX_ACCEPTED_RESIDUAL:g}, or the round-off floor "
+                f"({error.roundoff_floor:.1e}), is needed: solve with tol=1e-10"
             )
     return Derivative(problem, linear)

@@ -71,9 +71,8 @@ class System:
             solve = factor(SHIFT_OF_SINGULAR)
         if solve is None:
             raise CapabilityError(
-                "the derivative cannot be computed, because its linear system is singular even after a "
-                f"shift by {SHIFT_OF_SINGULAR:g} of its diagonal: A is indefinite, or the states of the "
-                "contacts are wrong. Solve with a smaller tol first"
+                f"the linear system of the derivative is singular even with {SHIFT_OF_SINGULAR:g} of its diagonal "
+                "added: A is indefinite, or states of contacts are wrong. Solve with a smaller tol first"
             )
         self._solve_factored = solve
 

@@ -375,8 +375,7 @@ def _complete_impulses(
     if not np.linalg.norm(weight * momentum_error) <= MOMENTUM_TOLERANCE * np.linalg.norm(weight * size):
         worst = int(np.argmax(weight * np.abs(momentum_error)))
         raise CapabilityError(
-            "the import does not reproduce Drake's next step: A (v+ - v*) and J^T times the impulses "
+            "a force that the import does not read acts on the plant: A (v+ - v*) and J^T times the impulses "
             f"differ by {momentum_error[worst]:.3g}, of terms up to {size[worst]:.3g}, at "
-            f"{plant.GetVelocityNames(always_add_suffix=True)[worst]}. A force that the import does not "
-            "read acts on the plant: remove it"
+            f"{plant.GetVelocityNames(always_add_suffix=True)[worst]}: remove it"
         )

@@ -329,9 +329,8 @@ def from_mujoco_many(
         raise InputError(f"model is a {type(model).__name__}; a mujoco.MjModel is needed")
     if can_sleep(mj, model):
         raise InputError(
-            'the model has <flag sleep="enable"/>, and a state does not contain which trees sleep: this call would '
-            "wake all of them. Clear the flag in the simulation of the states and here: "
-            "model.opt.enableflags &= ~mujoco.mjtEnableBit.mjENBL_SLEEP"
+            'the model has <flag sleep="enable"/>, and no state has the trees that sleep: clear it here '
+            "and in the simulation: model.opt.enableflags &= ~mujoco.mjtEnableBit.mjENBL_SLEEP"
         )
     check_choice("errors", errors, ERRORS)
     values = np.ascontiguousarray(as_array("states", states, (None, None), finite=errors == "raise"))
@@ -561,9 +560,8 @@ def _check_mass(mass: Any, smooth: FloatArray, force: FloatArray, precision: str
     if len(bad):
         i = bad[0]
         raise CapabilityError(
-            f"world {i}: M qacc_smooth differs from qfrc_smooth by {gap[i] / size[i]:.1e} of their size, so "
-            "the step used another mass matrix than M: give the M of this step, and use an integrator that "
-            "does not add damping to M"
+            f"world {i}: M qacc_smooth differs from qfrc_smooth by {gap[i] / size[i]:.1e} of their size: "
+            "give the M of this step, and use an integrator that does not add damping to M"
         )
 
 

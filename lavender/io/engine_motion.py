@@ -37,13 +37,11 @@ MAX_STIFF_RATIO = 1e-5
 MAX_MOTION_ENTRIES = 1_000_000  # Entries of J above which the dense QR factorisation of (2) takes seconds.
 MAX_BOUNDARY_ROUNDOFFS = 32.0  # [unit round-offs] Friction within this part of its bound is on the boundary.
 ROUNDOFF_OF_PRECISION = {"float64": 2.0**-53, "float32": 2.0**-24}
-EXACT_TOL = (
-    1e-12  # [-] Relative residual of the solution in (1), which is below the rounding of most problems.
-)
+# [-] Relative residual of the solution in (1), which is below the rounding of most problems.
+EXACT_TOL = 1e-12
 SOLVERS = ("newton", "auto")  # The second one solves if the first one does not converge.
-MAX_SOLUTION_ERROR = (
-    0.1  # [-] Largest error of the solution in (1), relative to the error of the engine's forces.
-)
+# [-] Largest error of the solution in (1), relative to the error of the engine's forces.
+MAX_SOLUTION_ERROR = 0.1
 
 
 @dataclass(frozen=True, eq=False)

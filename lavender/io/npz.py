@@ -314,9 +314,8 @@ def _build_box_cones(archive: Arrays, m: int) -> Cones:
     end = start + size
     if size.min() < 1 or size.max() > 3 or start.min() < 0 or end.max() > m or np.any(end[:-1] > start[1:]):
         raise InputError(
-            "cone_start and cone_dim must describe cones of 1 to 3 rows that do not overlap, within rows 0 "
-            f"to {m - 1}; they have sizes {size.min()} to {size.max()}, from row {start.min()} to "
-            f"{end.max() - 1}"
+            f"cones have sizes {size.min()} to {size.max()}, from row {start.min()} to {end.max() - 1}; cone_start "
+            f"and cone_dim of cones of 1 to 3 rows that do not overlap, within rows 0 to {m - 1}, are needed"
         )
     inside = np.zeros(m, bool)  # Whether a row belongs to the block of the row before it.
     for s, e in zip(start, end, strict=True):

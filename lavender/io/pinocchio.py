@@ -281,9 +281,8 @@ def _check_model(pin: Any, model: Any, data: Any) -> None:
             or (joint.idx_v, joint.idx_q) != (at_v, at_q)
         ):
             raise InputError(
-                f"joint {i} has parent {model.parents[i]} and (idx_v, nv, idx_q, nq) = {places}; a parent "
-                f"with a smaller number and ({at_v}, {joint.nv}, {at_q}, {joint.nq}) are needed. "
-                f"{OTHER_MODEL_ADVICE}"
+                f"joint {i} has parent {model.parents[i]} and (idx_v, nv, idx_q, nq) = {places}; a smaller "
+                f"parent and ({at_v}, {joint.nv}, {at_q}, {joint.nq}) are needed. {OTHER_MODEL_ADVICE}"
             )
         if not _is_rotation(model.jointPlacements[i].rotation):
             raise InputError(

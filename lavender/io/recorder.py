@@ -15,7 +15,6 @@ from __future__ import annotations
 import heapq
 import os
 import warnings
-import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,6 +35,7 @@ from lavender.io.stored import (
     format_json,
     make_folder,
     prepare_step_folder,
+    read_arrays,
     write_arrays,
     write_text,
 )
@@ -395,8 +395,4 @@ def read_recorded_state(folder: str | os.PathLike[str], file: str) -> dict[str, 
             f"{path} does not exist, because {file} was recorded without state=; record the steps again "
             "with state="
         )
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            return dict(stored)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"cannot read the state {path}: {error}; record the steps again") from None
+    return read_arrays(path)

@@ -196,13 +196,11 @@ class ProblemData:
         if kj + rows.n_contacts != k or contact[:kj].any() or not contact[kj:].all() or self.cones.has_round:
             raise InputError(
                 f"rows has {kj} joints and {rows.n_contacts} contacts, and cones has {k} blocks; a block of "
-                "bounded rows for each joint is needed, followed by a contact block (not ROUND) for each "
-                "contact"
+                "bounded rows for each joint, then a contact block (not ROUND) for each contact are needed"
             )
         raise InputError(
             f"cones.ptr begins with {self.cones.ptr[: kj + 1].tolist()!s:.60} and rows.joint_ptr is "
-            f"{rows.joint_ptr.tolist()!s:.60}; cones.ptr must begin with rows.joint_ptr: one block for each "
-            "joint, with the same number of rows"
+            f"{rows.joint_ptr.tolist()!s:.60}; cones.ptr must begin with rows.joint_ptr"
         )
 
     def _set_view(self) -> None:

@@ -60,16 +60,14 @@ def convert_from_findex(lower: Any, upper: Any, findex: Any, m: int) -> tuple[In
         i = int(bad[0])
         raise InputError(
             f"row {i} is the normal of friction row {int(np.flatnonzero(findex == i)[0])} and has the "
-            f"bounds [{low[i]}, {high[i]}]; a normal needs [0, inf]: change its bounds, or give its "
-            "friction rows constant bounds (findex -1)"
+            f"bounds [{low[i]}, {high[i]}]; [0, inf] is needed, or findex -1 of its friction rows"
         )
     count = np.bincount(findex[is_friction], minlength=m) if m else np.zeros(0, int)
     bad = np.flatnonzero(count > 2)
     if len(bad):
         raise InputError(
-            f"{count[bad[0]]} rows have findex {bad[0]}; a normal has at most two friction rows, its "
-            "tangents: give the other rows constant bounds (findex -1), or spin by patch_radius of "
-            "Cones.contacts"
+            f"{count[bad[0]]} rows have findex {bad[0]}; a normal has at most two, its tangents: "
+            "give the others constant bounds (findex -1), or spin by patch_radius of Cones.contacts"
         )
     first = order[~is_friction[order]]  # First row of each block, as an index into the arrays.
     size = 1 + count[first]

@@ -225,9 +225,8 @@ class Generalized:
         if row >= 0:
             velocity = row if self.order is None else int(self.order[row])
             raise InputError(
-                f"M is not positive definite: the pivot of {self.velocity_name(velocity)} is no more than rounding of "
-                f"its diagonal entry, or less than {MIN_MAGNITUDE:g} (another unit of mass or length brings it nearer "
-                "to 1); a body without mass or inertia needs some (MuJoCo: armature), or the velocity must be left out"
+                f"M is not positive definite: the pivot of {self.velocity_name(velocity)} is rounding of its diagonal "
+                f"entry, or below {MIN_MAGNITUDE:g}: give it a mass or inertia (MuJoCo: armature), or leave it out"
             )
 
     def __setattr__(self, name: str, value: Any) -> None:

@@ -253,14 +253,8 @@ class Operators(ProblemData):
         """Raise TooLarge if this upper bound of the number of entries of A off the diagonal is too large."""
         # Pairs of blocks that share both bodies were counted twice. Rows of J without entries have a diagonal entry.
         if min(bound + self.m, self.m**2) >= MAX_INDEXABLE_ENTRIES:
-            raise TooLarge(
-                f"A would have up to {bound:.3g} entries; at most 2^31 - 1 can be indexed: use a "
-                + (
-                    "sweep solver that takes rows"
-                    if self.generalized is None
-                    else "solver that takes J and M"
-                )
-            )
+            data = "rows" if self.generalized is None else "J and M"
+            raise TooLarge(f"A may have {bound:.3g} entries, above 2^31 - 1: use a solver that takes {data}")
 
     @computed_once
     def _compressed(self) -> tuple[IntArray, IntArray, FloatArray]:

@@ -148,8 +148,7 @@ def compute_block_levels_from_ground(problem: Problem, ground: Any = None) -> In
     if problem.rows is not None:
         if ground is not None:
             raise InputError(
-                "ground= is given for a problem with rows, whose static bodies define the ground: leave it "
-                "out"
+                "ground= is given for a problem with rows, whose static bodies are the ground: leave it out"
             )
         return compute_block_levels(problem.rows.moving_block_bodies, problem.rows.n_bodies)
     if ground is None:

@@ -161,8 +161,7 @@ class Problem(Builders):
             )
             raise InputError(
                 f"no keys in {keyless}, and the blocks differ ({self.cones.n_blocks} now, {before.cones.n_blocks} "
-                "before), so that impulses cannot be assigned: build both problems with key= (lv.RowBuilder does), or "
-                "solve without impulse="
+                "before): build both problems with key= (lv.RowBuilder does), or solve without impulse="
             )
         return start
 

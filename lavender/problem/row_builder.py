@@ -93,8 +93,7 @@ def _check_dimensions(position: tuple[int, ...], velocity: tuple[int, ...], iner
     if position[1] == 3 and velocity == (n, 3) and len(inertia) < 2:
         raise InputError(
             f"position [m] has shape {position}, three dimensions, but velocity has shape {velocity} and inv_inertia "
-            f"{inertia}, two dimensions: position ({n}, 2) is needed, without the angle; in three dimensions velocity "
-            f"({n}, 6) and inv_inertia ({n}, 3, 3)"
+            f"{inertia}, two dimensions: position ({n}, 2), or velocity ({n}, 6) and inv_inertia ({n}, 3, 3) are needed"
         )
 
 

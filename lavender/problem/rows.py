@@ -204,8 +204,7 @@ class Rows:
         if error > MAX_CORRECTED_ERROR:
             raise InputError(
                 f"contact {i}: normal {self.normal[i]} and tangent {self.tangent[i]} must be orthogonal unit vectors; "
-                f"they are off by {error:.2g}, and up to {MAX_CORRECTED_ERROR:g} (float32 leaves 1e-7) is corrected: "
-                "divide each by its length, after the part along the normal was taken out of the tangent"
+                f"they are off by {error:.2g}, and up to {MAX_CORRECTED_ERROR:g} (float32 leaves 1e-7) is corrected"
             )
         if error > MAX_UNCORRECTED_ERROR:
             object.__setattr__(self, "normal", mark_read_only(normal))
@@ -317,8 +316,7 @@ def _check_joint_counts(ptr: IntArray, jac: Any, joint_body: Any) -> None:
     if are_tables and (rows[0], joints[0]) != (ptr[-1], len(ptr) - 1):
         raise InputError(
             f"jac has {rows[0]} joint rows, joint_body has {joints[0]} joints, and joint_ptr is "
-            f"{ptr.tolist()!s:.60}, default [0]; the first row of each joint, then the number of rows is needed: "
-            f"joint_ptr=[0, {rows[0]}] and joint_body=[[a, b]] for one joint of {rows[0]} rows"
+            f"{ptr.tolist()!s:.60}, default [0]; the first row of each joint, then the number of rows is needed"
         )
 
 

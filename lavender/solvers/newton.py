@@ -215,15 +215,13 @@ class Newton(Solver):
             return NewtonState(problem, None, kernel)
         if bodies is None and over_velocities and self.form == "velocity":
             raise CapabilityError(
-                f"form='velocity' accepts at most {general.MAX_MATRIX_ENTRIES:.1e} values in the matrix "
-                "over the velocities of an island (dense, or with the fill of its factor), and this "
-                "problem needs more: give form='impulse', or use a sweep solver"
+                f"form='velocity' needs more than {general.MAX_MATRIX_ENTRIES:.1e} values for the matrix over the "
+                "velocities of an island: give form='impulse', or use a sweep solver"
             )
         if problem.cones._blocks.has_round:
             raise CapabilityError(
-                "round cones of more than two tangents need form='velocity', which accepts at most "
-                f"{general.MAX_MATRIX_ENTRIES:.1e} values in the matrix of an island; this problem needs "
-                "more, and form='impulse' does not support such cones: use fewer tangents"
+                "round cones of more than two tangents need form='velocity', and more than "
+                f"{general.MAX_MATRIX_ENTRIES:.1e} values for the matrix of an island: use fewer tangents"
             )
         form = "impulse" if bodies is None else "velocity"
         system = make_system(problem, form, like, bodies)

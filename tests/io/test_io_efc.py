@@ -302,7 +302,7 @@ def test_from_mujoco_many_of_a_model_with_sleep_is_rejected_and_agrees_with_from
         mj.mj_forward(model, data)
         if word == "enable":
             assert data.nefc == 0 and data.ntree_awake == 0
-            with pytest.raises(lv.InputError, match=r"which trees sleep.*mjENBL_SLEEP"):
+            with pytest.raises(lv.InputError, match=r"trees that sleep.*mjENBL_SLEEP"):
                 lv.io.from_mujoco_many(model, state[None])
         else:
             batch, impulse = lv.io.from_mujoco_many(model, state[None])

@@ -401,9 +401,8 @@ class Stepping:
             return solution.impulse
         if p.on_failure == "raise":
             raise SolveFailed(
-                f"step {self._steps} of {self.scene!r} failed, because solver {p.solver!r} did not solve "
-                f"its problem and on_failure is 'raise'. The result is: {solution}. Give more "
-                "solver_iterations or another solver, or on_failure='use' to continue"
+                f"step {self._steps} of {self.scene!r} failed, because {p.solver!r} did not solve its problem: "
+                f"{solution}. Give more solver_iterations or another solver, or on_failure='use' to continue"
             )
         self._failed += 1
         if p.on_failure == "keep" or not np.isfinite(solution.impulse).all():

@@ -164,8 +164,7 @@ class Parameters:
             if ratio > MAX_DEFAULT_SUBSTEPS:
                 raise InputError(
                     f"dt is {self.dt:g} s, more than {MAX_DEFAULT_SUBSTEPS} substeps of max_substep = "
-                    f"{self.max_substep:g} s; give a shorter dt, a longer max_substep, or substeps= if that many are "
-                    "meant"
+                    f"{self.max_substep:g} s; give a shorter dt, a longer max_substep, or substeps="
                 )
             substeps = max(1, math.ceil(ratio))
         return check_int("substeps", substeps, 1)

@@ -82,9 +82,8 @@ def named_scene(**defaults: Any) -> Callable[[Builder], Builder]:
         for p in own:
             if p.name in COMMON_PARAMETERS or p.default is p.empty or p.kind is p.VAR_KEYWORD:
                 raise InputError(
-                    f"parameter {p.name!r} of the scene builder {name!r} has no default, or has the name of "
-                    f"a common parameter of scenes; after {first.name!r}, only parameters with a default "
-                    "and another name are possible"
+                    f"parameter {p.name!r} of the scene builder {name!r} has no default, or the name of a parameter "
+                    f"of all scenes; parameters after {first.name!r} need a default and another name"
                 )
         SCENES[name], DEFAULTS[name] = build, defaults
         return build
@@ -168,9 +167,8 @@ class Scene:
         bodies, joints = self._built
         if scene._built != self._built and self.n_joints > joints:
             raise InputError(
-                f"scene {self.name!r} would have {scene.n_bodies} bodies instead of {bodies}, but joints "
-                "that were added to it refer to bodies by number: build the scene with the new parameters "
-                "first, then add the joints"
+                f"scene {self.name!r} would have {scene.n_bodies} bodies instead of {bodies}, and joints that were "
+                "added to it refer to bodies by number: set the parameters first, then add the joints"
             )
         scene.bodies += self.bodies[bodies:]
         scene.joints += self.joints[joints:]
