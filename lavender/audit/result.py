@@ -39,7 +39,6 @@ if TYPE_CHECKING:
 QUANTILES = (0.5, 0.9, 0.99, 0.999, 1.0)
 QUANTILE_NAMES = ("50 %", "90 %", "99 %", "99.9 %", "largest error")
 SAVED_KINDS = ("worst", "contact")
-MAX_CURVE_POINTS = 60  # Largest number of points of a curve over time.
 #: Outcomes of a step of an engine that claims that its solve converged, or that it did not.
 OUTCOMES = (
     "claimed and right", "claimed and wrong", "not claimed but right", "not claimed and wrong",

@@ -32,9 +32,6 @@ ALWAYS_DRAWN = (
     "osqp",
 )  # Most engines sweep as pgs does, and osqp is the most used solver of other packages.
 FIGURE_SIZE = (4.9, 3.3)  # [inches]
-ERROR_LIMIT = (
-    1e-3  # [m/s] Velocity error that pages compare with if no limit is given; 1 mrad/s on angular rows.
-)
 
 
 def select_drawn_solvers(ranking: Sequence[str]) -> list[str]:

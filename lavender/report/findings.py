@@ -40,12 +40,6 @@ MAX_CASES = 40  # Above this number of problems, the matrix has a line for each 
 MAX_MATRIX_ROWS = 100  # Lines of the folded matrix of all problems; matrix.csv has all.
 MAX_WARNINGS = 3  # Warnings of one kind on the first screen.
 RATIO_EDGES = (1.1, 2.0, 5.0, 20.0)  # Edges of the colours of the matrix.
-COLUMNS_OF_FILE = (
-    "form",
-    "floor [-]",
-    "iterations",
-    "worst row",
-)  # runs.csv has these columns, the page has not.
 MUCH_FASTER = 1.25  # A solver is faster than another on a problem from this ratio of times on.
 AUTHOR, TITLE = "The lavender developers", "lavender: solvers of rigid-body contact problems, judged in units"
 LAW_TITLES = {

@@ -101,15 +101,6 @@ def format_power(x: float) -> str:
     return "10" + str(n).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
 
 
-def format_ratio(x: float) -> str:
-    """Return a ratio in words: "2.0 times", "850 times"; from a million on, as a power of ten: "1e8 times"."""
-    if not math.isfinite(x):
-        return NONE
-    if x >= 1e6:
-        return f"1e{math.log10(x):.0f} times"
-    return f"{format_significant_digits(x, 2) if x < 99.5 else f'{x:.0f}'} times"
-
-
 def format_count(n: int, noun: str, plural: str = "") -> str:
     """Return a number with its noun: 1 contact, 2 contacts."""
     return f"{n} {noun if n == 1 else plural or noun + 's'}"

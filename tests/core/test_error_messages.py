@@ -27,7 +27,6 @@ GENERAL = random_generalized_problem(9, "cone")
 PLANE, SPACE, TENSORS = np.zeros((2, 3)), np.zeros((2, 6)), np.tile(I3, (2, 1, 1))
 contacts, bounded = lv.Cones.contacts, lv.Cones.bounded
 QP = ("P", "q", "G", "h", "A", "b", "lb", "ub")
-SWAPPED = "so the two seem to be swapped: the order is inv_mass, inv_inertia, velocity, dt, position"
 
 
 def two():

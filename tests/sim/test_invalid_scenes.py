@@ -17,8 +17,6 @@ import lavender as lv
 from lavender.sim.engine import check
 from lavender.sim.engine.layout import HEAD
 
-CARRIED = ("setting", "x", "q", "v", "cache_key", "cache_impulse", "cache_local", "joint_impulse")
-
 
 def trajectory(sim, steps):
     """Return the bytes of the positions after each step."""

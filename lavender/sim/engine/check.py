@@ -22,9 +22,6 @@ from lavender.sim.engine.layout import HEAD, SETTING, SIZE
 from lavender.sim.engine.state import State
 from lavender_ext.engine.arrays import CAP_CONTACT, CAP_PAIR, N_SIZES
 
-CARRIED = (
-    "x", "q", "v", "fat", "joint_impulse", "inv_inertia", "cache_impulse", "cache_local", "cache_roll", "cache_key"
-)  # fmt: skip
 GIVEN = (
     "inv_mass_body", "inertia", "inv_inertia_body", "shape", "friction", "restitution", "patch", "joint", "inv_mass",
     "kind_of_shape", "dyn", "uneven", "body_of", "joint_kind", "joint_motor", "joint_bodies", "joint_body", "excluded",
