@@ -158,7 +158,10 @@ class Batch(Sequence[Problem]):
         goal, at["target"], _ = _flatten("target", target, n, row_shape, sizes)
         compliance = 0.0 if compliance is None else compliance
         soft, at["soft"], _ = _flatten("compliance", compliance, n, row_shape, sizes)
-        self._arrays: Any = (jac, mass, free, goal, soft, self._flatten_mu(mu))
+        if mu is not None:
+            mu_shape = (self.cones.n_blocks,) if self._has_shared_cones else None
+            mu, at["mu"], _ = _flatten("mu", mu, n, mu_shape, at["blocks"])
+        self._arrays: Any = (jac, mass, free, goal, soft, mu)
         # `lavender.io.engine_motion.EngineMotion` of worlds that an engine moves by accelerations.
         self.engine_motions: dict[int, Any] = {}
 
@@ -205,14 +208,6 @@ class Batch(Sequence[Problem]):
                 f"{bad[0]}; every block must belong to one world: give a list with one Cones for each world"
             )
         at["block"], at["blocks"], at["cone_row"] = block, last - block, first
-
-    def _flatten_mu(self, mu: Any) -> np.ndarray | None:
-        """Return mu of all worlds as a flat array."""
-        if mu is None:
-            return None
-        shape = (self.cones.n_blocks,) if self._has_shared_cones else None
-        flat, self.at["mu"], _ = _flatten("mu", mu, len(self), shape, self.at["blocks"])
-        return flat
 
     def _get_cones_of_world(self, i: int, mu: FloatArray | None = None) -> Cones:
         """Return the blocks of world i, with mu (k,) if it is given."""

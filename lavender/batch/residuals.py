@@ -173,7 +173,8 @@ class WorldResults:
             try:
                 process_single(i)
             except LavenderError as error:
-                self.faults[i] = self._make_fault(i, error)
+                is_input = type(self.problems) is Batch and isinstance(error, InputError)
+                self.faults[i] = InputError(f"world {i}: {error}") if is_input else error
                 stop[0] |= errors == "raise"
 
         def work(stop: bytearray) -> None:
@@ -194,12 +195,6 @@ class WorldResults:
         self.faults.update(self._invalid_starts)
         for i in self.faults:
             self._worlds.numbers[:, i] = np.nan
-
-    def _make_fault(self, i: int, error: LavenderError) -> LavenderError:
-        """Return the error of world i, with the index of the world for a batch."""
-        if type(self.problems) is Batch and isinstance(error, InputError):
-            return InputError(f"world {i}: {error}")
-        return error
 
 
 class Residuals(WorldResults):

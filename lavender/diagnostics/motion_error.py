@@ -170,9 +170,12 @@ def _compute_error(problem: Problem, x: FloatArray, reference: FloatArray) -> Mo
     else:
         delta = x - reference
         velocity = _compute_velocity_change(problem, delta)
-        values["row"], values["rows"] = _find_index_and_max(
-            np.abs(_compute_slack_change(problem, delta, velocity))
-        )
+        if velocity is None:
+            slack_change = problem.csr @ delta
+        else:
+            assert problem.compliance is not None
+            slack_change = problem.jacobian @ velocity + problem.compliance * delta
+        values["row"], values["rows"] = _find_index_and_max(np.abs(slack_change))
         if velocity is not None and problem.generalized is not None:
             values["body"], values["speed"] = _find_index_and_max(np.abs(velocity))
         elif velocity is not None:
@@ -207,14 +210,6 @@ def _compute_error(problem: Problem, x: FloatArray, reference: FloatArray) -> Mo
 def _compute_velocity_change(problem: Problem, impulse: FloatArray) -> FloatArray | None:
     """Compute M^-1 J^T x (6 n,) or (nv,) [m/s, rad/s] of an impulse x (m,); None if M is not known."""
     return None if problem.matrix is not None else problem.compute_velocity_change(impulse).ravel()
-
-
-def _compute_slack_change(problem: Problem, impulse: FloatArray, velocity: FloatArray | None) -> FloatArray:
-    """Compute A x (m,) [m/s] of an impulse x (m,) with velocity change `velocity`."""
-    if velocity is None:
-        return np.asarray(problem.csr @ impulse)
-    assert problem.compliance is not None
-    return np.asarray(problem.jacobian @ velocity + problem.compliance * impulse)
 
 
 def _compute_energy_norms(

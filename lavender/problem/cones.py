@@ -532,7 +532,11 @@ def _convert_fields(
             f"ROUND=3, CONTACT_BOX={CONTACT_BOX}, CONTACT_ROLLING={CONTACT_ROLLING} and "
             f"CONTACT_ELLIPSE={CONTACT_ELLIPSE}"
         )
-    kind = _simplify_kinds(kind, np.diff(ptr))
+    size = np.diff(ptr)
+    # A round cone of up to two tangents, or a box of one, is a CONTACT.
+    is_disk = ((kind == ROUND) & (size <= 3)) | ((kind == CONTACT_BOX) & (size <= 2))
+    if is_disk.any():
+        kind = mark_read_only(np.where(is_disk, CONTACT, kind).astype(np.int32))
     lower = as_array("lower", lower, (m,), finite=False, unit="N s")
     upper = as_array("upper", upper, (m,), finite=False, unit="N s")
     check_not_nan("lower", lower)
@@ -589,9 +593,3 @@ def _raise_fault(fault: str, index: int, fields: tuple[np.ndarray, ...]) -> NoRe
     )
     check_nonnegative_magnitudes("rolling", rolling, "m")
     raise InputError(f"block {index} is invalid: {fault}")
-
-
-def _simplify_kinds(kind: IntArray, size: IntArray) -> IntArray:
-    """Return the kinds of blocks; a round cone of up to two tangents, or a box of one, becomes a CONTACT."""
-    is_disk = ((kind == ROUND) & (size <= 3)) | ((kind == CONTACT_BOX) & (size <= 2))
-    return mark_read_only(np.where(is_disk, CONTACT, kind).astype(np.int32)) if is_disk.any() else kind

@@ -143,7 +143,9 @@ class ProblemData:
             "law": _find_law(cones, friction),
         })  # fmt: skip
         if matrix is None:
-            fields["compliance"] = _convert_compliance(compliance, m, copy)
+            soft = 0.0 if compliance is None else compliance
+            fields["compliance"] = as_array("compliance", soft, (m,), unit="1/kg", copy=copy)
+            check_nonnegative_magnitudes("compliance", fields["compliance"], "1/kg")
         elif compliance is not None:
             raise InputError(
                 "compliance is given for a problem with a matrix A; A already contains compliance on its diagonal: add "
@@ -409,15 +411,6 @@ def _find_law(cones: Cones, friction: str) -> str:
     """Return the problem class of blocks with a law of friction."""
     blocks = cones._blocks
     return "linear" if blocks.is_free else "lcp" if blocks.is_bounded_rows else friction
-
-
-def _convert_compliance(compliance: ArrayLike | None, m: int, copy: bool) -> FloatArray:
-    """Convert a compliance to a checked array (m,) [1/kg]; the default is 0."""
-    if compliance is None:
-        return mark_read_only(np.zeros(m))
-    array = as_array("compliance", compliance, (m,), unit="1/kg", copy=copy)
-    check_nonnegative_magnitudes("compliance", array, "1/kg")
-    return array
 
 
 def _convert_keys(key: Any, k: int) -> np.ndarray:

@@ -206,7 +206,9 @@ class Generalized:
         except MemoryError:
             operator = None
         if operator is None or operator.is_worth_ordering:
-            order = _order_velocities(mass, n)
+            indptr, indices, _ = mass
+            lower = sp.csr_array((np.ones(len(indices), np.int32), indices, indptr), shape=(n, n))
+            order = _order_by_degree(sp.csr_array(lower + lower.T))
             reordered = kernels.Operator(*_permute_columns(jac, order), *_permute_lower(mass, order))
             if operator is None or reordered.fill < operator.fill:
                 attributes["order"], operator = mark_read_only(order), reordered
@@ -478,13 +480,6 @@ def _permute_columns(jac: Compressed, order: IntArray) -> Compressed:
     indptr, indices, data = jac
     rows = np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
     return _compress_entries(rows, np.argsort(order)[indices], data, len(indptr) - 1)
-
-
-def _order_velocities(mass: Compressed, n: int) -> IntArray:
-    """Return an order of velocities (n,) with little fill-in; elimination starts at the last one."""
-    indptr, indices, _ = mass
-    lower = sp.csr_array((np.ones(len(indices), np.int32), indices, indptr), shape=(n, n))
-    return _order_by_degree(sp.csr_array(lower + lower.T))
 
 
 def _order_by_degree(graph: sp.csr_array) -> IntArray:

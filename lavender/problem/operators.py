@@ -260,29 +260,24 @@ class Operators(ProblemData):
     def _compressed(self) -> tuple[IntArray, IntArray, FloatArray]:
         """Arrays (indptr, indices, data) of A for kernels and the judge.
 
-        They are stored separately because callers can replace the arrays of the matrix object `csr`.
+        They are stored separately because callers can replace the arrays of the matrix object `csr`. A = Y Y^T +
+        diag(compliance) is bitwise symmetric: both triangles are summed in the same order.
         """
         if self.generalized is not None:
-            return self._form_generalized()
-        if self.rows is not None:
+            self._check_entry_count(self.metric.entries_of_matrix)
+            # A kernel is used instead of SciPy, which a first solve with a time limit would have to import.
+            y = self.metric.whitened()
+            arrays = assemble.form_gram_matrix(*y, self.generalized.nv, self.compliance, FORMING.deadline)
+            if arrays is None:
+                raise TooLate("the time limit ended the forming of A")
+        elif self.rows is not None:
             bound, start, blocks = assemble.bound_delassus_entries(self.data)
             self._check_entry_count(bound)
-            bound = min(bound, self.m**2)
-            indptr, indices, data = assemble.form_delassus_matrix(self.data, bound, start, blocks)
-            return mark_read_only(indptr), mark_read_only(indices), mark_read_only(data)
-        return dense_to_csr(self.matrix)
-
-    def _form_generalized(self) -> tuple[IntArray, IntArray, FloatArray]:
-        """Form A = Y Y^T + diag(compliance), bitwise symmetric: both triangles are summed in the same order."""
-        assert self.generalized is not None
-        self._check_entry_count(self.metric.entries_of_matrix)
-        # A kernel is used instead of SciPy, which a first solve with a time limit would have to import.
-        y = self.metric.whitened()
-        formed = assemble.form_gram_matrix(*y, self.generalized.nv, self.compliance, FORMING.deadline)
-        if formed is None:
-            raise TooLate("the time limit ended the forming of A")
-        indptr, indices, data = formed
-        return mark_read_only(indptr), mark_read_only(indices), mark_read_only(data)
+            arrays = assemble.form_delassus_matrix(self.data, min(bound, self.m**2), start, blocks)
+        else:
+            return dense_to_csr(self.matrix)
+        indptr, indices, data = map(mark_read_only, arrays)
+        return indptr, indices, data
 
     @computed_once
     def whitened(self) -> sp.csr_array:

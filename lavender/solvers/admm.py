@@ -119,7 +119,10 @@ class AdmmState:
             form = problem.velocity_form()
             # `velocity_form` has scaled K and theta by the judge's d.
             self.is_over_bodies, self.theta, self.jacobian = True, form.theta, form.jacobian
-            self.body_work, self.body_solve = _count_body_work(problem), None
+            rows = problem.rows
+            assert rows is not None
+            self.body_work = float(Layout(rows.moving_block_bodies, rows.n_bodies, 6).work)  # of one factor
+            self.body_solve = None
             self.has_factor = self.body_work <= MAX_FACTOR_WORK_PER_ENTRY * form.jacobian.nnz
             return
         a = problem.csr
@@ -213,13 +216,6 @@ class AdmmState:
 def _is_over_bodies(problem: Problem) -> bool:
     rows = problem.rows
     return rows is not None and 0 < 6 * rows.n_bodies < problem.m
-
-
-def _count_body_work(problem: Problem) -> float:
-    """Return the number of multiply-adds of one factor over bodies."""
-    rows = problem.rows
-    assert rows is not None
-    return float(Layout(rows.moving_block_bodies, rows.n_bodies, 6).work)
 
 
 def _analyse_panels(system: LinearSystem) -> LinearSystem:

@@ -77,28 +77,18 @@ def _compute_factorisation_choice(problem: Problem) -> tuple[str, int, IntArray 
         return "dense", m - 1, None
     # In a narrow band, every row has at most 2 band + 1 nonzeros.
     if np.diff(problem._compressed[0]).max() <= 2 * MAX_COMPILED_BAND + 1:
-        order = find_small_bandwidth_order(problem)
-        band = compute_half_bandwidth_in_order(problem, order)
+        from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+        a = problem.csr
+        order = reverse_cuthill_mckee(a, symmetric_mode=problem.is_symmetric)
+        order = np.ascontiguousarray(order, np.int32)
+        position = np.empty(m, np.int64)
+        position[order] = np.arange(m)
+        row = np.repeat(position, np.diff(a.indptr))
+        band = int(np.abs(row - position[a.indices]).max(initial=0))
         if band <= MAX_COMPILED_BAND:
             return "band", band, order
     return "sparse", m - 1, None
-
-
-def find_small_bandwidth_order(problem: Problem) -> IntArray:
-    """Return an order of the rows of A with small bandwidth: reverse Cuthill-McKee."""
-    from scipy.sparse.csgraph import reverse_cuthill_mckee
-
-    order = reverse_cuthill_mckee(problem.csr, symmetric_mode=problem.is_symmetric)
-    return np.ascontiguousarray(order, np.int32)
-
-
-def compute_half_bandwidth_in_order(problem: Problem, order: IntArray) -> int:
-    """Return the half bandwidth of A with its rows in that order."""
-    position = np.empty(problem.m, np.int64)
-    position[order] = np.arange(problem.m)
-    a = problem.csr
-    row = np.repeat(position, np.diff(a.indptr))
-    return int(np.abs(row - position[a.indices]).max(initial=0))
 
 
 class Factor(Protocol):

@@ -144,13 +144,6 @@ def _make_sparse_matrix(entries: list[tuple[int, int, float]], shape: tuple[int,
     return sp.csr_array((np.array(x, float), (np.array(i, int), np.array(j, int))), shape=shape)
 
 
-def _normalise_direction(y: FloatArray) -> FloatArray:
-    """Return a direction with its largest entry scaled to 1 and rounding noise below 1e-13 set to 0."""
-    size = np.abs(y).max(initial=0.0)
-    y = y / size if size > 0.0 else y
-    return np.where(np.abs(y) < 1e-13, 0.0, y)
-
-
 @dataclass
 class ConvertedState:
     """State of the inner solver, and the conversion of its rows."""
@@ -250,7 +243,9 @@ class BoundedRowSolver(Solver):
         elif above <= tol:
             status = Status.ROUNDOFF_LIMIT
         elif status is Status.INFEASIBLE and claim.certificate is not None:
-            proof = _normalise_direction(form.to_impulse @ claim.certificate)
+            proof = form.to_impulse @ claim.certificate
+            proof = proof / (np.abs(proof).max(initial=0.0) or 1.0)
+            proof = np.where(np.abs(proof) < 1e-13, 0.0, proof)  # Set rounding noise to 0.
             if check_certificate(form.problem, proof, tol) is not None:
                 status, proof = Status.STALLED, None
                 message += ": of the friction as rows, which proves nothing of the problem itself"

@@ -419,14 +419,6 @@ def _is_importable(module: str) -> bool:
 registered: dict[str, SolverSpec] = {}
 
 
-def register_specs_of_module(table: str) -> None:
-    """Fill `registered` with the SPECS of a module."""
-    for spec in import_module_under_lock(table).SPECS:
-        # Restore the order of the table, from which `get` may have registered a solver before.
-        registered.pop(spec.name, None)
-        _add_own(spec)
-
-
 def _add_own(spec: SolverSpec) -> None:
     object.__setattr__(spec, "builtin", True)
     registered[spec.name] = spec
@@ -442,7 +434,10 @@ def load_all() -> None:
 def register_all_solvers() -> None:
     """Fill `registered` with the built-in solvers and the plug-ins."""
     for table in TABLES:
-        register_specs_of_module(table)
+        for spec in import_module_under_lock(table).SPECS:
+            # Restore the order of the table, from which `get` may have registered a solver before.
+            registered.pop(spec.name, None)
+            _add_own(spec)
     from importlib.metadata import entry_points  # It takes a tenth of the time of `import lavender`.
 
     for entry in entry_points(group=ENTRY_POINT_GROUP):
@@ -513,26 +508,18 @@ def get(name: str) -> SolverSpec:
     """
     spec = registered.get(name) if isinstance(name, str) else None
     if spec is None and isinstance(name, str):
-        spec = _register_by_name(name)
+        # The file of a built-in solver is imported alone, which takes less time than the whole table.
+        spec = import_module_under_lock(TABLES[0]).get_spec(name)
+        if spec is not None:
+            _add_own(spec)
+        else:
+            spec = specs().get(name)
     if spec is None:
         raise UnknownName("solver", name, specs())
     reason = spec.requires and spec.missing()
     if reason:
         raise SolverUnavailable(f"solver {name!r} {reason}")
     return spec
-
-
-def _register_by_name(name: str) -> SolverSpec | None:
-    """Register and return a solver that is not registered yet, or None.
-
-    The file of a built-in solver is imported alone, which takes less time than the whole table.
-    """
-    own: SolverSpec | None = import_module_under_lock(TABLES[0]).get_spec(name)
-    if own is not None:
-        _add_own(own)
-        return own
-    load_all()
-    return registered.get(name)
 
 
 def known(problem: Problem | None = None) -> dict[str, str | None]:
