@@ -206,18 +206,13 @@ def explain_slip_of_states(
             explanation = _explain_state(mj, model, data, entries)
             if explanation is not None:
                 explanations.append(replace(explanation, state=i))
-                explained.append(_get_state(mj, model, data))
+                own = np.empty(mj.mj_stateSize(model, mj.mjtState.mjSTATE_INTEGRATION))
+                mj.mj_getState(model, data, own, mj.mjtState.mjSTATE_INTEGRATION)
+                explained.append(own)
         if explanations:
             _simulate_remedies(mj, model, explanations, explained, watch)
     found = describe_provenance(model, name_model(model))
     return SlipOfStates(tuple(explanations), len(vectors), tuple(diverged), misfit, found)
-
-
-def _get_state(mj: Any, model: Any, data: Any) -> FloatArray:
-    """Return the state vector of mjSTATE_INTEGRATION."""
-    state = np.empty(mj.mj_stateSize(model, mj.mjtState.mjSTATE_INTEGRATION))
-    mj.mj_getState(model, data, state, mj.mjtState.mjSTATE_INTEGRATION)
-    return state
 
 
 def _advance(mj: Any, model: Any, vector: FloatArray | None, steps: int) -> Any:

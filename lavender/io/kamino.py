@@ -106,7 +106,11 @@ def from_kamino(solver: Any, *, verify: bool = False) -> EngineStep:
             layout = _LAYOUTS[solver] = _Layout(engine._model)
         worlds = _Worlds(engine, layout, solver._contacts_kamino)
         step = worlds.convert()
-        claims = _make_claims(solver.status.numpy())
+        status = solver.status.numpy()
+        residuals = {
+            name: status[name].astype(float) for name in status.dtype.names if name in RESIDUAL_NAMES
+        }
+        claims = Claims(status["converged"] != 0, status["iterations"].astype(np.int64), residuals)
         _verify_delassus_matrix(solver, engine, worlds, verify)
     except AttributeError as error:
         raise CapabilityError(f"this SolverKamino lacks an attribute: {error}. {KAMINO_ADVICE}") from None
@@ -130,13 +134,6 @@ def _check_configuration(engine: Any) -> None:
         not config.sparse_jacobian and engine._jacobians.data.J_cts_data is None
     ):
         raise InputError("this model has no joints, limits or contacts: there is no problem to convert")
-
-
-def _make_claims(status: Any) -> Claims:
-    """Build the claims from the engine's array of status records."""
-    names = [name for name in status.dtype.names if name in RESIDUAL_NAMES]
-    residuals = {name: status[name].astype(float) for name in names}
-    return Claims(status["converged"] != 0, status["iterations"].astype(np.int64), residuals)
 
 
 class _Layout:
@@ -419,13 +416,6 @@ class _Worlds:
         world, number, pair = (x.numpy()[:count].copy() for x in (data.wid, data.cid, data.bid_AB))
         return world, number, pair
 
-    def count_rows_by_kind(self) -> dict[str, np.ndarray]:
-        """Return the number of rows of each kind in each world (n,)."""
-        soft = np.bincount(self.world, self.compliance != 0.0, minlength=self.n)
-        return {
-            "joint": self.joints, "bounded": self.bounded, "limit": self.limits, "contact": self.contacts, "soft": soft
-        }  # fmt: skip
-
     def compare_delassus_matrix(self, i: int) -> float:
         """Return the largest difference of the engine's D from J M^-1 J^T in world i, relative to D's largest entry."""
         size, first_body = int(self.rows[i]), int(self.layout.first_body[i])
@@ -464,7 +454,9 @@ def _verify_delassus_matrix(solver: Any, engine: Any, worlds: _Worlds, complete:
     CapabilityError
         The matrices differ in a world with finite numbers.
     """
-    kinds = worlds.count_rows_by_kind()
+    soft = np.bincount(worlds.world, worlds.compliance != 0.0, minlength=worlds.n)
+    kinds = {"joint": worlds.joints, "bounded": worlds.bounded, "limit": worlds.limits}
+    kinds |= {"contact": worlds.contacts, "soft": soft}
     layout = worlds.bodies.tobytes(), _as_int(worlds.problem.maxdim).tobytes()
     known = _VERIFIED.get(solver)
     verified = known[1] if known is not None and known[0] == layout else frozenset()

@@ -186,26 +186,21 @@ class Stage:
         error = np.nan_to_num(np.concatenate(errors), nan=np.inf)
         return replace(result, error=error, motion=distance, **sizes)
 
-    def prepare_timing(self, setting: MujocoSetting) -> Callable[[], FloatArray]:
-        """Return a function that runs all stretches and returns the time of each step."""
-        model = setting.apply_to(self.mj, self.model)
-        return lambda: self.run_stretches(model)[0]
-
     def time_settings(self, settings: list[Measured], repeats: int, progress: Progress) -> None:
         """Time the steps of all settings, which alternate in `repeats` rounds; the first is the present setting.
 
         A setting with which a world diverges is not timed.
         """
         settings = [m for m in settings if np.isfinite(m.error).all()]
-        runs = [self.prepare_timing(m.setting) for m in settings]
+        models = [m.setting.apply_to(self.mj, self.model) for m in settings]
         for round_index in range(repeats):
-            for m, run in zip(settings, runs, strict=True):
+            for m, model in zip(settings, models, strict=True):
                 # Compare medians over the steps, so that an interrupted step does not exclude a setting.
                 if round_index and np.median(m.times) > MAX_TIME_RATIO * np.median(settings[0].times):
                     continue
                 text = f"round {round_index + 1} of {repeats}, {m.setting.name}"
                 progress.begin_measurement("timing", text)
-                m.times = np.minimum(m.times, run())
+                m.times = np.minimum(m.times, self.run_stretches(model)[0])
 
 
 def list_first_settings(mj: Any, model: Any) -> list[MujocoSetting]:

@@ -349,19 +349,15 @@ class Stepping:
                 try:
                     problem = self._build_problem(self.state)
                 except InputError:  # The numbers of the problem are not finite.
-                    self._end_run_at_lost_body()
+                    kernel.apply_impulses()
+                    if kernel.finish_substep() == OK:  # Else it has reported the lost body.
+                        bodies = [*a["contact_pair"][:1].ravel().tolist(), int(a["body_of"][0])]
+                        self.state.head[HEAD["lost"]] = next(i for i in bodies if a["dyn"][i] >= 0)
                     return
                 a["impulse"][: problem.m] = self._solve(problem)
                 kernel.apply_impulses()
             if kernel.finish_substep() != OK:
                 return
-
-    def _end_run_at_lost_body(self) -> None:
-        """End the run after a prepared problem that is not valid, at the body that `finish()` reports."""
-        self.state.kernel.apply_impulses()
-        if self.state.kernel.finish_substep() == OK:
-            bodies = [*self.state.a["contact_pair"][:1].ravel().tolist(), int(self.state.a["body_of"][0])]
-            self.state.head[HEAD["lost"]] = next(i for i in bodies if self.state.a["dyn"][i] >= 0)
 
     def _run_newton_on_engine_arrays(self) -> bool:
         """Run the first phase of `newton` on the engine's arrays; return whether it solved the problem.

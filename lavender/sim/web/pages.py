@@ -9,7 +9,6 @@ import subprocess
 import sys
 from collections.abc import Callable
 from functools import partial
-from http import HTTPStatus
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -143,14 +142,6 @@ class _Handler(SimpleHTTPRequestHandler):
         """Forbid browsers to cache the files."""
         self.send_header("Cache-Control", "no-cache")
         super().end_headers()
-
-    def send_head(self) -> Any:
-        """Answer "not found" for an invalid path, such as one with a NUL character."""
-        try:
-            return super().send_head()
-        except (OSError, ValueError):
-            self.send_error(HTTPStatus.NOT_FOUND)
-            return None
 
     def log_message(self, format: str, *arguments: Any) -> None:  # noqa: A002 - the base class names it so
         """Print nothing about single requests."""
