@@ -335,8 +335,7 @@ class GenesisScene:
             shape = state[name].shape if name in state else ()
             if shape != own[name].shape:
                 raise InputError(
-                    f"states: {name} has shape {shape} for the worlds of this scene; "
-                    f"{own[name].shape} is needed"
+                    f"states: {name} has shape {shape} for the worlds of this scene; {own[name].shape} is needed"
                 )
         self.solver.set_qpos(np.asarray(state["qpos"], np.float32))
         self.solver.set_dofs_velocity(np.asarray(state["qvel"], np.float32))

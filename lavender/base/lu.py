@@ -24,8 +24,7 @@ def factor_sparse_lu(matrix: Any, **options: Any) -> Any:
     # A full diagonal implies full structural rank.
     if not a.diagonal().all() and sp.csgraph.structural_rank(sp.csr_array(a)) < a.shape[0]:
         raise RuntimeError(
-            "the matrix is structurally singular: its nonzero pattern makes it singular for all values of "
-            "the entries"
+            "the matrix is structurally singular: its nonzero pattern makes it singular for all values of the entries"
         )
     return splu(a, **options)
 

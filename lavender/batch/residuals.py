@@ -377,8 +377,7 @@ def convert_impulses_or_guesses(problems: Any, impulses: Any) -> list[Any]:
     impulses = check_sequence("impulses", impulses, "(m,), one for each problem,")
     if len(impulses) != len(problems):
         raise InputError(
-            f"impulses has {len(impulses)} entries for {len(problems)} problems; one array for each problem "
-            "is needed"
+            f"impulses has {len(impulses)} entries for {len(problems)} problems; one array for each problem is needed"
         )
     return [
         p.guess if x is None else p.make_start(x, f"impulses of world {i}", finite=False)

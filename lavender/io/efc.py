@@ -597,8 +597,7 @@ def _find_elliptic_contacts(contacts: Any, elliptic: Any) -> tuple[Any, ...]:
     if len(bad):
         k, j = bad[0]
         raise InputError(
-            f"friction of contact {here[k]} is {rub[k, j]:g} at position {j}; a finite number above 0 is "
-            "needed"
+            f"friction of contact {here[k]} is {rub[k, j]:g} at position {j}; a finite number above 0 is needed"
         )
     first = world * np.int64(m) + address
     rows = [first[dim > j] + j for j in range(MAX_CONTACT_ROWS)]

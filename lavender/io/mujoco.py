@@ -336,8 +336,7 @@ def _read_mass(step: Step, data: Any) -> tuple[Any, Any]:
     """
     if not step.has_mass:
         raise InputError(
-            "M of this MjData is 0, because mj_forward(model, data) was not called: call it, or step the "
-            "simulation"
+            "M of this MjData is 0, because mj_forward(model, data) was not called: call it, or step the simulation"
         )
     kept = step.cache
     copied = mujoco_rows.copy_mass(step, kept.pattern)

@@ -392,7 +392,6 @@ def read_recorded_state(folder: str | os.PathLike[str], file: str) -> dict[str, 
     path = Path(folder) / STATES_FOLDER / file
     if not path.is_file():
         raise InputError(
-            f"{path} does not exist, because {file} was recorded without state=; record the steps again "
-            "with state="
+            f"{path} does not exist, because {file} was recorded without state=; record the steps again with state="
         )
     return read_arrays(path)

@@ -468,10 +468,7 @@ class Solution:
         note = f"; {self.message}" if self.message else ""
         wrong = f"; CONTRADICTED: {self.status_conflict}" if self.claim_check == CONTRADICTED else ""
         judged = self.residual if self.program_error is None else f"program error {self.program_error:.1e}"
-        return (
-            f"{self.solver.name}: {self.status.name}, {judged}, {self._work_text}, "
-            f"{self._time_text}{note}{wrong}"
-        )
+        return f"{self.solver.name}: {self.status.name}, {judged}, {self._work_text}, {self._time_text}{note}{wrong}"
 
 
 def name_start(problem: Any, impulse: Any) -> str:

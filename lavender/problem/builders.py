@@ -500,8 +500,7 @@ class Builders(Operators):
             )
         if b is not None and target is not None:
             raise InputError(
-                "b and target are both given, and each of them determines the right-hand side: give one of "
-                "the two"
+                "b and target are both given, and each of them determines the right-hand side: give one of the two"
             )
         if b is None and target is None and (J is not None or v_free is not None):
             raise InputError(

@@ -528,9 +528,8 @@ def _convert_fields(
     kind = as_array("cones.kind", kind, (k,), dtype=np.int32)
     if k and not np.isin(kind, kernels.KINDS).all():
         raise InputError(
-            f"cones.kind holds {sorted(set(kind.tolist()))}; the kinds are ROW=0, CONTACT=1, CONTACT_SPIN=2, "
-            f"ROUND=3, CONTACT_BOX={CONTACT_BOX}, CONTACT_ROLLING={CONTACT_ROLLING} and "
-            f"CONTACT_ELLIPSE={CONTACT_ELLIPSE}"
+            f"cones.kind holds {sorted(set(kind.tolist()))}; the kinds are ROW=0, CONTACT=1, CONTACT_SPIN=2, ROUND=3, "
+            f"CONTACT_BOX={CONTACT_BOX}, CONTACT_ROLLING={CONTACT_ROLLING} and CONTACT_ELLIPSE={CONTACT_ELLIPSE}"
         )
     size = np.diff(ptr)
     # A round cone of up to two tangents, or a box of one, is a CONTACT.

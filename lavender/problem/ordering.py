@@ -110,8 +110,7 @@ def compute_block_order(
         blocks = as_array("order", order, (k,), dtype=np.int32).copy()
         if not np.array_equal(np.sort(blocks), np.arange(k)):
             raise InputError(
-                f"order is not a permutation of the blocks; every block from 0 to {k - 1} is needed exactly "
-                "once"
+                f"order is not a permutation of the blocks; every block from 0 to {k - 1} is needed exactly once"
             )
         return Order(blocks, k, GIVEN, rng)
     if order not in SWEEP_ORDERS:

@@ -180,8 +180,7 @@ class Rows:
             body = getattr(self, f"{name}_body")[index, 0]
             if body >= 0:
                 raise InputError(
-                    f"{name}_body[{index}] is [{body}, {body}]; two different bodies are needed, or -1 for "
-                    "a static one"
+                    f"{name}_body[{index}] is [{body}, {body}]; two different bodies are needed, or -1 for a static one"
                 )
             raise InputError(
                 f"{name}_body[{index}] is [-1, -1], two static bodies, which no impulse moves; at least one "

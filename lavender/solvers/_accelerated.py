@@ -71,8 +71,7 @@ class Accelerated(Sweeping):
             check_name("sweep", self.sweep, SWEEP_NAMES)
         if self.sweep == "pgs" and problem.law == "cone":
             raise InputError(
-                "sweep='pgs' cannot solve this problem, because it has no update for the cone law: give "
-                "sweep='blocks'"
+                "sweep='pgs' cannot solve this problem, because it has no update for the cone law: give sweep='blocks'"
             )
         if self.convex is not None and (not isinstance(self.convex, int) or self.convex < 0):
             raise InputError(f"convex is {self.convex!r}; a whole number of iterations >= 0 is needed")

@@ -31,8 +31,7 @@ class SOR(Sweeping):
     def __post_init__(self) -> None:
         if not 0.0 < check_float("omega", self.omega) < 2.0:
             raise InputError(
-                f"omega is {self.omega}; a number between 0 and 2 is needed, because SOR diverges outside "
-                "of this range"
+                f"omega is {self.omega}; a number between 0 and 2 is needed, because SOR diverges outside of this range"
             )
 
     def _build_state(self, problem: Problem, order: Order, before: Any) -> SweepState:

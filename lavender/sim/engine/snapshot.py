@@ -79,14 +79,12 @@ class Snapshot:
         data = read_whole_file(path, "the snapshot")
         if not data.startswith(MAGIC):
             raise InputError(
-                f"{str(path)!r} does not begin as a snapshot of lavender; a file that Snapshot.save wrote "
-                "is needed"
+                f"{str(path)!r} does not begin as a snapshot of lavender; a file that Snapshot.save wrote is needed"
             )
         body, checksum = data[:-32], data[-32:]
         if hashlib.sha256(body).digest() != checksum:
             raise InputError(
-                f"the snapshot {str(path)!r} is damaged: its checksum does not match its content. Save or copy it "
-                "again"
+                f"the snapshot {str(path)!r} is damaged: its checksum does not match its content. Save or copy it again"
             )
         try:
             snapshot = cls._parse(body)

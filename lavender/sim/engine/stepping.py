@@ -69,8 +69,7 @@ class Stepping:
             raise InputError(f"scene is a {type(scene).__name__}; a lavender.Scene is needed, or a name")
         if not scene.bodies:
             raise InputError(
-                "the scene has no bodies; at least one is needed: add some with add_box, add_sphere or "
-                "add_plane"
+                "the scene has no bodies; at least one is needed: add some with add_box, add_sphere or add_plane"
             )
         self.scene = scene = copy(scene)  # Later additions to the scene do not change this simulation.
         self.report_residual = check_flag("report_residual", report_residual)
@@ -471,8 +470,7 @@ class Stepping:
         """Return the problem of the last substep and its impulses (m,) [N s]; InputError if there is none."""
         if not self.state.head[HEAD["solved"]]:
             raise InputError(
-                "the simulation has no complete last step, because none was made or it was stopped: call "
-                "step() first"
+                "the simulation has no complete last step, because none was made or it was stopped: call step() first"
             )
         problem = self._build_problem(self.state)
         return problem, self.state.a["impulse"][: problem.m].copy()
