@@ -83,7 +83,7 @@ cdef class Driver(Method):
 
     @property
     def islands(self):
-        """Number of islands, which are independent problems without common velocities."""
+        """Return the number of islands, which are independent problems without common velocities."""
         return self.space.islands
 
     @property

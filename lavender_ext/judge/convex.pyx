@@ -394,7 +394,7 @@ cdef class NewtonStep:
 
     @property
     def size(self):
-        """Number of equations."""
+        """Return the number of equations."""
         return self.n_free + self.n_rows
 
     def count_entries(self):
