@@ -201,3 +201,6 @@ def test_score_page_has_the_numbers_of_the_table():
     assert f"**LavenderSim** in {passed['lavender']}:" in text
     errors = {(row.engine, row.scene): row.error for row in rows}
     assert f"at {errors['mujoco', 'stick']:.1f} m/s" in text
+    repeated = [row for row in read_records().values() if row.runs >= 3 and not row.note]
+    assert len(repeated) > 200 and all(row.spread == 0.0 for row in repeated)
+    assert "Repeated cells have equal errors" in text
