@@ -9,7 +9,6 @@ without arguments, a pendulum is compared with the same pendulum without its fri
 
 import sys
 
-import mujoco
 import numpy as np
 
 PENDULUM = """<mujoco><worldbody><body name="arm"><joint name="hinge" damping="0.5" {}/>
@@ -54,6 +53,8 @@ def compare(source, other):
 
 
 if __name__ == "__main__":
+    import mujoco
+
     if len(sys.argv) == 3:
         compare(*(mujoco.MjModel.from_xml_path(path) for path in sys.argv[1:]))
     else:

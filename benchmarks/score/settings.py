@@ -107,9 +107,9 @@ ENGINES: Mapping[str, Entry] = {
 #: Engines that were tried and are not in the table, with the reason.
 NOT_RUN: Mapping[str, str] = {
     "DART, PGS": "PgsBoxedLcpSolver has no constructor in Python",
-    "MuJoCo MJX, brax, newton": "they install (0.6 to 0.8 GB); on a CPU each scene compiles for 10 s to minutes",
-    "genesis-world": "no set of binary packages that installs together within four minutes",
-    "Exudyn": "no contact of boxes with friction between rigid bodies without a mesh",
-    "planck, oimo": "their npm packages do not install here",
+    "MuJoCo MJX, brax, newton": "not tried: no adapter yet, and they compile each scene on a CPU",
+    "genesis-world": "not tried: no set of binary packages was found within four minutes",
+    "Exudyn": "not tried: no adapter yet",
+    "planck, oimo": "npm found no package of the pinned version",
     "matter-js, p2-es, motrixsim": "installed; no adapter yet",
 }

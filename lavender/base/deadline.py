@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from threading import local
 from time import perf_counter
 
@@ -46,6 +46,8 @@ class _Forming(local):
 
 
 FORMING = _Forming()  # The deadline that forming A reads, of each thread.
+#: In place of `limit_forming` where a solve has no limit: it runs no code of this file.
+UNLIMITED: AbstractContextManager[None] = nullcontext()
 
 
 @contextmanager

@@ -340,8 +340,10 @@ class ScaledProgram(ConvexProgram):
     def select_rows(self, rows: IntArray, sign: float, dense: bool) -> Any:
         """Return sign J of these rows, dense or as `csc_matrix`."""
         if dense:
-            return make_dense(self.J, self.n, rows, sign)
-        return sp.csc_matrix(make_columns(self.J, self.n, rows, sign), (len(rows), self.n))
+            return make_dense(self.J, self.n, np.asarray(rows, np.int32), sign)
+        return sp.csc_matrix(
+            make_columns(self.J, self.n, np.asarray(rows, np.int32), sign), (len(rows), self.n)
+        )
 
     def get_hessian(self, dense: bool) -> Any:
         """Return a new dense P, or P as `csc_matrix` with sorted indices."""

@@ -228,7 +228,7 @@ class Generalized:
             velocity = row if self.order is None else int(self.order[row])
             raise InputError(
                 f"M is not positive definite: the pivot of {self.velocity_name(velocity)} is rounding of its diagonal "
-                f"entry, or below {MIN_MAGNITUDE:g}: give it a mass or inertia (MuJoCo: armature), or leave it out"
+                f"entry, or below {MIN_MAGNITUDE:g} (change the unit): give it a mass or inertia (MuJoCo: armature)"
             )
 
     def __setattr__(self, name: str, value: Any) -> None:

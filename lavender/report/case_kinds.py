@@ -167,7 +167,8 @@ class ProgramCase(ContactCase):
     def judge(self, solution: Solution) -> Row:
         """Return the error of the program; it is above rounding."""
         error = solution.program_error
-        assert error is not None
+        if error is None:  # from `solve`, which judges the program as a contact problem
+            error = self.judge_impulse(solution.impulse)
         return {"relative": error, "error_energy": math.nan, "velocity": math.nan, "roundoff_floor": 0.0}
 
     def judge_impulse(self, impulse: FloatArray) -> float:

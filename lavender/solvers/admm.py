@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.base.deadline import NEVER, Deadline, TooLate, limit_forming
+from lavender.base.deadline import NEVER, UNLIMITED, Deadline, TooLate, limit_forming
 from lavender.base.errors import BREAKDOWN, InputError
 from lavender.base.lazy_import import import_numerical_modules
 from lavender.base.lazy_import import sparse as sp
@@ -104,7 +104,7 @@ class AdmmState:
     def _begin_run(self) -> None:
         """Build the stopping test and the splitting."""
         problem = self.problem
-        with limit_forming(self.deadline if self.deadline.is_set else None):
+        with limit_forming(self.deadline) if self.deadline.is_set else UNLIMITED:
             self.data = problem.data
         self.watch = create_stopping_test(problem, problem.data, _ADMM_PATIENCE)
         self.splitting = admm.Splitting(self.data, self.memory, _START_RHO, self.relaxation)

@@ -42,7 +42,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray, check_choice
-from lavender.base.deadline import Deadline, TooLate, limit_forming
+from lavender.base.deadline import UNLIMITED, Deadline, TooLate, limit_forming
 from lavender.base.errors import CapabilityError, InputError
 from lavender.judge.residuals import (
     compute_stopping_residual,
@@ -323,7 +323,7 @@ class Newton(Solver):
         if claim.status not in (Status.STALLED, Status.NUMERICAL_ERROR, Status.DIVERGED) or remaining <= 0:
             return claim
         try:
-            with limit_forming(deadline):
+            with limit_forming(deadline) if deadline is not None and deadline.is_set else UNLIMITED:
                 continuation = self.prepare_continuation(state)
         except TooLate:
             return replace(claim, status=Status.TIME_LIMIT)

@@ -26,7 +26,7 @@ from lavender.base.arrays import (
     check_int,
     mark_read_only,
 )
-from lavender.base.deadline import NEVER, Deadline, TooLate, limit_forming, read_clock
+from lavender.base.deadline import NEVER, UNLIMITED, Deadline, TooLate, limit_forming, read_clock
 from lavender.base.errors import BREAKDOWN, CapabilityError, InputError, InUse, UnknownName, format_error
 from lavender.base.lazy_import import import_numerical_modules
 from lavender.judge.certificates import prove_infeasibility
@@ -350,7 +350,7 @@ class Prepared:
             setup = NotSetUp()
         else:
             try:
-                with limit_forming(deadline):
+                with limit_forming(deadline) if deadline is not None and deadline.is_set else UNLIMITED:
                     if isinstance(last, SetUp) and not (
                         is_other and not same_structure(self.problem, problem)
                     ):
