@@ -54,6 +54,13 @@ def test_audit_steps_counts_each_outcome_of_claims(tmp_path):
     assert (np.load(tmp_path / "records.npz")["converged"] == result.converged).all()
 
 
+@pytest.mark.parametrize(("bad_step", "is_exact"), [(None, True), (0, False), (1, False)])
+def test_solves_before_a_divergence_are_exact_only_if_every_one_is(bad_step, is_exact):
+    steps = [step_of([0.2 if k == bad_step else 0.0], [1]) for k in range(3)]
+    result = audit_steps(steps, threshold=1e3)  # a wrong step is close enough to the user, and not exact
+    assert result.has_exact_solves(Divergence(0, 2, "speed", False)) == is_exact
+
+
 def test_audit_steps_at_their_floor_are_below_every_limit():
     step = step_of([2.0**-52, 0.0], [1, 1])
     result = audit_steps([step], threshold=0.0, max_velocity_error=1e-17)
