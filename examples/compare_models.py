@@ -52,11 +52,17 @@ def compare(source, other):
     print(f"mass without bodies fixed to the world: {masses[0]:.3f} kg, converted {masses[1]:.3f} kg")
 
 
-if __name__ == "__main__":
+def main():
+    """Compare the models in two files, or two pendulums."""
     import mujoco
 
-    if len(sys.argv) == 3:
-        compare(*(mujoco.MjModel.from_xml_path(path) for path in sys.argv[1:]))
+    paths = sys.argv[1:]
+    if len(paths) == 2:
+        compare(*(mujoco.MjModel.from_xml_path(path) for path in paths))
     else:
         texts = PENDULUM.format('frictionloss="0.2" actuatorfrcrange="-30 30"'), PENDULUM.format("")
         compare(*(mujoco.MjModel.from_xml_string(text) for text in texts))
+
+
+if __name__ == "__main__":
+    main()
