@@ -3,6 +3,7 @@
 python docs/scorecard.py
 """
 
+import io
 import math
 import sys
 from pathlib import Path
@@ -11,6 +12,7 @@ import matplotlib as mpl
 import matplotlib.ticker
 import numpy as np
 from matplotlib.figure import Figure
+from PIL import Image
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "docs")]
@@ -22,11 +24,12 @@ from benchmarks.score.scenes import FRICTION, HEADINGS, RATES, SCENES, classify
 from benchmarks.score.settings import ENGINES
 from benchmarks.score.simulate import split_requirement
 
+N_COLORS = 64  # Number of colours of a picture.
 STATIC = ROOT / "docs" / "static" / "scorecard"
-COLORS = ("#1a9850", "#a6d96a", "#fdae61", "#d73027")  # good, fair, poor, wrong
+COLORS = ("#2166ac", "#92c5de", "#f4a582", "#b2182b")  # good, fair, poor, wrong
 NONE, FAILED = "#dddddd", "#9e9ac8"
 COLUMNS = {"default": 240, "accurate": 1000}  # level -> steps a second of the heat map
-mpl.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "lavender", "font.size": 9})
+mpl.rcParams.update({"font.size": 9})
 
 
 def markdown(head, lines):
@@ -225,9 +228,10 @@ def main():
         ("rates", draw_rates),
         ("costs", draw_costs),
     ):
-        form = "png" if name in ("heat", "costs") else "svg"
-        draw(rows).savefig(
-            STATIC / f"{name}.{form}", dpi=85, metadata={"Software" if form == "png" else "Date": None}
+        drawn = io.BytesIO()
+        draw(rows).savefig(drawn, dpi=85)
+        Image.open(drawn).convert("RGB").quantize(N_COLORS, dither=Image.Dither.NONE).save(
+            STATIC / f"{name}.png", optimize=True
         )
     tables = {
         "scenes": make_scene_table(),

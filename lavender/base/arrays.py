@@ -60,7 +60,9 @@ def to_numpy(name: str, value: Any) -> np.ndarray:
         try:
             return np.asarray(value)
         except (TypeError, ValueError) as error:
-            raise InputError(f"{name} is no array ({error}); an array of numbers is needed") from None
+            raise InputError(
+                f"{name} cannot be read as an array ({error}); an array of numbers is needed"
+            ) from None
     if getattr(value, "requires_grad", False):
         raise InputError(
             f"{name} requires a gradient, which would be lost: give {name}.detach(), or use lavender.torch to "
@@ -211,7 +213,9 @@ def get_shape(name: str, value: Any) -> tuple[int, ...]:
     try:
         return np.shape(value)
     except ValueError as error:
-        raise InputError(f"{name} is no array ({error}); an array of numbers is needed") from None
+        raise InputError(
+            f"{name} cannot be read as an array ({error}); an array of numbers is needed"
+        ) from None
 
 
 def resolve_index(i: Any, n: int, thing: str = "world") -> int | list[int]:

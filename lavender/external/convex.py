@@ -52,8 +52,8 @@ DEFINITE_SHIFTS = 1e-7, 1e-5
 MAX_CLAIM_ERROR = (
     1e-3  # [-] A claim "infeasible" with a larger error of its proof is followed by a second call.
 )
-# The matrix of a step of k equations is sparse with at most this multiple of k^3 entries. At k = 292 to 380, both kinds
-# of factor take the same time with 1.5 to 2.5 % of k^2 entries; with 86 %, a dense one takes a quarter.
+# The matrix of a step of k equations counts as sparse with at most this multiple of k^3 entries. At k = 292 to 380, the
+# sparse and the dense factorisation take the same time if 1.5 to 2.5 % of the k^2 entries are not zero.
 MAX_SPARSE_ENTRIES = 5e-5
 MAX_FIT_SIZE = 300  # Largest number of variables and of active rows for `fit_multipliers`.
 NEAR_SLACK = 1e-8  # [-] Rows with a smaller slack in scaled units may be active with a multiplier of 0.

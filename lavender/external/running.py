@@ -24,7 +24,7 @@ MIN_TOLERANCES = 1e-11, 1e-12  # Smallest tolerances of the two calls: rounding 
 # Gap of the second call: an interior-point method leaves an error of the square root of the gap on a row on which
 # multiplier and slack vanish together.
 SECOND_GAP = 1e-16
-# Iterations of an interior-point method in the first call, and in the second call above those of the first one.
+# Most iterations of an interior-point method in the first call, and by how many the second call may exceed the first.
 MAX_INTERIOR_ITERATIONS, MORE_INTERIOR_ITERATIONS = 100, 15
 OUT_OF_BUDGET = (Status.MAX_ITERATIONS, Status.TIME_LIMIT, Status.INTERRUPTED)
 # No second call follows, except after a claim of infeasibility that its multipliers contradict.

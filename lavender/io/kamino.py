@@ -133,7 +133,7 @@ def _check_configuration(engine: Any) -> None:
     if engine.problem_fd is None or (
         not config.sparse_jacobian and engine._jacobians.data.J_cts_data is None
     ):
-        raise InputError("this model has no joints, limits or contacts: there is no problem to convert")
+        raise InputError("this model has no joints, limits or contacts, so it has no constraint problem")
 
 
 class _Layout:

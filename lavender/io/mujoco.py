@@ -379,7 +379,9 @@ def _find_mass_pattern(model: Any) -> tuple[IntArray, IntArray]:
         or np.any(columns[indptr[1:] - 1] != np.arange(len(count)))
         or np.any((np.diff(columns) <= 0)[~np.isin(np.arange(1, len(columns)), indptr)])
     ):
-        raise InputError(f"M_rowadr, M_rownnz and M_colind are no lower triangle of M. {OTHER_MODEL_ADVICE}")
+        raise InputError(
+            f"M_rowadr, M_rownnz and M_colind do not describe the lower triangle of M. {OTHER_MODEL_ADVICE}"
+        )
     return mark_read_only(indptr), columns
 
 
@@ -454,7 +456,9 @@ def _get_velocity_before(step: Step) -> FloatArray | None:
     if v is None or not isinstance(v, int):
         return v
     if v == -1:
-        raise InputError(f"dof_bodyid and body_parentid are no tree of these bodies. {OTHER_MODEL_ADVICE}")
+        raise InputError(
+            f"dof_bodyid and body_parentid do not describe a tree of these bodies. {OTHER_MODEL_ADVICE}"
+        )
     raise CapabilityError(
         "the velocity before the step cannot be computed from cvel and cdof: joints of one body have "
         "dependent axes, or MjData was changed since its forward pass: run mj_forward"

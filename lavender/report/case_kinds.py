@@ -147,7 +147,7 @@ class ContactCase:
 
 
 class ProgramCase(ContactCase):
-    """A quadratic program (`Problem.from_qp`); its errors are those of `QPSolution`, without a unit."""
+    """A quadratic program (`Problem.from_qp`). `QPSolution` defines its errors, which have no unit."""
 
     call = "solve_qp"
     heads: Mapping[str, str] = {

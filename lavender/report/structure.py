@@ -159,7 +159,7 @@ def _build_block_graph(problem: Problem) -> Edges:
 
 
 def _has_redundant_rows(problem: Problem) -> bool:
-    """Whether there are fewer independent rows than rows, by the counts or by the singular values."""
+    """Whether some rows depend on others: by counts of rows and velocities, or by singular values."""
     if problem.rows is not None and problem.m > 6 * problem.rows.n_bodies:
         return True
     if problem.m > MAX_RANK_ROWS:

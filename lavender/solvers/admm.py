@@ -121,7 +121,8 @@ class AdmmState:
             self.is_over_bodies, self.theta, self.jacobian = True, form.theta, form.jacobian
             rows = problem.rows
             assert rows is not None
-            self.body_work = float(Layout(rows.moving_block_bodies, rows.n_bodies, 6).work)  # of one factor
+            # Work of one factorisation.
+            self.body_work = float(Layout(rows.moving_block_bodies, rows.n_bodies, 6).work)
             self.body_solve = None
             self.has_factor = self.body_work <= MAX_FACTOR_WORK_PER_ENTRY * form.jacobian.nnz
             return

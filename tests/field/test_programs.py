@@ -9,20 +9,10 @@ import scipy.sparse as sp
 from calls import installed
 
 import lavender as lv
+from benchmarks.corpus import read_program
 
 FOLDER = Path(__file__).with_name("programs")
 OBJECTIVES = json.loads((FOLDER / "objectives.json").read_text())
-
-
-def read_program(name):
-    """Return the arrays of a program by name."""
-    with np.load(FOLDER / f"{name}.npz") as data:
-        arrays = {key: data[key] for key in ("q", "b", "h", "lb", "ub", "P", "A", "G") if key in data}
-        for key in "PAG":
-            if f"{key}_data" in data:
-                parts = (data[f"{key}_{part}"] for part in ("data", "indices", "indptr"))
-                arrays[key] = sp.csc_array(tuple(parts), tuple(data[f"{key}_shape"]))
-    return arrays
 
 
 def mix_units(arrays, seed):
@@ -51,7 +41,7 @@ def test_solver_finds_every_program(solver, is_mixed):
     for k, (name, objective) in enumerate(OBJECTIVES.items()):
         if is_mixed and (solver, name) == ("daqp", "QBEACONF"):
             continue  # daqp returns nothing in these units, with and without the package's scaling.
-        arrays = read_program(name)
+        arrays = read_program(FOLDER / f"{name}.npz")
         given, cost = mix_units(arrays, k) if is_mixed else (arrays, 1.0)
         answer = lv.solve_qp(**given, solver=solver, tol=1e-6)
         terms = max(abs(objective), 1e-3 * np.abs(given["q"]) @ np.abs(answer.x) / cost)

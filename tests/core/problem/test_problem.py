@@ -81,7 +81,7 @@ def test_problem_rows_have_names():
         random_lcp(1).row_name(99)
     with pytest.raises(lv.InputError, match="row is -1"):
         random_lcp(1).block_of(-1)
-    with pytest.raises(lv.InputError, match="key is no array"):
+    with pytest.raises(lv.InputError, match="key cannot be read as an array"):
         replace(random_lcp(1), key=[[1, 2], [3]])
 
 
