@@ -49,9 +49,8 @@ MAX_SINGULAR_PIVOT = 1e-13
 # [-] Multiples of the largest diagonal entry that are added to a singular P for backends that need a definite one, in
 # the first and in the second call. The Newton step removes their effect.
 DEFINITE_SHIFTS = 1e-7, 1e-5
-MAX_CLAIM_ERROR = (
-    1e-3  # [-] A claim "infeasible" with a larger error of its proof is followed by a second call.
-)
+# [-] A claim "infeasible" with a larger error of its proof is followed by a second call.
+MAX_CLAIM_ERROR = 1e-3
 # The matrix of a step of k equations counts as sparse with at most this multiple of k^3 entries. At k = 292 to 380, the
 # sparse and the dense factorisation take the same time if 1.5 to 2.5 % of the k^2 entries are not zero.
 MAX_SPARSE_ENTRIES = 5e-5

@@ -43,9 +43,8 @@ MIN_TIME_LIMIT = 1e-6  # Smallest time limit [s] that is passed to a solver.
 # Largest number of iterations of the first chunk: at 40 us per iteration, as of solvers in Python, it takes 10 ms.
 FIRST_CHUNK_ITERATIONS = 256
 FIRST_LIMITED_ITERATIONS = 16  # The same under a time limit.
-LIMITED_CHUNK_MARGIN = (
-    4  # The first chunk is shorter by this factor then: a sweep may take 4 ns per unit of work.
-)
+# Under a time limit the first chunk is shorter by this factor, because a sweep may take 4 ns per unit of work.
+LIMITED_CHUNK_MARGIN = 4
 Callback = Callable[[int, FloatArray, Residual], Any]
 # The fields are iterations, time [s], relative residual, energy error and velocity error.
 Record = tuple[int, float, float, float, float]
