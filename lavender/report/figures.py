@@ -58,7 +58,7 @@ def draw_time_to_accuracy(report: Contents, names: Sequence[str], folder: Figure
             weight = "normal" if i else "bold"
             labels.append(Label(own[-1], f"{name} {format_time(own[-1])}", style["color"], weight))
         axes.set_xticks(range(len(tolerances)), list(map(format_power, tolerances)))
-        axes.set_xlabel("residual to reach (1: do nothing)")
+        axes.set_xlabel("residual to reach (1: no impulse)")
         axes.yaxis.set_major_formatter(lambda t, _: format_time(t))
         axes.yaxis.set_minor_formatter(lambda t, _: format_time(t) if f"{t:e}"[0] in "25" else "")
         axes.grid(True, axis="y")

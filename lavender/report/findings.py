@@ -118,8 +118,8 @@ class Report(Contents):
         time = format_time(row["mean"])
         if n == 1:
             return f"{text} {target} in {time}."
-        unsolved = "" if row["solved"] == n else f", unsolved ones at {format_time(self.time_limit)}"
-        return f"{text}, in {time} on average ({format_time(row['worst'])} at worst{unsolved})."
+        unsolved = "" if row["solved"] == n else f"; unsolved ones at {format_time(self.time_limit)}"
+        return f"{text}, in {time} on average ({format_time(row['worst'])} at worst, on {row['hardest']}{unsolved})."
 
     @cached_property
     def sentences(self) -> list[str]:
@@ -454,8 +454,8 @@ class Report(Contents):
         note = ""
         if n > 1 and not self.is_campaign:
             note = (
-                f"Shifted geometric mean (10 µs), on a logarithmic scale; a problem not solved or not accepted counts "
-                f"as {format_time(self.time_limit)}."
+                f"Shifted geometric mean (10 µs), on a logarithmic scale; a problem not solved or not accepted "
+                f"(its law, form or size) counts as {format_time(self.time_limit)}."
             )
             note += f" The table below has all {len(ranking)} solvers." if len(ranking) > len(shown) else ""
         named = f"all {n} problems" if n > 1 else "one problem"
