@@ -84,16 +84,6 @@ def start_scene(
         World i starts from state i modulo their number.
     spread : float, default 0 m/s, rad/s
     seed : int, default 0
-
-    Raises
-    ------
-    InputError
-        The engine is not installed, the file has no function `build`, `build` returns another object, or states do not
-        fit the scene.
-    UnknownName
-        The engine or the builder is unknown.
-    CapabilityError
-        The importer of the engine does not support the scene.
     """
     check_name("engine", engine, CLAIM_ENGINES)
     worlds, dt = check_int("worlds", worlds, 1), check_float("dt", dt, above=0.0)
@@ -112,13 +102,7 @@ def start_scene(
 
 
 def read_engine_states(source: Any, names: tuple[str, ...]) -> EngineState:
-    """Read states of an engine from an .npz or a dict of arrays; each array has one entry for each state.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, has arrays with other names or different numbers of entries, or a number is not finite.
-    """
+    """Read states of an engine from an .npz or a dict of arrays; each array has one entry for each state."""
     label = "states"
     if isinstance(source, (str, os.PathLike)):
         label = f"states {os.fspath(source)}"

@@ -27,13 +27,7 @@ def is_environment(source: Any) -> bool:
 
 
 def get_environment_data(env: Any) -> tuple[Any, Any]:
-    """Return the model and the data of MuJoCo of an environment.
-
-    Raises
-    ------
-    InputError
-        The environment has none.
-    """
+    """Return the model and the data of MuJoCo of an environment."""
     model, data = (getattr(env.unwrapped, name, None) for name in ("model", "data"))
     if type(model).__name__ != "MjModel" or type(data).__name__ != "MjData":
         raise InputError(

@@ -117,11 +117,6 @@ class Runs:
         source : path of a model (MJCF, .mjb) or mujoco.MjModel
         worlds, steps, more
             See `Runs`.
-
-        Raises
-        ------
-        InputError
-            The model cannot be read, or the controls do not fit it.
         """
         mj, model = load_model(source)
         notes = (SLEEP_NOTE,) if can_sleep(mj, model) else ()
@@ -161,13 +156,7 @@ class Runs:
         return replace(self, starts=starts.select_evenly(self.worlds), notes=(*self.notes, *starts.notes))
 
     def with_other_model(self, source: Any) -> Runs:
-        """Return these runs with another model that solves the same steps; None for none.
-
-        Raises
-        ------
-        InputError
-            The model cannot be read, or its states have another size.
-        """
+        """Return these runs with another model that solves the same steps; None for none."""
         if source is None:
             return self
         mj, model = load_model(source)
@@ -387,13 +376,7 @@ def split_state_vector(model: Any, state: FloatArray) -> dict[str, FloatArray]:
 
 
 def iterate_frames(engine: str, runs: Runs, njmax: int | None = None) -> Iterator[Frame]:
-    """Step all worlds by MJX or MuJoCo Warp and yield the frame of each step.
-
-    Raises
-    ------
-    InputError
-        The package is not installed, or does not accept the model.
-    """
+    """Step all worlds by MJX or MuJoCo Warp and yield the frame of each step."""
     mj, model = runs.mj, copy.copy(runs.model)
     model.opt.jacobian = mj.mjtJacobian.mjJAC_DENSE
     starts = [runs.create_start_data(world) for world in range(runs.worlds)]

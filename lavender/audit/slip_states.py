@@ -175,11 +175,6 @@ def explain_slip_of_states(
     Returns
     -------
     SlipOfStates
-
-    Raises
-    ------
-    InputError
-        No geom has one of the names.
     """
     mj = import_mujoco()
     model = without_sleep(mj, model)

@@ -28,11 +28,6 @@ def find_converter(like: Any) -> Callable[[np.ndarray], Any] | None:
     callable or None
         Function that copies a NumPy array to the library of `like`. None if `like` is None or a NumPy array, because
         results are then returned as NumPy arrays.
-
-    Raises
-    ------
-    InputError
-        `like` is not an array of a library with DLPack.
     """
     if like is None or isinstance(like, np.ndarray):
         return None

@@ -50,11 +50,6 @@ def to_numpy(name: str, value: Any) -> np.ndarray:
 
     Arrays with `__dlpack__` (PyTorch, JAX, CuPy) or `__array__` (Warp) are views if they are in the memory of the
     processor, and are copied once if they are on another device.
-
-    Raises
-    ------
-    InputError
-        The value is not an array of numbers, requires a gradient, or is on a device that cannot be read.
     """
     if not hasattr(value, "__dlpack__") or isinstance(value, np.ndarray):
         try:
@@ -125,12 +120,6 @@ def as_array(
     Returns
     -------
     numpy.ndarray
-
-    Raises
-    ------
-    InputError
-        The value is not numeric, is complex, has another shape or masked entries, or has a number that `finite` or
-        `dtype` excludes.
     """
     # Fast path for values that need no conversion and no message.
     if dtype is np.float64:
@@ -178,11 +167,6 @@ def as_float_array(name: str, value: Any) -> np.ndarray:
     """Convert `value` to an array of float32 or float64 of any shape; such an array is returned without a copy.
 
     The numbers are not checked.
-
-    Raises
-    ------
-    InputError
-        The value is not numeric, is complex, has masked entries, or has nested sequences of different lengths.
     """
     get_shape(name, value)
     check_unmasked(name, value)
@@ -313,11 +297,6 @@ def as_csr(name: str, value: Any, *, copy: bool = True, unit: str = "", too_many
         Unit of the entries, for messages.
     too_many : str, optional
         Advice at the end of the message about more than 2^31 - 1 nonzeros.
-
-    Raises
-    ------
-    InputError
-        The matrix has too many nonzeros, invalid indices or pointers, or entries that are not finite real numbers.
     """
     if value.nnz >= 2**31:
         raise InputError(f"{name} has {value.nnz} nonzeros; at most 2^31 - 1 can be indexed{too_many}")

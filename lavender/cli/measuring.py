@@ -52,11 +52,6 @@ def measure_files(
     """Measure solvers on files, and call `show_event` with the progress.
 
     With workers nothing is timed. `path` is the records file.
-
-    Raises
-    ------
-    InputError
-        The folder cannot be written or is in use by another process.
     """
     from lavender import report
     from lavender.report.store import get_key, make_lines, select_machines

@@ -175,13 +175,7 @@ def reject_options_without_effect(context: click.Context, **conditions: Any) -> 
 
 
 def describe_solvers(solvers: Sequence[str] | None) -> dict[str, bool]:
-    """Return the conditions of `OPTIONS_WITHOUT_EFFECT` that depend on the named solvers.
-
-    Raises
-    ------
-    UnknownName
-        A solver does not exist.
-    """
+    """Return the conditions of `OPTIONS_WITHOUT_EFFECT` that depend on the named solvers."""
     from lavender.solvers import registry
 
     specs = [registry.get(name) for name in solvers or ()]

@@ -111,13 +111,7 @@ def check_state_arguments(
 
 
 def embed_planar_velocities(rows: Rows, velocity: Any) -> FloatArray:
-    """Return the velocities (n, 6) of a problem in the xy plane, given as (v_x, v_y, omega) of each body (n, 3).
-
-    Raises
-    ------
-    InputError
-        A body, joint or contact leaves the plane, so that three numbers may be linear velocities in space.
-    """
+    """Return the velocities (n, 6) of a problem in the xy plane, given as (v_x, v_y, omega) of each body (n, 3)."""
     out_of_plane = [2, 3, 4]
     jac = np.reshape(rows.jac, (-1, 6))
     inertia = np.array(rows.inv_inertia)

@@ -82,13 +82,7 @@ def write(out: Path, *, replace: bool = False) -> list[Path]:
 
 
 def _write_files(out: Path, contents: Mapping[str, str], replace: bool) -> list[Path]:
-    """Write files by their names below a folder.
-
-    Raises
-    ------
-    InputError
-        A file exists with other contents, and `replace` is false. No file is written.
-    """
+    """Write files by their names below a folder; none if one exists with other contents and `replace` is false."""
     files = {out / name: text.encode() for name, text in contents.items()}
     for path, data in files.items():
         if path.exists() and not replace and path.read_bytes() != data:

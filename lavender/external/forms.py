@@ -161,13 +161,6 @@ def choose_program_form(problem: Problem, form: str, definite: bool = False) -> 
         - for J and M if A is singular.
     definite : bool
         Whether the backend needs a positive definite P.
-
-    Raises
-    ------
-    InputError
-        The form is unknown.
-    CapabilityError
-        The problem does not have this form.
     """
     form, rows = check_choice("form", form, PROGRAM_FORMS), problem.rows
     if form == "program" and problem.qp is None:

@@ -211,13 +211,7 @@ class _Limit:
 
 
 def compute_free_motion(plant: Any, context: Any, dt: float) -> tuple[FloatArray, FloatArray]:
-    """Return A (nv, nv) and v* (nv,) of SAP's discretisation (see the module).
-
-    Raises
-    ------
-    CapabilityError
-        An actuator has a PD controller.
-    """
+    """Return A (nv, nv) and v* (nv,) of SAP's discretisation (see the module)."""
     from pydrake.multibody.tree import JacobianWrtVariable, JointActuatorIndex, JointIndex, MultibodyForces_
 
     nv = int(plant.num_velocities())
@@ -351,11 +345,6 @@ def _complete_impulses(
 
     Drake does not publish the impulses of joint limits. They are set in `impulses` to the momentum that the contacts
     do not explain, if the limit is close enough to act and the sign fits.
-
-    Raises
-    ------
-    CapabilityError
-        The remaining error exceeds `MOMENTUM_TOLERANCE`.
     """
     nv = len(v_free)
     state = np.array(plant.EvalUniquePeriodicDiscreteUpdate(context).value())

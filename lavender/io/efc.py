@@ -566,13 +566,7 @@ def _check_mass(mass: Any, smooth: FloatArray, force: FloatArray, precision: str
 
 
 def _find_elliptic_contacts(contacts: Any, elliptic: Any) -> tuple[Any, ...]:
-    """Return world, first row, rows and coefficients of each contact that begins at a row of `elliptic` (n, m).
-
-    Raises
-    ------
-    InputError
-        Not four arrays of one length; a contact without friction coefficients; rows that no contact or several name.
-    """
+    """Return world, first row, rows and coefficients of each contact that begins at a row of `elliptic` (n, m)."""
     if not isinstance(contacts, (tuple, list)) or len(contacts) != 4:
         raise InputError(f"contacts is {contacts!r:.60}; (world, efc_address, dim, friction) is needed")
     names = [f"{name} of contacts" for name in ("world", "efc_address", "dim")]

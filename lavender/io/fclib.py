@@ -73,11 +73,6 @@ class Contents(NamedTuple):
         """Return the problem.
 
         A global problem is returned in generalised coordinates (J = H^T), or as A and b if M is not a mass matrix.
-
-        Raises
-        ------
-        InputError
-            M is singular, array sizes do not agree, or the factors of M would be too large.
         """
         x, a, general = self.parts, None, None
         if self.group.startswith(LOCAL):
@@ -132,13 +127,7 @@ def _bound_factor_entries(mass: sp.csr_array) -> float:
 
 
 def form_dense_a(mass: sp.csr_array, jt: sp.csr_array, f: FloatArray) -> tuple[sp.csr_array, FloatArray]:
-    """Return A = J M^-1 J^T (m, m) and J M^-1 f (m,) for M (n, n), J^T (n, m) and f (n,).
-
-    Raises
-    ------
-    InputError
-        M is singular, or its factors would be too large.
-    """
+    """Return A = J M^-1 J^T (m, m) and J M^-1 f (m,) for M (n, n), J^T (n, m) and f (n,)."""
     entries = _bound_factor_entries(mass)
     if entries > MAX_MASS_FACTOR_ENTRIES:
         raise InputError(f"the factors of M may have {entries:.3g} entries, above {MAX_MASS_FACTOR_ENTRIES}")
@@ -165,12 +154,6 @@ def read(path: str | os.PathLike[str]) -> Stored:
     """Read the problem, the solution and the guesses of an FCLIB file.
 
     A file with both forms is read in its local form. The first guess becomes `problem.guess`.
-
-    Raises
-    ------
-    InputError
-        The file is not an FCLIB file, is truncated or inconsistent, or holds a problem with and one without rolling
-        friction; or h5py is not installed.
     """
     h5py = import_h5py()
     try:
@@ -284,13 +267,7 @@ def _list_guess_groups(r: HDF5Reader) -> list[str]:
 def write(
     problem: Problem, path: str | os.PathLike[str], *, impulse: Any = None, drop: Collection[str] = ()
 ) -> None:
-    """Save a friction contact problem in the local form, W = A and q = -b; see `lavender.io.save`.
-
-    Raises
-    ------
-    CapabilityError
-        FCLIB cannot hold something of this problem; every such thing is named.
-    """
+    """Save a friction contact problem in the local form, W = A and q = -b; see `lavender.io.save`."""
     if not isinstance(problem, Problem):
         raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
     unknown = sorted(set(drop) - {"names", "key", "precision"})

@@ -448,11 +448,6 @@ def _verify_delassus_matrix(solver: Any, engine: Any, worlds: _Worlds, complete:
     """Compare the engine's matrix D with J M^-1 J^T + diag(compliance), unless it was compared in an earlier step.
 
     `complete` compares the matrices of all worlds in any case.
-
-    Raises
-    ------
-    CapabilityError
-        The matrices differ in a world with finite numbers.
     """
     soft = np.bincount(worlds.world, worlds.compliance != 0.0, minlength=worlds.n)
     kinds = {"joint": worlds.joints, "bounded": worlds.bounded, "limit": worlds.limits}

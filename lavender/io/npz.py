@@ -69,13 +69,7 @@ class Stored:
 
 
 def read_npz(path: str | os.PathLike[str]) -> Stored:
-    """Read a problem from an .npz archive of any layout that `docs/formats.md` lists.
-
-    Raises
-    ------
-    InputError
-        The archive is damaged or of another layout.
-    """
+    """Read a problem from an .npz archive of any layout that `docs/formats.md` lists."""
     archive = read_arrays(path)
     try:
         if "lavender_format" in archive:
@@ -352,13 +346,7 @@ def _read_matrix(archive: Arrays) -> Any:
 def build_checked_csr(
     indptr: np.ndarray, indices: np.ndarray, data: np.ndarray, m: int, n: int
 ) -> sp.csr_array:
-    """Build a CSR matrix (m, n) from arrays of a file, with checked indices; `data` may be longer than needed.
-
-    Raises
-    ------
-    InputError
-        An array has the wrong type or length, or an index is out of range.
-    """
+    """Build a CSR matrix (m, n) from arrays of a file, with checked indices; `data` may be longer than needed."""
     for name, x, kinds in (("pointers", indptr, "iu"), ("indices", indices, "iu"), ("values", data, "buif")):
         if x.ndim != 1 or x.dtype.kind not in kinds:
             raise InputError(

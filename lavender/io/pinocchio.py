@@ -245,15 +245,7 @@ def wrap_engine_errors(engine: str, advice: str) -> Iterator[None]:
 
 
 def _check_model(pin: Any, model: Any, data: Any) -> None:
-    """Check a model, its data and the indices of every joint, because Pinocchio does not check them.
-
-    Raises
-    ------
-    InputError
-        Types, sizes or indices do not agree, or a placement is not a rotation.
-    CapabilityError
-        The model has mimicking joints.
-    """
+    """Check a model, its data and the indices of every joint, because Pinocchio does not check them."""
     if not isinstance(model, pin.Model) or not isinstance(data, pin.Data):
         raise InputError(
             f"got a {type(model).__name__} and a {type(data).__name__}; a pinocchio.Model and its Data are needed"
@@ -304,15 +296,7 @@ def _check_model(pin: Any, model: Any, data: Any) -> None:
 
 
 def _check_constraint(i: int, model: Any, constraint: Any, data: Any) -> None:
-    """Check that the joints of constraint i belong to this model and its data to its kind.
-
-    Raises
-    ------
-    InputError
-        A joint belongs to another model, the data belong to another kind, or a placement is not a rotation.
-    CapabilityError
-        A frame anchor has a desired offset.
-    """
+    """Check that the joints of constraint i belong to this model and its data to its kind."""
     kind = type(constraint).__name__
     if not hasattr(constraint, "createData") or not hasattr(constraint, "calc"):
         raise InputError(f"constraint model {i} is a {kind}; a constraint model of Pinocchio is needed")
@@ -359,13 +343,7 @@ def _unwrap_constraint(constraint: Any) -> Any:
 def _convert_constraint(
     model: Any, data: Any, n: int, dt: float, correction: float
 ) -> tuple[Cones, Any, list[int]]:
-    """Return the cones, the target (n,) [m/s, rad/s] and the order of the rows of one constraint.
-
-    Raises
-    ------
-    CapabilityError
-        The kind of constraint is not supported.
-    """
+    """Return the cones, the target (n,) [m/s, rad/s] and the order of the rows of one constraint."""
     kind = type(model).__name__
     order = list(range(n))
     if kind in ANCHORS:

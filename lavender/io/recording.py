@@ -251,13 +251,7 @@ def record_file(
     control: Control = "random",
     **options: Any,
 ) -> Recording:
-    """Call `record` for a model file (MJCF); an array of controls may also be given as a file (.npy).
-
-    Raises
-    ------
-    InputError
-        `record` raises it, or no step had a constraint that could be exported.
-    """
+    """Call `record` for a model file (MJCF); an array of controls may also be given as a file (.npy)."""
     mj, model = load_model(path)
     result = record(model, mj.MjData(model), folder, steps, control=load_controls(control), **options)
     if not result.files:

@@ -48,13 +48,7 @@ MAX_CHECKED_STATES = 32  # Equality constraints are checked in up to this many s
 
 
 def load_model(source: Any) -> tuple[Any, Any]:
-    """Return the module mujoco and a model: of a file (MJCF, .mjb), or a mujoco.MjModel as it is.
-
-    Raises
-    ------
-    InputError
-        MuJoCo is not installed, or cannot read the file, or the file is a problem, or `source` is another object.
-    """
+    """Return the module mujoco and a model: of a file (MJCF, .mjb), or a mujoco.MjModel as it is."""
     mj = import_mujoco()
     if isinstance(source, mj.MjModel):
         return mj, source
@@ -98,13 +92,7 @@ def hash_model(model: Any, options: bool = False) -> str:
 
 
 def load_controls(control: Control) -> Control:
-    """Return controls for `record`: the array of a file (.npy), or `control` unchanged.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read or holds several arrays.
-    """
+    """Return controls for `record`: the array of a file (.npy), or `control` unchanged."""
     if not isinstance(control, str) or control in CONTROLS:
         return control
     needed = f"one of {', '.join(CONTROLS)}, or a .npy file of one array, is needed"
@@ -230,11 +218,6 @@ def read_states(mj: Any, model: Any, source: Any) -> StartStates:
     Returns
     -------
     StartStates
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, or its arrays do not fit the model; a number is not finite; the model has no keyframes.
     """
     if isinstance(source, StartStates):
         return source

@@ -42,11 +42,6 @@ def prepare_step_folder(path: str | os.PathLike[str], replace: bool = False, con
     The folder must not hold problem files, because the steps of two recordings are not one sequence. `replace` removes
     the problem files and the engine's results. With `continued`, the files belong to the present recording and are
     kept.
-
-    Raises
-    ------
-    InputError
-        The folder holds problem files, or cannot be cleared or written.
     """
     replace = check_bool("replace", replace)
     folder = make_folder(check_writable(path, folder=True))
@@ -65,13 +60,7 @@ def prepare_step_folder(path: str | os.PathLike[str], replace: bool = False, con
 
 
 def resolve_destination(path: str | os.PathLike[str]) -> Path:
-    """Return the path at which a file is written: the target of symbolic links, a regular file or a new one.
-
-    Raises
-    ------
-    InputError
-        The path is a folder, a pipe or a device, in the place of which `os.replace` would put a file.
-    """
+    """Return the path at which a file is written: the target of symbolic links, a regular file or a new one."""
     path = as_path(path)
     try:
         target = Path(os.path.realpath(path))
@@ -85,13 +74,7 @@ def resolve_destination(path: str | os.PathLike[str]) -> Path:
 
 
 def check_writable(path: str | os.PathLike[str], folder: bool = False) -> Path:
-    """Return `path` if its file (or `folder`, with its parents) can be written later; nothing is opened or created.
-
-    Raises
-    ------
-    InputError
-        The file or folder cannot be written.
-    """
+    """Return `path` if its file (or `folder`, with its parents) can be written later; nothing is opened or created."""
     path = as_path(path)
     parent = Path(os.path.realpath(path)) if folder else resolve_destination(path).parent
     while folder and parent != parent.parent and not parent.exists():
@@ -119,11 +102,6 @@ def write_atomically(path: str | os.PathLike[str], write: Callable[[Path], Any])
 
     `write` is called with a temporary path in the folder of the file, which is then renamed. If `path` is a symbolic
     link, the target of the link is replaced. The permissions of an existing file are kept.
-
-    Raises
-    ------
-    InputError
-        The file cannot be written.
     """
     target = resolve_destination(path)
     short = target.name[:TEMPORARY_NAME_CHARACTERS]
@@ -207,13 +185,7 @@ class Arrays(dict[str, np.ndarray]):
 
 
 def read_arrays(path: str | os.PathLike[str]) -> Arrays:
-    """Read all arrays of an archive (.npz); nothing is unpickled.
-
-    Raises
-    ------
-    InputError
-        The file is not a complete archive of arrays of numbers or texts.
-    """
+    """Read all arrays of an archive (.npz); nothing is unpickled."""
     name, arrays = "", Arrays()
     try:
         with as_path(path).open("rb") as stream:  # NumPy leaves a damaged file open.
@@ -244,13 +216,7 @@ def check_figure_path(path: str | os.PathLike[str]) -> Path:
 
 
 def write_figure(canvas: Any, path: str | os.PathLike[str], **options: Any) -> None:
-    """Write a figure of matplotlib with `write_atomically`; the suffix selects the format (default: png).
-
-    Raises
-    ------
-    InputError
-        matplotlib cannot write the format, or the file cannot be written.
-    """
+    """Write a figure of matplotlib with `write_atomically`; the suffix selects the format (default: png)."""
     path = check_figure_path(path)
     from matplotlib import rc_context
 
@@ -283,11 +249,6 @@ def read_first_bytes(path: str | os.PathLike[str], count: int = 8, role: str = "
     count : int
     role : str
         Name of the file's role for error messages.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read.
     """
     path = as_path(path)
     try:

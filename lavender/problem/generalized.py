@@ -414,13 +414,7 @@ def extract_lower_triangle(
     max_asymmetry: float = MAX_ASYMMETRY,
     names: Sequence[str] | None = None,
 ) -> Compressed:
-    """Return the lower triangle of a dense or sparse symmetric matrix, with all diagonal entries, also zeros.
-
-    Raises
-    ------
-    InputError
-        The matrix is not square, or not symmetric to `max_asymmetry`; the message then ends with `hint`.
-    """
+    """Return the lower triangle of a dense or sparse symmetric matrix, with all diagonal entries, also zeros."""
     found = kernels.lower_triangle_of_dense(matrix, max_asymmetry)
     array = matrix
     if found is None:

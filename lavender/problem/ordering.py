@@ -84,15 +84,6 @@ def compute_block_order(
     Returns
     -------
     Order
-
-    Raises
-    ------
-    UnknownName
-        The order is unknown.
-    InputError
-        The array is not a permutation; `ground` is out of range, or given with an order that does not use it.
-    CapabilityError
-        The order "bottom_up" or "top_down" was requested for a matrix without `ground`.
     """
     k = problem.n_blocks
     split = 0 if problem.rows is None else problem.rows.n_joints

@@ -320,13 +320,7 @@ def _check_joint_counts(ptr: IntArray, jac: Any, joint_body: Any) -> None:
 
 
 def check_and_symmetrise_inertia(name: str, tensors: FloatArray) -> FloatArray:
-    """Return inverse inertias (n, 3, 3), made symmetric positive semidefinite if they are not by rounding to float32.
-
-    Raises
-    ------
-    InputError
-        A tensor differs by more than `MAX_CORRECTED_ERROR` of its largest entry.
-    """
+    """Return inverse inertias (n, 3, 3), made symmetric positive semidefinite after rounding to float32."""
     size = np.abs(tensors).max(axis=(1, 2))
     skew = np.abs(tensors - tensors.transpose(0, 2, 1)).max(axis=(1, 2))
     with np.errstate(divide="ignore", invalid="ignore"):

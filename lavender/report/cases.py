@@ -171,12 +171,6 @@ def list_steps_in_folder(folder: str | Path) -> list[Item]:
 
     Steps that were recorded from different start states or in different worlds are different sequences; a single step
     of a state is a case.
-
-    Raises
-    ------
-    InputError
-        `folder` is not a folder, it holds fewer than two problem files, or steps of several recordings: two files have
-        the same number, names have different prefixes, or the engine's list of steps does not contain a file.
     """
     folder = Path(folder)
     if not folder.is_dir():

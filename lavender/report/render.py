@@ -139,11 +139,6 @@ def write_files(
     -------
     Path
         The folder.
-
-    Raises
-    ------
-    InputError
-        The folder cannot be written.
     """
     from lavender.io.stored import make_folder, write_text
 

@@ -238,13 +238,7 @@ class Runner:
         self.report_progress("", "")
 
     def distribute_pairs(self, items: list[Item], workers: int, backend: str) -> None:
-        """Measure the pairs of a campaign with workers, and store the rows of each pair when a worker returns them.
-
-        Raises
-        ------
-        InputError
-            A worker was lost.
-        """
+        """Measure the pairs of a campaign with workers, and store the rows of each pair when a worker returns them."""
         local = tuple(spec for n in self.names if not ((spec := self.specs[n]).builtin or spec.distribution))
         known: dict[tuple[str, str], list[Row]] = {}
         for row in self.known.values():

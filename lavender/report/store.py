@@ -266,11 +266,6 @@ def convert_columns(lines: DataFrame, kind: str, columns: Row) -> DataFrame:
     """Return the lines of one kind with these columns, in the types of the defaults, which replace missing values.
 
     Texts are made printable; only messages may have several lines.
-
-    Raises
-    ------
-    InputError
-        A column has a value of another type.
     """
     import pandas as pd
 
@@ -367,13 +362,7 @@ def select_skips(lines: DataFrame) -> DataFrame:
 
 
 def select_machines(lines: DataFrame) -> dict[str, Row]:
-    """Return the last description of each machine with its versions and plan, by the name of its run; the newest last.
-
-    Raises
-    ------
-    InputError
-        A description has values of another type.
-    """
+    """Return the last description of each machine with its versions and plan, by the name of its run, in order of time."""
     machines: dict[str, Row] = {}
     defaults = {"run": "", "started": "", "lavender": "", "python": "", "platform": "", "cpu": "", "cores": 1,
                 "threads": 1, "load": math.nan, "whole": True}  # fmt: skip
@@ -405,13 +394,7 @@ def _escape_texts(value: Any) -> Any:
 
 
 def select_solvers(lines: DataFrame, names: Iterable[str]) -> DataFrame:
-    """Return the lines about some solvers, and the lines about machines and cases.
-
-    Raises
-    ------
-    InputError
-        There are no runs of a solver.
-    """
+    """Return the lines about some solvers, and the lines about machines and cases."""
     own = lines["solver"] if "solver" in lines else lines["kind"].map({})
     known = sorted({str(name) for name in own.dropna()} - {""})
     names = list(names)

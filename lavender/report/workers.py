@@ -103,13 +103,7 @@ def _ignore_sigint() -> Iterator[None]:
 
 
 def connect_backend(spec: str) -> tuple[str, contextlib.AbstractContextManager[Any]]:
-    """Return joblib's name of a backend, and a context manager that holds the connection to its cluster.
-
-    Raises
-    ------
-    InputError
-        A package is missing, no scheduler answers, or joblib does not have the backend.
-    """
+    """Return joblib's name of a backend, and a context manager that holds the connection to its cluster."""
     from joblib.parallel import BACKENDS
 
     name, _, address = spec.partition("=")

@@ -60,13 +60,7 @@ class Accelerated(Sweeping):
         raise NotImplementedError
 
     def prepare(self, problem: Problem) -> AcceleratedState:
-        """Build the state: sweep order, memory, and the diagonal blocks of A if blocks are solved exactly.
-
-        Raises
-        ------
-        InputError
-            The options `sweep` and `convex` are not valid for the problem.
-        """
+        """Build the state: sweep order, memory, and the diagonal blocks of A if blocks are solved exactly."""
         if self.sweep is not None:
             check_name("sweep", self.sweep, SWEEP_NAMES)
         if self.sweep == "pgs" and problem.law == "cone":

@@ -179,15 +179,7 @@ class Newton(Solver):
         return self._choose_form_and_build_state(problem, None)
 
     def _choose_form_and_build_state(self, problem: Problem, like: System | None) -> NewtonState:
-        """Choose the form and build the state; the layout of the system `like` may be reused.
-
-        Raises
-        ------
-        InputError
-            `form` is "velocity", and the problem is a matrix.
-        CapabilityError
-            The matrix over the velocities is too large for form="velocity" or for round cones.
-        """
+        """Choose the form and build the state; the layout of the system `like` may be reused."""
         if self.form not in FORMS:
             check_choice("form", self.form, FORMS)
         if self.form == "velocity" and problem.matrix is not None:

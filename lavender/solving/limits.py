@@ -19,13 +19,7 @@ MAX_JUDGE_SHARE = 0.3  # Largest part of the remaining time that is reserved for
 
 
 def check_time_limit(time_limit: Any) -> float:
-    """Return a time limit [s] as a number; inf if it is None.
-
-    Raises
-    ------
-    InputError
-        `time_limit` is not a positive number.
-    """
+    """Return a time limit [s] as a number; inf if it is None."""
     if type(time_limit) is float and time_limit > 0.0:
         return time_limit
     if time_limit is None or (isinstance(time_limit, np.floating) and time_limit == np.inf):

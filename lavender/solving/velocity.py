@@ -26,13 +26,7 @@ UNFINISHED = (Status.MAX_ITERATIONS, Status.STALLED, Status.TIME_LIMIT)
 
 
 def check_velocity_tolerance(velocity_tol: float, tol: float) -> float:
-    """Return `velocity_tol` [m/s] as a float.
-
-    Raises
-    ------
-    InputError
-        `velocity_tol` is not above 0, or `tol` is not its default.
-    """
+    """Return `velocity_tol` [m/s] as a float."""
     velocity_tol = check_float("velocity_tol", velocity_tol, above=0.0)
     if tol != DEFAULT_TOLERANCE:
         raise InputError(
@@ -51,11 +45,6 @@ def relative_tolerance(problem: Problem, velocity_tol: float, tol: float) -> flo
         Largest accepted velocity error of a row (rad/s on angular rows).
     tol : float
         Relative residual of the same call, which must be the default.
-
-    Raises
-    ------
-    InputError
-        `velocity_tol` is not above 0, or `tol` is not its default.
     """
     velocity_tol = check_velocity_tolerance(velocity_tol, tol)
     reference = residual(problem, problem.start()).velocity_at_zero if problem.m else 0.0

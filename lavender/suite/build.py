@@ -77,13 +77,7 @@ class Contacts:
 def build_contact_problem(
     bodies: Bodies, contacts: Contacts, friction: str = "none", mu: Any = 0.5, target: Any = 0.0, **more: Any
 ) -> Problem:
-    """Build a problem of contacts without friction, or with two tangents and the law "coulomb" or "cone".
-
-    Raises
-    ------
-    InputError
-        `friction` has another value.
-    """
+    """Build a problem of contacts without friction, or with two tangents under the law "coulomb" or "cone"."""
     if friction not in CONTACT_FRICTION_LAWS:
         raise InputError(f"friction is {friction!r}; {' or '.join(CONTACT_FRICTION_LAWS)} is needed")
     rows = bodies.make_rows(contacts)

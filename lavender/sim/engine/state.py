@@ -135,13 +135,7 @@ class State:
         self.keys[:] = other.keys
 
     def with_larger_buffers(self) -> State:
-        """Return a copy with buffers of the sizes that the last substep needed.
-
-        Raises
-        ------
-        InputError
-            There are too many pairs of bodies, or the buffers would exceed `MAX_BUFFER_BYTES`.
-        """
+        """Return a copy with buffers of the sizes that the last substep needed."""
         if self.head[HEAD["need_pairs"]] == PAIR_COUNT_OVERFLOW:
             raise InputError(
                 f"more than {MAX_PAIRS} pairs of bodies are close together ({self.size[SIZE['bodies']]} bodies): "
@@ -154,13 +148,7 @@ class State:
 
     @classmethod
     def from_scene(cls, scene: Scene) -> State:
-        """Build the initial state of a scene.
-
-        Raises
-        ------
-        InputError
-            A scene of box friction has spin or rolling friction, or the buffers would exceed `MAX_BUFFER_BYTES`.
-        """
+        """Build the initial state of a scene."""
         p, bodies, joints = scene.parameters, scene.bodies, scene.joints
         n = len(bodies)
         # `even` bodies have an inertia I that is exactly a multiple of the identity, which rotation does not change.

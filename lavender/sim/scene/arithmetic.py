@@ -24,13 +24,7 @@ PI = 0x3243F6A8885A308D313198A2E03707344A4093822299F31D0082EFA98EC4E6C89
 
 
 def compute_sine_and_cosine(angle: float) -> tuple[float, float]:
-    """Return sine and cosine of an angle [rad], each rounded once: Taylor series in integer multiples of 2^-256.
-
-    Raises
-    ------
-    InputError
-        The angle is not finite, or is `MAX_ANGLE` or larger.
-    """
+    """Return sine and cosine of an angle [rad], each rounded once: Taylor series in integer multiples of 2^-256."""
     angle = float(angle)
     if not abs(angle) < MAX_ANGLE:
         raise InputError(f"an angle is {angle:g} rad; less than {MAX_ANGLE:g} is needed")

@@ -224,13 +224,7 @@ def normalise(x: FloatArray, min_length: float = 0.0) -> FloatArray | None:
 
 
 def choose_inertia(label: str, inertia: Any, shape: Any, mass: float) -> FloatArray:
-    """Return the checked `inertia` as a tensor (3, 3) [kg m^2]; if it is None, the inertia of the solid shape.
-
-    Raises
-    ------
-    InputError
-        The inertia is not valid, or the inertia or the mass is too small or too large.
-    """
+    """Return the checked `inertia` as a tensor (3, 3) [kg m^2]; if it is None, the inertia of the solid shape."""
     if inertia is None:
         with np.errstate(all="ignore"):
             x = np.asarray((shape if shape is not None else Sphere(0.1)).compute_inertia(mass))

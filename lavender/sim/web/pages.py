@@ -26,13 +26,7 @@ SHIPPED = HERE  # Folder of the WebAssembly modules that the package contains.
 
 
 def build_module(out: Path, name: str = "lavender") -> wasm.Built:
-    """Compile the kernels to a WebAssembly module: "lavender", which is independent, or "newton", which extends it.
-
-    Raises
-    ------
-    LavenderError
-        The module cannot be built.
-    """
+    """Compile the kernels to a WebAssembly module: "lavender", or "newton", which extends it."""
     check_writable(out)
     part = wasm.PARTS[name]
     try:
@@ -49,11 +43,6 @@ def get_or_build_module(say: Callable[[str], Any] = lambda text: None, name: str
     say : callable
         Called with a message before a build.
     name : {"lavender", "newton"}
-
-    Raises
-    ------
-    LavenderError
-        The module of the package is missing or outdated, and cannot be built.
     """
     shipped = SHIPPED / f"{name}.wasm"
 
@@ -74,13 +63,6 @@ def write_page(folder: Path, say: Callable[[str], Any] = lambda text: None) -> P
     """Write the page into a folder for any file server and return the path of index.html.
 
     The page needs neither Python nor a network.
-
-    Raises
-    ------
-    InputError
-        The folder cannot be written.
-    LavenderError
-        A module cannot be built.
     """
     make_folder(check_writable(folder, folder=True))
     modules = {name: get_or_build_module(say, name) for name in wasm.PARTS}
@@ -96,13 +78,7 @@ def write_page(folder: Path, say: Callable[[str], Any] = lambda text: None) -> P
 
 
 def compare_with_native_kernels(say: Callable[[str], Any] = lambda text: None) -> bool:
-    """Return whether the modules under Node give the bits of the native kernels; print the differences.
-
-    Raises
-    ------
-    LavenderError
-        There is no checkout or no Node, or a module cannot be built.
-    """
+    """Return whether the modules under Node give the bits of the native kernels; print the differences."""
     script = ROOT / "tests" / "sim" / "web" / "check_wasm_exports.mjs"
     if not script.is_file():
         raise LavenderError(
@@ -148,13 +124,7 @@ class _Handler(SimpleHTTPRequestHandler):
 
 
 def create_file_server(folder: Path, port: int = 0) -> ThreadingHTTPServer:
-    """Create a server of `folder` on the loopback address without starting it; port 0 selects a free one.
-
-    Raises
-    ------
-    InputError
-        The port cannot be used.
-    """
+    """Create a server of `folder` on the loopback address without starting it; port 0 selects a free one."""
     try:
         return ThreadingHTTPServer(("127.0.0.1", port), partial(_Handler, directory=str(folder)))
     except (OSError, OverflowError) as error:

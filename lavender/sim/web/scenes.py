@@ -85,11 +85,6 @@ def write_scene(scene: Scene, path: str | PathLike[str], title: str = "") -> Non
     path : path
     title : str, optional
         Name in the list of scenes; the name of the file by default.
-
-    Raises
-    ------
-    InputError
-        The scene uses another solver, is not valid, or the file cannot be written.
     """
     if not isinstance(scene, Scene):
         raise InputError(f"scene is a {type(scene).__name__}; a Scene is needed: lv.Scene({scene!r:.40})")
