@@ -18,14 +18,11 @@ from typing import Any
 
 START_TIMEOUT = 60.0  # [s] On a loaded machine, importing a function and its modules may take this long.
 KILL_TIMEOUT = 10.0  # [s] The end of a killed process is awaited for this long.
-PARENT_CHECK_INTERVAL = 0.5  # [s] Time after which a process notices that its parent has ended.
-#: Whether a process is killed together with the processes that it started, as one process group.
-PROCESS_GROUPS = os.name == "posix"
 #: Program of the other process. `python -m` is not used: it searches modules in the current folder first, where the
 #: sources of a checkout would hide the installed package.
 SERVE_SCRIPT = (
-    "import sys; sys.path[:] = filter(None, sys.path); from lavender.base.subprocesses import serve_requests; "
-    "serve_requests(int(sys.argv[1]))"
+    "import sys; sys.path[:] = filter(None, sys.path); "
+    "from lavender.base.subprocesses import serve_requests; serve_requests()"
 )
 
 
@@ -44,8 +41,7 @@ class RemoteError(Exception):
 class ProcessBackend:
     """Calls functions of modules in another process, which the first call starts and later calls reuse.
 
-    When this process ends, the other one ends within `PARENT_CHECK_INTERVAL`, or when its code next returns to the
-    interpreter.
+    When this process ends, the other one ends after its present call.
     """
 
     popen: subprocess.Popen[bytes] | None = None
@@ -77,7 +73,7 @@ class ProcessBackend:
         process = self.popen
         assert process is not None and process.stdin is not None and process.stdout is not None
         limit = threading.TIMEOUT_MAX if timeout is None else min(timeout, threading.TIMEOUT_MAX)
-        timer, begun = threading.Timer(limit, kill_process, [process]), time.monotonic()
+        timer, begun = threading.Timer(limit, process.kill), time.monotonic()
         timer.daemon = True
         try:
             if timeout is not None:
@@ -112,19 +108,18 @@ class ProcessBackend:
         path = os.pathsep.join(p or os.getcwd() for p in sys.path)
         try:
             self.popen = subprocess.Popen(
-                [sys.executable, "-c", SERVE_SCRIPT, str(os.getpid())],
+                [sys.executable, "-c", SERVE_SCRIPT], env={**os.environ, "PYTHONPATH": path},
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-                env={**os.environ, "PYTHONPATH": path}, start_new_session=PROCESS_GROUPS,
             )  # fmt: skip
         except OSError as error:
             raise ProcessEnded(f"it did not start: {error}") from None
 
     def close(self) -> None:
-        """Kill the process and the processes that it started."""
+        """Kill the process."""
         process, self.popen = self.popen, None
         if process is None:
             return
-        kill_process(process)
+        process.kill()
         with contextlib.suppress(subprocess.TimeoutExpired):
             process.wait(KILL_TIMEOUT)
         for stream in (process.stdin, process.stdout):
@@ -132,23 +127,12 @@ class ProcessBackend:
                 stream.close()  # type: ignore[union-attr]
 
 
-def kill_process(process: subprocess.Popen[bytes]) -> None:
-    """Kill a process and the processes that it started."""
-    if PROCESS_GROUPS:
-        # The number of the group, which its first process has too, is not reused while a process of it runs.
-        with contextlib.suppress(OSError):
-            os.killpg(process.pid, signal.SIGKILL)
-    process.kill()
-
-
 # -- in the other process -----------------------------------------------------------------------------
 
 
-def serve_requests(parent: int) -> None:
+def serve_requests() -> None:
     """Answer requests, each with a function and its arguments, until the pipe ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # The parent handles Ctrl-C.
-    if PROCESS_GROUPS:
-        threading.Thread(target=_wait_and_kill_group, args=(parent,), daemon=True).start()
     requests, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     null = os.open(os.devnull, os.O_RDWR)
     os.dup2(null, 0)  # The function's own input and output are the null device.
@@ -165,10 +149,3 @@ def serve_requests(parent: int) -> None:
             answer = pickle.dumps(((type(error).__name__, str(error)), None))
         answers.write(answer)
         answers.flush()
-
-
-def _wait_and_kill_group(parent: int) -> None:
-    """Wait until the parent process ends, then kill this process and the processes that it started."""
-    while os.getppid() == parent:
-        time.sleep(PARENT_CHECK_INTERVAL)
-    os.killpg(0, signal.SIGKILL)

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib
-import re
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import click
 
 from lavender._version import __version__
-from lavender.base.errors import InputError, LavenderError, UnknownName
+from lavender.base.errors import LavenderError, UnknownName
 from lavender.base.exits import EXIT_BAD_INPUT, EXIT_INTERRUPTED
 from lavender.cli.options import print_escaped
 
@@ -34,26 +32,6 @@ COMMANDS = {
 
 class Commands(click.Group):
     """Group of all commands. The module of a command is imported when the command is used."""
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Reject an empty argument, which would mean the current folder, then parse as click does."""
-        if any(word == "" or (word.startswith("--") and word.endswith("=")) for word in args):
-            raise click.UsageError(
-                "an argument is empty; a value is needed: set the shell variable that it uses, or leave it out",
-                ctx,
-            )
-        return super().parse_args(ctx, args)
-
-    def invoke(self, ctx: click.Context) -> Any:
-        """Run a command; an error about a parameter names the command's option instead."""
-        try:
-            return super().invoke(ctx)
-        except InputError as error:
-            command = self.get_command(ctx, ctx.invoked_subcommand or "")
-            message = _name_options(str(error), command.params if command else ())
-            if message == str(error):
-                raise
-            raise InputError(message) from error
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names of all commands."""
@@ -80,19 +58,6 @@ class Commands(click.Group):
         return command
 
 
-def _name_options(message: str, parameters: Sequence[click.Parameter]) -> str:
-    """Replace names of parameters in an error message by the names of their options.
-
-    A name is replaced everywhere if the message states its value ("steps is 0"), or begins with it ("contacts names").
-    """
-    for parameter in parameters:
-        name, options = parameter.name, [option for option in parameter.opts if option.startswith("--")]
-        if name and options and re.search(rf"(?<![\w-]){name} is |^{name} names ", message):
-            message = re.sub(rf"(?<![\w-]){name}(?= is | names | must )", options[0], message)
-            message = re.sub(rf"(?<= of ){name}$", options[0], message)
-    return message
-
-
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 @click.version_option(__version__, prog_name="lavender")
 def cli() -> None:
@@ -105,7 +70,8 @@ def cli() -> None:
 def main(args: Sequence[str] | None = None) -> None:
     """Run the command line. An error of lavender is printed as one line and exits with 2, Ctrl-C exits with 130."""
     try:
-        with _print_warnings_as_sentences():
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning
             code = cli.main(
                 args=None if args is None else list(args), prog_name="lavender", standalone_mode=False
             )
@@ -121,17 +87,6 @@ def main(args: Sequence[str] | None = None) -> None:
     raise SystemExit(code if isinstance(code, int) else 0)
 
 
-@contextlib.contextmanager
-def _print_warnings_as_sentences() -> Iterator[None]:
-    """Print each UserWarning as one line, without the line of source that issued it."""
-    with warnings.catch_warnings():
-        show = warnings.showwarning
-
-        def show_sentence(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
-            if category is UserWarning:
-                print_escaped(f"lavender: warning: {message}", err=True)
-            else:
-                show(message, category, *place, **more)
-
-        warnings.showwarning = show_sentence
-        yield
+def _show_warning(message: Warning | str, *place: Any, **more: Any) -> None:
+    """Print a warning as one line, without the line of source that issued it."""
+    print_escaped(f"lavender: warning: {message}", err=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -27,10 +26,7 @@ if TYPE_CHECKING:
     from lavender.report import Event, Plan
 
 
-PROGRESS_INTERVAL = 10.0  # [s] Time between two lines of progress if the output is not a terminal.
-REDRAW_INTERVAL = 0.25  # [s] Time between two updates of the line on a terminal.
-MIN_DONE_FRACTION = 0.1  # The remaining time is not estimated before this fraction of the work is done.
-MIN_ELAPSED = 1.0  # [s] The remaining time is not estimated from a shorter time.
+REDRAW_INTERVAL = 0.25  # [s] Time between two updates of the progress on a terminal.
 
 
 class Measured(NamedTuple):
@@ -139,59 +135,30 @@ def show_page(page: ResultPage, folder: Path, is_quiet: bool = False) -> None:
 
 @contextlib.contextmanager
 def show_progress(is_quiet: bool = False) -> Iterator[Callable[[Event], None]]:
-    """Yield a callback that shows progress on stderr: on a terminal in one line, else in a line every few seconds.
+    """Yield a callback that shows progress on stderr if it is a terminal, unless `is_quiet`."""
+    from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-    With `is_quiet`, the callback shows nothing.
-    """
-    if is_quiet:
-        yield lambda event: None
-        return
     console = make_console(stderr=True)
-    interval = REDRAW_INTERVAL if console.is_terminal else PROGRESS_INTERVAL
-    # The time of a phase, without results that were reused.
-    phase, began, reused_until = "", time.monotonic(), 0
-    printed = -math.inf if console.is_terminal else began
+    columns = (
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.description}", markup=False),
+    )
+    drawn = 0.0
+    # Without `auto_refresh`: the thread that redraws would disturb the times that are measured.
+    with Progress(
+        *columns, console=console, auto_refresh=False, transient=True,
+        disable=is_quiet or not console.is_terminal,
+    ) as progress:  # fmt: skip
+        task = progress.add_task("starting", total=None)
 
-    def show_line(text: str) -> None:
-        if console.is_terminal:
-            console.file.write(f"\r{text[: console.width - 1]}\x1b[K")
-            console.file.flush()
-        else:
-            click.echo(text, err=True)
+        def show_event(event: Event) -> None:
+            nonlocal drawn
+            if (now := time.monotonic()) - drawn > REDRAW_INTERVAL:
+                drawn = now
+                current = ": ".join(filter(None, (event.phase, f"{event.case} {event.solver}".strip())))
+                progress.update(task, description=current, completed=event.done, total=event.total or None)
+                progress.refresh()
 
-    def show_event(event: Event) -> None:
-        nonlocal phase, began, reused_until, printed
-        now = time.monotonic()
-        if event.reused or event.phase != phase:
-            phase, began, reused_until = event.phase, now, event.done + event.reused
-        if now - printed < interval:
-            return
-        printed = now
-        count = f"{event.done} of {event.total}, " if event.total else ""
-        remaining = (
-            "" if phase == "writing" else format_remaining_time(event, now - began, event.done - reused_until)
-        )
-        current = ": ".join(filter(None, (event.phase, f"{event.case} {event.solver}".strip())))
-        show_line(f"{count}{now - began:.0f} s{remaining and f', {remaining}'}: {current}")
-
-    if console.is_terminal:
-        show_line("starting")
-    try:
         yield show_event
-    finally:
-        if console.is_terminal:
-            show_line("")
-
-
-def format_remaining_time(event: Event, elapsed: float, done: int | None = None) -> str:
-    """Return a phrase such as "about 40 s remain" from the time [s] in which `done` were done, by default all.
-
-    It is empty before a tenth of the work is done: the first parts contain the start of workers and compilation.
-    """
-    done = event.done if done is None else done
-    if done < max(1, MIN_DONE_FRACTION * event.total) or not event.total or elapsed < MIN_ELAPSED:
-        return ""
-    remaining = elapsed * (event.total - event.done) / done
-    if remaining < 90.0:
-        return f"about {max(1, round(remaining))} s remain"
-    return f"about {round(remaining / 60.0)} min remain"

@@ -13,8 +13,6 @@ import contextlib
 import io
 import json
 import math
-import os
-import time
 import warnings
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -23,7 +21,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from lavender.base.errors import InputError, require_packages
-from lavender.io.stored import as_path, make_folder, read_whole_file, resolve_destination
+from lavender.io.stored import as_path, make_folder, read_whole_file
 from lavender.judge.solution import CLAIM_CHECKS, CONFIRMED
 from lavender.report.text import escape_unprintable, format_tolerance
 
@@ -33,7 +31,6 @@ if TYPE_CHECKING:
 Row: TypeAlias = dict[str, Any]  # Content of one line.
 KINDS = ("machine", "case", "run", "skip")
 MAX_LINE_BYTES = 2**26  # A longer last line is not of a records file; lines have a few thousand bytes.
-SYNC_INTERVAL = 1.0  # [s] A power cut loses at most the lines of this time, a killed process none.
 ERROR = "ERROR"  # Status of a run whose solver raised an exception, in addition to the statuses of a solve.
 #: Columns that are equal in two lines about the same measurement; the later line counts.
 KEY = ("run", "case", "sha", "solver", "start", "mode", "tol", "max_iter", "time_limit", "order")
@@ -131,7 +128,7 @@ class Store:
     """
 
     def __init__(self, path: str | Path) -> None:
-        self.path, self._real = as_path(path), resolve_destination(path)
+        self.path = as_path(path)
         make_folder(self.path.parent)
         try:
             self.lines = read(self.path) if self.path.exists() else make_lines([])
@@ -141,7 +138,6 @@ class Store:
             self.file = self.path.open("a", encoding="utf-8")
         except OSError as error:
             raise InputError(f"cannot write {self.path}: {error.strerror or error}") from None
-        self._synced = time.monotonic()
 
     def add(self, row: Row) -> None:
         """Write one row and flush it to the operating system before returning.
@@ -149,7 +145,7 @@ class Store:
         Raises
         ------
         InputError
-            The disk is full (earlier rows are stored), or the file was removed.
+            The disk is full; earlier rows are stored.
         """
         plain = (str, int, bool)
         line = json.dumps(
@@ -158,12 +154,6 @@ class Store:
         try:
             self.file.write(line + "\n")
             self.file.flush()
-            if time.monotonic() - self._synced > SYNC_INTERVAL:
-                os.fsync(self.file.fileno())
-                self._synced = time.monotonic()
-                if not self._real.exists():
-                    advice = "run the command again in another folder"
-                    raise InputError(f"{self.path} was removed while it was being written: {advice}")
         except OSError as error:
             raise InputError(
                 f"cannot write {self.path} ({error.strerror or error}): free disk space and run the same command "
@@ -362,7 +352,7 @@ def select_skips(lines: DataFrame) -> DataFrame:
 
 
 def select_machines(lines: DataFrame) -> dict[str, Row]:
-    """Return the last description of each machine with its versions and plan, by the name of its run, in order of time."""
+    """Return the last description of each machine with its versions and plan, by its run, in order of time."""
     machines: dict[str, Row] = {}
     defaults = {"run": "", "started": "", "lavender": "", "python": "", "platform": "", "cpu": "", "cores": 1,
                 "threads": 1, "load": math.nan, "whole": True}  # fmt: skip

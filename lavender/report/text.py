@@ -6,14 +6,13 @@ import hashlib
 import math
 import re
 from collections.abc import Sequence
+from unicodedata import category
 
 TIME_UNITS = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"))
 NONE = "–"  # Shown in place of a missing number.
 MAX_FILE_NAME_LENGTH = 120  # [characters] File systems accept 255 bytes, including a suffix.
-#: Characters that no text of a report contains: controls, lone surrogates, line ends, marks of writing direction.
-UNPRINTABLE = re.compile(
-    "[\x00-\x1f\x7f-\x9f\u2028\u2029\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
-)
+#: Categories of characters that no text of a report contains: controls, formats, lone surrogates, line ends.
+UNPRINTABLE = ("Cc", "Cf", "Cs", "Zl", "Zp")
 
 
 def format_residual(x: float) -> str:
@@ -122,24 +121,11 @@ def format_percent(part: int, whole: int, digits: int = 0) -> str:
 
 
 def escape_unprintable(text: str, lines: bool = False) -> str:
-    """Replace characters that a terminal, file or page cannot show by their codes.
-
-    A byte of a file name that is not UTF-8 (a lone surrogate in Python's string) is written as this byte. With
-    `lines`, line ends and tabs are kept, as in messages; without, the result is one line.
-    """
+    """Replace characters that a terminal, file or page cannot show by their codes; with `lines` not line ends."""
     if text.isprintable():
         return text
-
-    def escape(match: re.Match[str]) -> str:
-        if lines and match[0] in "\n\t":
-            return match[0]
-        code = ord(match[0])
-        if 0xDC80 <= code <= 0xDCFF:
-            code -= 0xDC00
-        words = {"\n": "\\n", "\t": "\\t", "\r": "\\r"}
-        return words.get(match[0]) or (f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}")
-
-    return UNPRINTABLE.sub(escape, text)
+    kept = "\n\t" if lines else ""
+    return "".join(ascii(c)[1:-1] if category(c) in UNPRINTABLE and c not in kept else c for c in text)
 
 
 def make_file_name(name: str) -> str:

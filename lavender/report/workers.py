@@ -4,20 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import os
-import signal
-import threading
-import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from functools import cache
-from multiprocessing import resource_tracker
 from typing import Any
 
 from lavender.base.errors import InputError, require_packages
 
 MAX_WORKERS = 4096  # [processes] More than any machine has cores.
 CONNECT_TIMEOUT = 10.0  # [s] Time for a scheduler to answer.
-PARENT_CHECK_INTERVAL = 0.5  # [s] Time between two checks of a worker that its parent still runs.
 
 
 def check_workers(workers: Any) -> None:
@@ -48,12 +42,10 @@ def map_unordered(
         from distributed.scheduler import KilledWorker
 
         lost = (*lost, KilledWorker, FutureCancelledError)
-    parent = os.getpid() if backend == "loky" else 0  # 0 if workers belong to a cluster.
     with joblib.parallel_config(backend=backend, n_jobs=workers):
-        calls = (joblib.delayed(_call_in_worker)(parent, function, each) for each in arguments)
+        calls = (joblib.delayed(_call_in_worker)(os.getpid(), function, each) for each in arguments)
         try:
-            with _ignore_sigint() if hasattr(signal, "pthread_sigmask") else contextlib.nullcontext():
-                results = joblib.Parallel(return_as="generator_unordered", batch_size=1)(calls)
+            results = joblib.Parallel(return_as="generator_unordered", batch_size=1)(calls)
             try:
                 for result in results:  # noqa: UP028 - `yield from` would close `results` without the filter below
                     yield result
@@ -67,39 +59,10 @@ def map_unordered(
 
 
 def _call_in_worker(parent: int, function: Callable[..., Any], call_arguments: tuple[Any, ...]) -> Any:
-    """Call the function in a worker, which ends when its parent does."""
-    if parent and parent != os.getpid():
-        _end_this_process_with_parent(parent)
+    """Call the function in a worker."""
+    if parent != os.getpid():
         warnings.filterwarnings("ignore", "solver plug-in")  # The parent has reported it.
     return function(*call_arguments)
-
-
-@cache
-def _end_this_process_with_parent(parent: int) -> None:
-    """Start a thread that ends this process soon after its parent was killed."""
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(PARENT_CHECK_INTERVAL)
-        os._exit(1)
-
-    if hasattr(os, "getppid"):
-        threading.Thread(target=watch, daemon=True).start()
-
-
-@contextlib.contextmanager
-def _ignore_sigint() -> Iterator[None]:
-    """Ignore SIGINT in processes started in this context. A terminal sends it to all; only this process handles it."""
-    from joblib.externals.loky.backend import resource_tracker as loky_tracker
-
-    # Start both resource trackers first: starting one unblocks SIGINT in this process.
-    resource_tracker.ensure_running()
-    loky_tracker.ensure_running()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def connect_backend(spec: str) -> tuple[str, contextlib.AbstractContextManager[Any]]:

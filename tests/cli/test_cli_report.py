@@ -15,8 +15,6 @@ from stacks import idle_problem, stack
 import lavender as lv
 from lavender import cli, io, report
 from lavender import export as export
-from lavender.cli import measuring
-from lavender.report import Event
 from lavender.report.store import select_cases, select_skips
 
 
@@ -26,19 +24,6 @@ def test_explain_command_prints_stages_and_json(lavender):
     assert "newton is counted to take" in shown and "granularF(n=4)" in shown and "admm" in shown
     plan = json.loads(lavender("explain", "stack(n=200)", "--json", "--tol", "1e-9")[1])
     assert plan["tol"] == 1e-9 and plan["rows"] == 200 and plan["stages"][0]["solver"] == "direct"
-
-
-def test_progress_lines_have_the_remaining_time(capsys, monkeypatch):
-    monkeypatch.setattr(measuring, "PROGRESS_INTERVAL", 0.0)  # s between two lines
-    with measuring.show_progress() as watch:
-        watch(Event(1, 5, "timing: a setting", ""))
-    assert capsys.readouterr().err == "1 of 5, 0 s: timing: a setting\n"
-    event = Event(20, 80, "stack", "newton")
-    assert measuring.format_remaining_time(event, 10.0) == "about 30 s remain"
-    assert measuring.format_remaining_time(event, 100.0) == "about 5 min remain"
-    assert measuring.format_remaining_time(event, 0.1) == ""  # too early
-    assert measuring.format_remaining_time(Event(7, 80, "stack", "newton"), 10.0) == ""  # before a tenth is done
-    assert measuring.format_remaining_time(Event(20, 0, "", ""), 10.0) == ""  # the total is not known
 
 
 def test_lists_take_commas_or_blanks_and_files_may_follow(lavender, path, tmp_path):

@@ -3,7 +3,6 @@
 import html.parser
 import io
 import re
-import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -12,12 +11,9 @@ import pandas as pd
 import pytest
 from approved_texts import check_text
 from rich.console import Console
-from worked import python
 
 from lavender.report import drawing, figures, write
-from lavender.report.page import Page
 from lavender.report.render import print_table, write_files
-from lavender.report.text import format_power, format_speed, format_time
 from tests.report.synthetic import EVIL, FALSE_CLAIM, example, record, report_of, shown, skip
 
 
@@ -182,112 +178,7 @@ def test_write_files_has_frames_as_csv_and_data_as_json(tmp_path):
 # -- figures ----------------------------------------------------------------------------------------
 
 
-def test_figures_draw_no_text_outside_of_the_canvas(monkeypatch):
-    """Labels at the ends of lines were cut where names of solvers are long."""
-    from matplotlib.figure import Figure
-
-    outside, save = [], Figure.savefig
-
-    def check_and_save(self, *given, **more):
-        self.canvas.draw()
-        width, height = self.get_size_inches() * self.dpi
-        for axes in self.axes:
-            for text in (*axes.texts, axes.xaxis.label, axes.yaxis.label):
-                box = text.get_window_extent()
-                if box.x0 < -1 or box.x1 > width + 1 or box.y0 < -1 or box.y1 > height + 1:
-                    outside.append((text.get_text(), box))
-        return save(self, *given, **more)
-
-    monkeypatch.setattr(Figure, "savefig", check_and_save)
-    names = ["auto", "sequential_impulses", "block_gauss_seidel", "a_plug_in_with_a_name_that_is_long"]
-    made = [
-        record(case, name, 10.0 ** (i - 4), x, tol=tol)
-        for case in "ab" for i, name in enumerate(names) for tol, x in ((1e-3, 1e-4), (1e-6, 1e-8))
-    ]  # fmt: skip
-    report_of(*made).make_page().render()
-    assert outside == []
-
-
-@pytest.mark.parametrize("n", [1, 2, 9])
-def test_spread_labels_keeps_order_gap_and_range(n):
-    values = np.random.default_rng(n).uniform(0.0, 1.0, n).round(1)
-    y = drawing.spread_labels(values, 0.06, 0.0, 1.0)
-    order = np.argsort(values, kind="stable")
-    assert (np.diff(y[order]) >= 0.06 - 1e-9).all() and y.min() >= -1e-9 and y.max() <= 1.0 + 1e-9
-
-
 def test_profile_is_the_share_of_cases_within_a_factor_of_the_fastest():
     times = pd.DataFrame({"a": [1.0, 2.0], "b": [4.0, 1.0], "c": [np.nan, 1.0]}, index=["x", "y"])
     svg = figures.draw_profile(times, ["x", "y"], None)
     assert "Solved within twice the fastest time: x 33 %, y 100 %" in svg
-
-
-def test_style_sheet_has_a_contrast_of_at_least_4_5_in_both_themes():
-    """Of every text on the paper and on the cells of a matrix, after the formula of WCAG 2."""
-    css = Page("", "", "").render()
-    themes = [dict(re.findall(r"--(\w+): (#[0-9a-f]{3,6})", part)) for part in css.split("@media screen")[:2]]
-
-    def luminance(color):
-        code = color[1:] if len(color) == 7 else "".join(2 * c for c in color[1:])
-        rgb = [int(code[i : i + 2], 16) / 255.0 for i in (0, 2, 4)]
-        return np.dot(
-            [0.2126, 0.7152, 0.0722], [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in rgb]
-        )
-
-    def contrast(one, two):
-        low, high = sorted((luminance(one), luminance(two)))
-        return (high + 0.05) / (low + 0.05)
-
-    for theme in (themes[0], themes[0] | themes[1]):
-        texts = ["ink", "quiet", "link", "bad", "ok", *(f"s{i}" for i in range(5))]
-        pairs = [(name, "paper") for name in texts] + [(f"t{i}", f"h{i}") for i in range(5)] + [("bad", "badbg")]
-        assert {
-            pair: contrast(*(theme[x] for x in pair)) for pair in pairs if contrast(*(theme[x] for x in pair)) < 4.5
-        } == {}
-
-
-def test_formats_have_two_digits_and_units_that_do_not_break():
-    assert [format_time(t) for t in (2.5e-8, 8.14e-6, 6.11e-4, 9.99e-4, 0.25, 12.0)] == [
-        "0.025\u00a0µs", "8.1\u00a0µs", "611\u00a0µs", "999\u00a0µs", "250\u00a0ms", "12\u00a0s"
-    ]  # fmt: skip
-    assert [format_speed(v) for v in (0.0, 5e-14, 2.3e-7, 2.3e-4, 0.0234, 1.5, 13.0, np.nan)] == [
-        *("0\u00a0m/s", "5e-14\u00a0m/s", "0.23\u00a0µm/s", "0.23\u00a0mm/s", "23\u00a0mm/s", "1.5\u00a0m/s"),
-        *("13\u00a0m/s", "–"),
-    ]  # fmt: skip
-    assert format_speed(0.41, "rad/s") == "0.41\u00a0rad/s" and format_speed(2e-3, "rad/s") == "2\u00a0mrad/s"
-    assert [format_power(x) for x in (1e-9, 0.1, 1.0, 100.0, 1e4)] == ["10⁻⁹", "0.1", "1", "100", "10⁴"]
-
-
-def test_page_of_forty_problems_and_twenty_solvers_has_at_most_150_kb(tmp_path):
-    made = [
-        record(f"problem {i}", f"solver_{j}", 1e-3 * (1 + j), 1e-8, tol=tol)
-        for i in range(20) for j in range(20) for tol in (1e-3, 1e-6)
-    ]  # fmt: skip
-    write(report_of(*made), tmp_path)
-    assert (tmp_path / "index.html").stat().st_size <= 150_000
-
-
-@pytest.mark.nightly
-@pytest.mark.skipif(sys.platform == "win32", reason="the peak of memory is read by the resource module")
-def test_report_of_100000_runs_needs_less_than_500_mb(tmp_path):
-    code = f"""import json
-from lavender.report.store import to_jsonable
-from tests.report.synthetic import lines_of, record
-made = record("c0", "auto", 1e-3, 1e-8)
-cases = [record(f"c{{i}}", "auto", 1e-3, 1e-8) for i in range(1000)]
-with open({str(tmp_path / "records.jsonl")!r}, "w") as f:
-    for row in lines_of(*cases).iloc[:1001].to_dict("records"):
-        f.write(json.dumps(to_jsonable({{k: v for k, v in row.items() if v == v}})) + "\\n")
-    for i in range(100_000):
-        change = {{"case": f"c{{i % 1000}}", "sha": f"shac{{i % 1000}}", "solver": f"s{{i // 1000 % 20}}"}}
-        f.write(json.dumps(to_jsonable(made | change | {{"tol": 10.0 ** -(1 + i // 20_000)}})) + "\\n")
-"""
-    python("-c", code)
-    code = f"""import resource
-from lavender.report import Report, read, write
-lines = read({str(tmp_path / "records.jsonl")!r})
-write(lines, {str(tmp_path / "out")!r})
-print(len(Report(lines).runs), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"""
-    count, peak = map(int, python("-c", code).stdout.split())
-    assert count == 100_000 and peak < 500 * 1024  # [KiB] on Linux
-    assert re.search(r"auto|s\d+", (tmp_path / "out" / "tables" / "structures.csv").read_text())

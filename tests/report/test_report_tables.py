@@ -12,7 +12,7 @@ from lavender.report.render import format_cells, format_markdown, list_number_he
 from lavender.report.tables import read_engine_answers
 from lavender.report.text import format_percent
 from lavender.report.timing import add_times
-from tests.report.synthetic import BUDGET, FALSE_CLAIM, lines_of, record, report_of, shown
+from tests.report.synthetic import BUDGET, FALSE_CLAIM, lines_of, record, report_of
 
 SIZES = {f"c{n}": n for n in (10, 30, 100, 300, 1000)}
 DEAD = {"status": "ERROR", "claims": False}
@@ -172,13 +172,6 @@ def test_report_has_its_approved_recommendation_and_tables(tmp_path, name, made,
     check_text("report_scenarios.txt", name, describe_report(report, tables_shown))
 
 
-def test_terminal_of_crashed_plug_ins_has_their_errors():
-    lines = lines_of(*CRASHED, cases={"b": {"law": "coulomb"}})
-    text = shown(Report(lines), 100)
-    assert "crashed (1 of 2): mine on a: ERROR: ValueError" in text
-    assert "crashed (2 of 2): yours on b: ERROR: TypeError: of yours" in text
-
-
 def test_report_without_times_ranks_by_solved_cases_and_shows_no_time():
     made = [*all_of("abc", ("auto", 0.0)), *all_of("ab", ("pgs", 0.0)), record("c", "pgs", 0.0, 0.5)]
     lines = lines_of(*made)
@@ -229,15 +222,6 @@ def test_format_cells_times_have_one_unit_and_sizes_one_format():
     assert sizes.to_numpy().tolist() == [["3.5e-1", "2.9e-3"], ["2.0e-1", "–"]]
     markdown = format_markdown(pd.DataFrame({"a": ["<b>|*x*"]}))
     assert markdown == ["| a |", "| --- |", r"| &lt;b&gt;\|\*x\* |"]
-
-
-def test_tables_of_200_cases_of_which_few_are_solved_are_complete():
-    """pandas has codes of one byte for up to 127 categories, and did not align them with codes of two bytes."""
-    made = [record(f"c{i}", s, 1e-3, 1e-8 if i < 3 else 0.5, tol=1e-3) for i in range(200) for s in ("auto", "pgs")]
-    report = report_of(*made)
-    assert len(report.sections["runs"].frame) == 400
-    assert report.sections["runs"].frame["to 1e-3 [s]"].notna().sum() == 6
-    assert len(tables.select_failures(report)) == 394
 
 
 def test_tabulate_structures_counts_a_case_that_a_solver_did_not_end_in_time_as_unsolved():

@@ -279,22 +279,6 @@ def test_run_ctrl_c_keeps_the_records_that_were_made(tmp_path, plug_in):
     assert not report.Report(report.read(path)).is_stopped
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="an open file cannot be removed there")
-def test_store_removed_file_is_an_error(tmp_path, monkeypatch):
-    monkeypatch.setattr(store, "SYNC_INTERVAL", -1.0)
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "sub").mkdir()
-    with report.Store("sub/records.jsonl") as opened:
-
-        def watch(event):
-            if event.solver == "direct" and event.row is None:
-                (tmp_path / "sub" / "records.jsonl").unlink()
-
-        monkeypatch.chdir("/")  # A relative name refers to the folder in which it was given.
-        with pytest.raises(lv.InputError, match="was removed"):
-            report.run([stack(5)], ["pgs", "direct"], QUICK, opened, watch=watch)
-
-
 def test_write_csv_has_a_row_for_each_run(tmp_path):
     found = report.run([stack(6), chain(4, guess=np.ones(4))], ["pgs", "direct"], QUICK)
     report.write(found, tmp_path, figures=False)
