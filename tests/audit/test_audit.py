@@ -15,7 +15,6 @@ from lavender.audit.audit import audit
 from lavender.audit.pieces import AUDIT_VERDICTS
 from lavender.audit.simulated_worlds import Frame
 from lavender.io.efc import from_efc
-from lavender.io.start_states import read_states
 
 
 def words_of(found):
@@ -120,14 +119,6 @@ def test_audit_of_a_world_that_diverges_judges_the_other_worlds(boxes, monkeypat
     assert "1 world diverged, the first at step 4; " in words_of(found) and "; 6 steps not judged." in words_of(found)
 
 
-def test_audit_stopped_before_the_first_step_raises_keyboard_interrupt(boxes):
-    def watch(event):
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        audit(boxes(EARLY), worlds=3, steps=25, workers=1, watch=watch)
-
-
 def test_audit_of_a_world_that_ends_in_a_mujoco_error_judges_only_steps_before(boxes, monkeypatch):
     step = mj.mj_step
 
@@ -173,16 +164,6 @@ def test_audit_of_a_divergence_after_exact_solves_blames_the_model(tmp_path, mon
     assert found.diverged["solves until then"].tolist() == ["exact" if exact else "not exact"] * 3
 
 
-@pytest.mark.filterwarnings("ignore")
-def test_audit_of_a_world_that_diverges_in_its_last_step_counts_it(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "runaway.xml").write_text(RUNAWAY.format(gain=60))
-    steps = 1 + audit("runaway.xml", worlds=1, steps=60, workers=1, spread=0.0).divergences[0].step
-    found = audit("runaway.xml", worlds=1, steps=steps, workers=1, spread=0.0)
-    assert found.n_diverged == 1
-    assert audit("runaway.xml", worlds=1, steps=steps - 1, workers=1, spread=0.0).n_diverged == 0
-
-
 def test_audit_rows_and_contacts_equal_those_of_mujoco(boxes):
     path = boxes()
     found = audit(path, worlds=2, steps=60, workers=1)
@@ -220,18 +201,6 @@ def test_audit_from_stored_states_repeats_their_errors(boxes, tmp_path, names):
     # The fourth world starts from the first state with other velocities.
     assert [w.velocity for w in found.worst] == again.numbers[0, :3, 0].tolist()
     assert again.numbers[0, 3, 0] != again.numbers[0, 0, 0]
-
-
-def test_read_states_of_physics_vectors_misses_warm_start_and_controls(boxes):
-    made = mj.MjModel.from_xml_path(str(boxes()))
-    vector = np.concatenate([made.qpos0, np.zeros(made.nv)])
-    for kind, missing in (("PHYSICS", ("warm start", "controls")), ("INTEGRATION", ())):
-        data = mj.MjData(made)
-        data.qpos[:], data.qvel[:] = np.split(vector, [made.nq])
-        size = mj.mj_stateSize(made, getattr(mj.mjtState, f"mjSTATE_{kind}"))
-        state = np.empty(size)
-        mj.mj_getState(made, data, state, getattr(mj.mjtState, f"mjSTATE_{kind}"))
-        assert read_states(mj, made, state[None]).missing == missing
 
 
 KEYFRAMES = """<keyframe><key qpos="0 0 .099 1 0 0 0  0 0 .5 1 0 0 0  0" ctrl=".5"/>
@@ -272,15 +241,6 @@ def test_audit_with_a_wrong_argument_raises_an_error_that_names_it(boxes, tmp_pa
         given = {"states": "bad.npz"}
     with pytest.raises(lv.LavenderError, match=words):
         audit(boxes(), **{"worlds": 1, "steps": 2, "workers": 1} | given)
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_audit_of_a_world_that_mujoco_resets_ends_there(boxes, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log there
-    found = audit(boxes(), worlds=2, steps=10, workers=1, spread=1e12)
-    assert (found.verdict[1, 1:] == AUDIT_VERDICTS.index("not judged")).all()
-    assert (found.verdict[0] < AUDIT_VERDICTS.index("not judged")).all() and np.isfinite(found.max_velocity_error)
-    assert [(d.world, d.step, d.is_outside) for d in found.divergences] == [(1, 0, True)]
 
 
 def test_audit_with_warnings_of_mujoco_counts_them_without_printing(boxes, monkeypatch, tmp_path, capfd):
@@ -389,13 +349,3 @@ def test_audit_of_an_engine_whose_acceleration_is_not_finite_does_not_judge_its_
     assert [(d.step, d.is_outside) for d in found.divergences] == [(3, False)]
     assert "; 1 step not judged." in words_of(found)
     assert "--engine mujoco" in words_of(found)
-
-
-@pytest.mark.parametrize(("engine", "package"), [("mjx", "mujoco.mjx"), ("mujoco_warp", "mujoco_warp")])
-def test_audit_with_an_engine_not_installed_names_the_package(boxes, engine, package, monkeypatch):
-    import sys
-
-    for name in (package, "jax", "warp"):
-        monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(lv.InputError, match="pip install mujoco-"):
-        audit(boxes(), worlds=1, steps=2, engine=engine)

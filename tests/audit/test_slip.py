@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import lavender as lv
-from lavender.audit.slip import REMEDY_STEPS, Remedy, SlipExplanation, explain_slip
+from lavender.audit.slip import REMEDY_STEPS, explain_slip
 from lavender.audit.slip_states import explain_slip_of_states
 
 mujoco = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[peers]'")
@@ -271,41 +271,6 @@ def test_explain_slip_of_states_remedy_has_the_slip_that_the_typed_setting_gives
     assert best.later < 0.3 * explanation.remedies[0].later
 
 
-def test_explain_slip_without_contacts_or_velocities_raises():
-    with pytest.raises(lv.InputError, match="no contact with tangents"):
-        explain_slip(lv.Problem.lcp(np.eye(2), np.ones(2)), np.zeros(2))
-    matrix = lv.Problem.contact(np.eye(3), np.array([1.0, 1.0, 0.0]), mu=0.5)
-    with pytest.raises(lv.LavenderError):
-        explain_slip(matrix, np.zeros(3))
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_slip_remedies_after_a_reset_by_mujoco_are_not_recommended():
-    model, states = make_diverging_states([1.0])
-    data, step = mujoco.MjData(model), 0
-    data.qpos[:], data.qvel[:] = states["qpos"][0], states["qvel"][0]
-    while not data.warning[int(mujoco.mjtWarning.mjWARN_BADQACC)].number:
-        mujoco.mj_step(model, data)
-        step += 1
-    (explanation,) = explain_slip_of_states(model, states).explanations
-    assert explanation.remedies[0].diverged_step == step - 1 > 0
-    assert explanation.remedies_table.iloc[0, 2] == f"diverges in step {step - 1}"
-    assert len(explanation.advice) == 1 and "No setting is recommended" in explanation.advice[0]
-
-
-def test_slip_below_the_threshold_gives_no_advice():
-    remedies = (Remedy("as it is", 1e-3, 1e-9), Remedy("<option/>", 1e-3, 1e-12))
-    explanation = SlipExplanation((), (), remedies=remedies)
-    (line,) = explanation.advice
-    assert "is 1.0e-9 m/s as it is; up to 1e-06 m/s count as no slip" in line
-
-
-def test_slip_of_round_cones_names_the_undefined_law():
-    explanations = explain_slip_of_states(block(0.3, option='cone="elliptic"', condim=4), steps=100).explanations
-    assert "Variant 'coulomb': Coulomb's law is not defined for its round cones." in explanations[0].sentences
-    assert explanations[0].parts["convex relaxation"] == pytest.approx([0.0] * len(explanations[0].contacts))
-
-
 def falling_states(model, velocities):
     """Return the states of a box that has settled, with these velocities along x and upwards [m/s]."""
     kind, data = mujoco.mjtState.mjSTATE_INTEGRATION, mujoco.MjData(model)
@@ -341,21 +306,3 @@ def test_slip_over_time_counts_steps_with_contact_of_all_states():
     # The box turns by less than 1e-3 rad.
     assert now.later == pytest.approx(speeds[:, 1:][touches[:, 1:]].mean(), rel=1e-2)
     assert both.remedies_table.iloc[0].tolist()[3:] == [f"{n} of 50", f"{now.kept} of 2"]
-
-
-def test_slip_names_no_setting_twice():
-    options = 'noslip_iterations="20" tolerance="1e-12" iterations="10" impratio="2"'
-    model = block(0.2, option=options)
-    settings = [r.setting for r in explain_slip_of_states(model, steps=5).worst.remedies]
-    assert len(settings) == len(set(settings)) >= 4
-
-
-def test_slip_explanation_prints_the_digits_of_the_command(tmp_path):
-    from lavender.report.render import format_cells
-
-    result = explain_slip_of_states(block(0.2), steps=20)
-    explanation = result.explanations[0]
-    assert format_cells(explanation.table).to_string(index=False) in str(explanation)
-    page = result.page.write(tmp_path / "slip")
-    assert "slip-over-time" in page.read_text(encoding="utf-8")
-    assert mujoco.__version__ in (tmp_path / "slip" / "numbers.json").read_text(encoding="utf-8")

@@ -2,7 +2,6 @@
 
 import importlib
 import json
-import os
 import re
 import signal
 import subprocess
@@ -17,10 +16,9 @@ from stacks import stack
 from worked import python
 
 import lavender as lv
-from lavender import cli, report
+from lavender import cli
 from lavender.cli import entry
 
-TOLD = {"capture_output": False, "stderr": subprocess.PIPE}  # where the output goes to a place of its own
 QUICK = ("--tolerances", "1e-3", "1e-6", "--budgets", "2", "4", "--repeats", "1", "--no-figures")
 
 
@@ -122,34 +120,6 @@ def test_solve_command_with_output_equal_to_the_problem_ends_with_2(lavender, pa
 # -- what nobody should ask for ---------------------------------------------------------------------------
 
 
-def test_read_records_with_an_endless_line_raises(tmp_path):
-    path = tmp_path / "records.jsonl"
-    with path.open("wb") as stream:
-        stream.truncate(2**27)
-    with pytest.raises(lv.InputError, match="has a line of more than"):
-        report.read(path)
-
-
-INTERRUPT = """
-import os, signal, sys
-class Finder:
-    def find_spec(self, name, path=None, target=None):
-        if name == os.environ["INTERRUPTED"]:
-            signal.raise_signal(signal.SIGINT)
-sys.meta_path.insert(0, Finder())
-"""
-
-
-@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="signals of POSIX")
-def test_ctrl_c_while_the_module_of_a_command_is_imported_ends_with_130(tmp_path):
-    """The signal comes where the import of a module begins, whatever the machine's speed."""
-    (tmp_path / "sitecustomize.py").write_text(INTERRUPT)  # which Python imports first
-    environment = {**os.environ, "PYTHONPATH": str(tmp_path), "INTERRUPTED": "lavender.cli.solvers"}
-    done = python("-m", "lavender", "solvers", env=environment, status=130)
-    assert "lavender: stopped" in done.stderr
-    assert "Traceback" not in done.stderr
-
-
 @pytest.mark.parametrize("command", ["audit", "tune"])
 def test_ctrl_c_in_a_command_ends_with_130(tmp_path, monkeypatch, capsys, command):
     pytest.importorskip("mujoco")
@@ -203,14 +173,6 @@ def test_command_with_an_unwritable_output_ends_with_2_before_work(lavender, mon
         assert (code, out) == (cli.EXIT_BAD_INPUT, "")
         assert re.search(r"^lavender: cannot (write|create) .*", err)
         assert str(tmp_path / place) in err
-
-
-@pytest.mark.parametrize("words", ["solvers", "explain toy_stack"])
-def test_command_with_a_closed_pipe_prints_no_error(words):
-    reader, writer = os.pipe()
-    os.close(reader)
-    assert python("-m", "lavender", *words.split(), status=1, stdout=writer, **TOLD).stderr == ""
-    os.close(writer)
 
 
 def test_check_judges_a_stored_answer_for_the_precision_it_was_made_in(lavender, tmp_path):
@@ -274,11 +236,6 @@ def test_solve_json_has_the_judged_result(lavender, path):
     assert code == 0 and result["status"] == "CONVERGED" and result["success"] is True
     assert (result["relative"], result["velocity"]) == (judged.relative, judged.velocity)
     assert result["rows"] == problem.m and result["worst_row"] == judged.worst_name
-
-
-def test_check_names_each_case_once(lavender):
-    code, printed, _ = lavender("check", "stack(n=4)", "toy_stack", "--solvers", "pgs")
-    assert code == 0 and printed.count("stack(n=4)") == 1 and printed.count("toy_stack") == 1
 
 
 def test_check_json_is_the_only_output(lavender, path):

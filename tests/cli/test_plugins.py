@@ -89,22 +89,3 @@ def test_report_with_a_plug_in_that_ends_the_process_keeps_its_rows_and_continue
     assert set(runs["solver"]) == {"direct", "pgs", "good"}
     for name in ("solver", "max_iter", "time", "solution_hash"):  # Nothing was measured again.
         assert runs.loc[runs["solver"] != "good", name].tolist() == kept[name].tolist()
-
-
-def test_report_with_workers_names_a_broken_plug_in_once(install, tmp_path):
-    words = (
-        "report",
-        "toy_stack",
-        "--solvers",
-        "pgs",
-        "jacobi",
-        "--workers",
-        "2",
-        "--tolerances",
-        "1e-3",
-        "--budgets",
-        "4",
-    )
-    environment = install("broken = no_such_module:SPEC")
-    done = python("-m", "lavender", *words, "--out", str(tmp_path / "o"), env=environment)
-    assert done.stderr.count("solver plug-in 'broken'") == 1

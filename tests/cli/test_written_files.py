@@ -4,8 +4,6 @@ import contextlib
 import errno
 import json
 import os
-import re
-import signal
 from ast import literal_eval
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,11 +17,8 @@ import lavender as lv
 from lavender import io, report
 from lavender.io.stored import write_text
 from lavender.report.store import Store, to_jsonable
-from lavender.report.text import make_file_name
 from lavender.sim.engine import run
 from lavender.sim.engine.picture import Film
-
-TEMPORARY_NAME = re.compile(r"\..*\.\d+\.\d+\.part(\.\w+)?")  # Names of files that are not complete yet.
 
 resource = pytest.importorskip("resource", reason="limits of files are of POSIX")
 needs_hdf5 = pytest.mark.skipif(find_spec("h5py") is None, reason="FCLIB's files need h5py (extra: fclib)")
@@ -113,17 +108,6 @@ def test_write_on_a_full_disk_keeps_the_old_file(is_renamed, suffix, call, resul
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
-@needs_hdf5
-@pytest.mark.parametrize("size", [4096, 24576])
-def test_a_full_disk_while_fclib_writes_is_an_error(tmp_path, size):
-    """HDF5 itself ends the process by a signal if a write fails that is not its first."""
-    path = tmp_path / "p.hdf5"
-    a = np.random.default_rng(0).normal(size=(60, 60))
-    with file_size_limit(size), pytest.raises(lv.InputError, match="cannot write"):
-        lv.Problem.contact(a @ a.T, np.ones(60), np.full(20, 0.5)).save(path)
-    assert not os.listdir(tmp_path)
-
-
 def test_store_on_a_full_disk_raises_and_keeps_the_earlier_rows(tmp_path):
     path = tmp_path / "records.jsonl"
     row = {"kind": "skip", "run": "run", "case": "case", "solver": "pgs", "reason": "reason"}
@@ -133,31 +117,6 @@ def test_store_on_a_full_disk_raises_and_keeps_the_earlier_rows(tmp_path):
         with file_size_limit(size), pytest.raises(lv.InputError, match=r"cannot write .* free disk space"):
             store.add(row)
     assert len(report.read(path)) >= 1  # The second line may be flushed when the file is closed.
-
-
-WRITE_AND_DIE = """if True:
-    import os, signal, sys
-    from pathlib import Path
-    from lavender.io.stored import write_atomically
-    from lavender.sim.web import compile
-
-    def write(part):
-        Path(part).write_bytes(b"half")
-        os.kill(os.getpid(), signal.SIGKILL)
-
-    if sys.argv[1] == "module":
-        Path.replace = lambda part, target: os.kill(os.getpid(), signal.SIGKILL)
-        compile.write_atomically(Path("a.txt"), b"half")
-    write_atomically("a.txt", write)"""
-
-
-@pytest.mark.parametrize("kind", ["file", "module"])
-def test_killed_writer_leaves_the_old_file_and_a_temporary_one(kind, tmp_path):
-    (tmp_path / "a.txt").write_bytes(BEFORE)
-    python("-c", WRITE_AND_DIE, kind, cwd=tmp_path, status=-signal.SIGKILL)
-    assert (tmp_path / "a.txt").read_bytes() == BEFORE
-    (part,) = (p for p in tmp_path.iterdir() if p.name != "a.txt")
-    assert TEMPORARY_NAME.fullmatch(part.name)
 
 
 def test_folder_of_steps_is_continued_by_its_recording_alone(tmp_path):
@@ -226,10 +185,3 @@ def test_a_record_of_an_undescribed_case_is_rejected(tmp_path):
     (tmp_path / "records.jsonl").write_text("\n".join(lines) + "\n")
     with pytest.raises(lv.InputError, match="a record belongs to a case that no line describes"):
         report.read(tmp_path)
-
-
-def test_file_names_of_long_names_differ():
-    names = ["n" * 300 + str(i) for i in range(3)]
-    assert len({make_file_name(name) for name in names}) == 3
-    items = report.resolve_sources([stack(name=n) for n in [*names, names[0], "x", "x", "x #2"]])
-    assert len({make_file_name(item.name).lower() for item in items}) == len(items)

@@ -1,7 +1,5 @@
 """Short texts, tables and figures of results in a notebook, and completion of names in namespaces."""
 
-import importlib
-
 import numpy as np
 import pytest
 
@@ -26,12 +24,6 @@ def test_plot_of_a_solution_shows_worst_rows_and_history(solution):
     np.testing.assert_array_equal(history.lines[0].get_ydata(), solution.history.relative)
     with pytest.raises(lv.InputError, match="rows is 0"):
         solution.plot(rows=0)
-
-
-@pytest.mark.parametrize("name", ["io", "suite", "report", "contract", "export", "engine", "scene"])
-def test_completion_of_a_namespace_shows_public_names_only(name):
-    module = importlib.import_module(getattr(lv, name).__name__)
-    assert dir(module) == sorted(module.__all__)
 
 
 def test_repr_of_results_has_one_line_with_their_numbers(problem, solution, tmp_path):

@@ -161,11 +161,3 @@ def test_from_drake_of_unsupported_input_raises():
         lv.io.from_drake(3, context)
     with pytest.raises(lv.InputError, match="correction"):
         lv.io.from_drake(plant, context, correction=2.0)
-
-
-def test_from_drake_of_inconsistent_velocities_raises(monkeypatch):
-    _, _, plant, context = robot()
-    honest = drake.compute_free_motion
-    monkeypatch.setattr(drake, "compute_free_motion", lambda *a: (honest(*a)[0], honest(*a)[1] + 1e-3))
-    with pytest.raises(lv.CapabilityError, match=r"J\^T times the impulses differ"):
-        lv.io.from_drake(plant, context)

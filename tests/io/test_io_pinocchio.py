@@ -182,30 +182,6 @@ def test_from_pinocchio_desired_velocity_is_the_target(kind):
     np.testing.assert_allclose(problem_of(model, [one], q, v).b - without, added)
 
 
-@pytest.mark.parametrize("where", ["joint", "constraint"])
-@pytest.mark.parametrize("rotation", [2.0 * np.eye(3), np.diag([1.0, 1.0, -1.0]), np.full((3, 3), np.nan)])
-def test_from_pinocchio_with_a_placement_that_is_not_a_rotation_raises(where, rotation):
-    model, _, q, v = robot()
-    placement = pin.SE3(rotation, np.zeros(3))
-    if where == "joint":
-        model.jointPlacements[2] = placement
-        models = []
-    else:
-        models = [pin.PointContactConstraintModel(model, 0, pin.SE3.Identity(), 1, placement)]
-    with pytest.raises(lv.InputError, match="rotation"):
-        problem_of(model, models, q, v)
-
-
-def test_from_pinocchio_of_an_empty_model_or_joints_out_of_order_is_read():
-    assert problem_of(pin.Model(), [], np.zeros(0), np.zeros(0)).m == 0
-    model = pin.Model()
-    for i, parent in enumerate([0, 0, 1]):  # the child of the first comes after the second
-        joint = model.addJoint(parent, pin.JointModelRX(), pin.SE3.Identity(), f"joint {i}")
-        model.appendBodyToJoint(joint, pin.Inertia.Random(), pin.SE3.Identity())
-    with pytest.raises(lv.InputError, match="follow one another"):
-        problem_of(model, [], np.zeros(3), np.zeros(3))
-
-
 # -- data that were changed -----------------------------------------------------------------------------
 
 

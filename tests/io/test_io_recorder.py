@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import lavender as lv
-from lavender.io import recorder as module
 from lavender.report.tables import read_engine_answers
 
 CONES = lv.Cones.contacts(0.5, tangents=1)
@@ -88,63 +87,6 @@ def test_recorder_accepts_single_problems_and_pairs(tmp_path):
     assert lv.io.read_recorded_state(tmp_path / "a", recorder.files[0])["time"] == 0.5
     with pytest.raises(lv.InputError, match="recorded without state"):
         lv.io.read_recorded_state(tmp_path / "a", recorder.files[1])
-
-
-@pytest.mark.parametrize("name", ["file", "args", "allow_pickle", "a.b", "zipf"])
-def test_recorder_with_a_state_of_any_name_can_be_read(tmp_path, name):
-    with lv.io.Recorder(tmp_path, every=1) as recorder:
-        recorder.add(step_of([0.1, 0.2]), state={name: np.array([[1.0], [2.0]]), "label": np.array(["a", "b"])})
-    state = lv.io.read_recorded_state(tmp_path, recorder.files[1])
-    assert state[name].tolist() == [2.0] and state["label"] == "b"
-
-
-@pytest.mark.parametrize(
-    ("state", "words"),
-    [
-        ({"q": np.array([None, [1.0, 2.0]], object)}, "state 'q' holds objects"),
-        ({"q": np.array([(1.0, None)] * 2, [("a", float), ("b", object)])}, "state 'q' holds objects"),
-        ({"q": np.zeros(2), "../q": np.zeros(2)}, "a dict of arrays"),
-        ({3: np.zeros(2)}, "a dict of arrays"),
-        ([np.zeros(2)], "a dict of arrays"),
-    ],
-)
-def test_recorder_with_a_state_that_no_reader_could_load_writes_nothing(tmp_path, state, words):
-    with lv.io.Recorder(tmp_path, every=1) as recorder:
-        with pytest.raises(lv.InputError, match=words):
-            recorder.add(step_of([0.1, 0.2]), state=state)
-        assert not list(tmp_path.rglob("*.npz")) and recorder.files == ()
-        recorder.add(step_of([0.1, 0.2]))
-        assert [line["step"] for line in lines_of(tmp_path)] == [0, 0]
-
-
-def test_recorder_that_is_closed_rejects_steps(tmp_path):
-    recorder = lv.io.Recorder(tmp_path / "a", every=1)
-    recorder.add(step_of([0.1]))
-    recorder.close()
-    with pytest.raises(lv.InputError, match=r"a is closed: call add before close"):
-        recorder.add(step_of([0.1]))
-    assert len(lines_of(tmp_path / "a")) == len(list((tmp_path / "a").glob("*.npz"))) == 1
-
-
-def test_recorder_that_is_killed_leaves_no_line_without_a_file(tmp_path, monkeypatch):
-    write = module.write_text
-
-    class Killed(BaseException):
-        pass
-
-    def kill(path, text):
-        write(path, text)
-        raise Killed
-
-    with lv.io.Recorder(tmp_path, keep_worst=1) as recorder:
-        recorder.add(step_of([0.1]))
-        monkeypatch.setattr(module, "write_text", kill)
-        with pytest.raises(Killed):
-            recorder.add(step_of([0.3]))
-        assert all((tmp_path / line["file"]).is_file() for line in lines_of(tmp_path))
-        monkeypatch.setattr(module, "write_text", write)
-        recorder.add(step_of([0.2]))
-    assert [path.name for path in tmp_path.glob("*.npz")] == list(recorder.files)
 
 
 def test_recorder_writes_json_without_nan(tmp_path):

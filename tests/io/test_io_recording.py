@@ -8,7 +8,7 @@ import pytest
 from mujoco_scene import mj, scene, state
 
 import lavender as lv
-from lavender.io import recorder, recording
+from lavender.io import recording
 from lavender.io.start_states import StartStates
 
 PGS = 1e-6  # as in test_io_mujoco.py
@@ -56,19 +56,6 @@ def test_record_ctrl_c_keeps_the_steps_until_then(tmp_path):
     assert found.is_interrupted and [line["file"] for line in lines] == list(found.files)
     assert sorted(path.name for path in tmp_path.glob("*.npz")) == list(found.files) and len(lines) == 5
     assert len(lv.report.resolve_sources(tmp_path)) == 5
-
-
-def test_record_ctrl_c_while_a_file_is_written_leaves_no_file_without_a_line(tmp_path, monkeypatch):
-    write = recorder.write_npz
-
-    def interrupt(problem, path, impulse):
-        write(problem, path, impulse=impulse)
-        if path.name == "step_03.npz":
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(recorder, "write_npz", interrupt)
-    assert lv.io.record(*state(steps=1), tmp_path, 20).files == ("step_01.npz", "step_02.npz")
-    assert len(list(tmp_path.glob("*.npz"))) == 2
 
 
 def test_record_from_different_states_makes_independent_steps(tmp_path):
@@ -137,17 +124,6 @@ def test_record_with_noslip_separates_its_iterations(tmp_path):
     assert np.sum(data.solver_niter) == lines[1]["iterations"] + lines[1]["noslip_iterations"]
     assert lines[0]["iterations"] == lines[1]["iterations"] > 0
     assert (lines[0]["noslip_iterations"], lines[1]["noslip_iterations"]) == (0, 10)
-
-
-@pytest.mark.parametrize("name", ["mj_step", "mj_forward"])
-def test_record_of_a_model_that_ends_mujoco_in_an_error_raises_its_words(tmp_path, monkeypatch, name):
-    def ends(*_):
-        raise mj.FatalError("not supported")
-
-    model, data = state(steps=1)
-    monkeypatch.setattr(mj, name, ends)
-    with pytest.raises(lv.InputError, match="step 1: MuJoCo raised an error, not supported"):
-        lv.io.record(model, data, tmp_path / "steps", 4)
 
 
 def test_record_with_controls_plays_draws_or_calls_them(tmp_path):

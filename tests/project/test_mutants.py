@@ -1,6 +1,5 @@
 """`.ci/mutants`: every fault of tests/mutants applies to the present sources and states its effect in a sentence."""
 
-import ast
 import importlib.machinery
 import importlib.util
 import sys
@@ -20,7 +19,6 @@ def load_command():
 
 
 mutants = load_command()
-from fault_draw import OPERATORS, list_places  # noqa: E402 (found by the line above)
 
 FAULTS = mutants.list_faults([])
 
@@ -51,29 +49,6 @@ def test_recorded_results_are_of_faults_and_name_a_test_file_that_exists():
     assert results.keys() <= {fault.name for fault in FAULTS}
     files = {test.split("::")[0] for test in results.values() if test.startswith("tests/")}
     assert [name for name in sorted(files) if not (ROOT / name).is_file()] == []
-
-
-def test_record_result_replaces_the_line_of_its_fault_and_drops_faults_that_were_deleted(tmp_path, monkeypatch):
-    for name in ("a", "b", "c"):
-        (tmp_path / f"{name}.patch").touch()
-    monkeypatch.setattr(mutants, "FAULTS", tmp_path)
-    monkeypatch.setattr(mutants, "RESULTS", tmp_path / "results.txt")
-    mutants.RESULTS.write_text("b: survives\nc: tests/x.py::test[1: 2]\nz: survives\n")
-    mutants.record_result("b", "tests/y.py::test")
-    mutants.record_result("a", "")
-    assert mutants.read_results() == {"a": "survives", "b": "tests/y.py::test", "c": "tests/x.py::test[1: 2]"}
-
-
-def test_apply_fault_finds_indented_lines_after_its_anchor_and_rejects_repeated_ones():
-    fault = mutants.Fault("name", "A sentence.", "path", "def second", [" a = 1", "-b = a", "+b = -a", "+c = b"])
-    text = (
-        "def first():\n    a = 1\n    b = a\n\ndef second():\n    if x:\n        a = 1\n        b = a\n    return b\n"
-    )
-    expected = text.replace("        b = a\n", "        b = -a\n        c = b\n")
-    assert mutants.apply_fault(fault, text) == expected
-    for changed in (text.replace("b = a\n", "b = 2 * a\n"), text + "a = 1\nb = a\n"):
-        with pytest.raises(ValueError, match=r"does not apply: its lines occur [02] times"):
-            mutants.apply_fault(fault, changed)
 
 
 KERNEL = """from libc.math cimport fabs
@@ -117,55 +92,3 @@ def test_nearly_all_faults_of_kernels_can_be_switched():
     kernels = [fault for fault in FAULTS if fault.is_kernel]
     single = [f.name for f in kernels if mutants.switch_fault(f, (ROOT / f.path).read_text(), 1) is None]
     assert len(single) <= 5, single
-
-
-def test_drawn_faults_are_those_of_their_seed_and_each_applies_and_changes_one_line():
-    files = [*(ROOT / "lavender" / "solving").glob("*.py"), *(ROOT / "lavender_ext" / "newton").glob("*.pxd")]
-    lines = {path.relative_to(ROOT).as_posix(): set(range(100, 400)) for path in files}
-    drawn = [mutants.Fault(*own[:3], "", own[3]) for own in mutants.draw_faults(ROOT, 64, 5, lines)]
-    assert drawn == [mutants.Fault(*own[:3], "", own[3]) for own in mutants.draw_faults(ROOT, 64, 5, lines)]
-    assert {fault.path for fault in drawn} <= lines.keys()
-    assert all(100 < int(fault.sentence.split()[-3]) <= 400 for fault in drawn)
-    assert len({(fault.path, *fault.lines) for fault in drawn}) == len(drawn) == 64
-    assert sum(fault.is_kernel for fault in drawn) == 32
-    assert len({fault.sentence.split(",")[0] for fault in drawn}) == len(OPERATORS)
-    for fault in drawn:
-        text = (ROOT / fault.path).read_text()
-        changed = mutants.apply_fault(fault, text)
-        differ = [a for a, b in zip(text.splitlines(), changed.splitlines(), strict=True) if a != b]
-        assert len(differ) == 1
-        assert not differ[0].strip().startswith(("def ", "import ", "from ", "#"))
-
-
-@pytest.mark.parametrize(
-    ("operator", "line", "expected"),
-    [
-        ("sign", "    x = a - b", "    x = a + b"),
-        ("sign", "    x = f(-y)", "    x = f(y)"),
-        ("bound", "    return x < 1", "    return x <= 1"),
-        ("row", "    y = x[3 * i + 2]", "    y = x[3 * i]"),
-        ("row", "    y = x[0]", "    y = x[1]"),
-        ("other of a pair", "    r = arm_a", "    r = arm_b"),
-        ("dropped branch", "    if x and y:", "    if False:"),
-        ("stale state", "    s.at[k] = 2.0", "    pass"),
-        ("ignored argument", "    f(x, tol=tol)", "    f(x)"),
-        ("ignored argument", "    if g(x, deadline):", "    if g(x, NULL):"),
-    ],
-)
-def test_operator_changes_code_but_no_text_comment_or_declaration(operator, line, expected):
-    lines = [line, f'    y = "{line.strip()}"', f"    # {line.strip()}", f"def f(x={line.strip()!r}):"]
-    [place] = list_places("x.py", "\n".join(lines))[operator]
-    assert (place.line, f"{line[: place.begin]}{place.text}{line[place.end :]}") == (0, expected)
-
-
-def test_marks_enter_every_function_of_a_module():
-    text = (ROOT / "lavender" / "solving" / "limits.py").read_text()
-    functions = [x for x in ast.walk(ast.parse(text)) if isinstance(x, ast.FunctionDef)]
-    marked = [
-        x
-        for x in ast.walk(ast.parse(mutants.fault_reach.insert_marks(text, 7, is_kernel=False)))
-        if isinstance(x, ast.FunctionDef) and any("mark(7)" in ast.unparse(y) for y in x.body[:2])
-    ]
-    assert len(marked) == len(functions) > 1
-    lines = mutants.fault_reach.insert_marks(KERNEL, 2, is_kernel=True).splitlines()
-    assert lines[lines.index("    mark(2)") - 1].startswith("cdef inline double f(")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from extreme_problems import SPECIAL
 from hypothesis import given, reject
-from worked import after, python
+from worked import after
 
 import lavender as lv
 from lavender.sim.engine import check
@@ -408,37 +408,4 @@ def test_ctrl_c_in_any_substep_restores_the_state_before_the_step(caller, at):
 
 # -- counts that overflow ------------------------------------------------------------------------------
 
-COINCIDENT = """
-import resource, sys
-import lavender as lv
-resource.setrlimit(resource.RLIMIT_AS, (3 * 2**30, 3 * 2**30))
-for n in (60, 65_537):
-    scene = lv.Scene(substeps=1)
-    scene.add_sphere(0.5, position=(0, 0, 1))
-    scene.bodies = scene.bodies * n
-    sim = lv.Simulation(scene)
-    try:
-        contacts = len(sim.step()[0]["contacts"]["depth"])
-    except lv.InputError as error:
-        assert "move" in str(error) and str(n) in str(error), error
-        assert sim.steps == 0 and n > 60
-    else:
-        assert contacts == n * (n - 1) // 2 and n == 60, contacts
-"""
-
-
-@pytest.mark.slow
-def test_scene_of_coincident_spheres_steps_or_raises():
-    # 65,537 spheres are 2^31 + 32,768 pairs, a negative number in 32 bits.
-    pytest.importorskip("resource")
-    python("-X", "faulthandler", "-c", COINCIDENT)
-
-
 # -- numbers at the edge of float64 --------------------------------------------------------------------
-
-
-def test_scene_with_buffers_beyond_memory_raises():
-    sim = lv.Simulation(lv.Scene("stack", n=2))
-    sim.state.head[HEAD["need_contacts"]] = 2**28
-    with pytest.raises(lv.InputError, match="GiB"):
-        sim.state.with_larger_buffers()

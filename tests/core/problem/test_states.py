@@ -1,11 +1,7 @@
 """States of blocks and their margins, from impulse and slack."""
 
-import copy
-import pickle
-
 import numpy as np
 import pytest
-import scipy.sparse as sp
 from gradient_problems import KINDS, combinations, drawn
 
 import lavender as lv
@@ -62,14 +58,6 @@ def test_states_of_equal_bounds_have_no_margin():
 def test_states_of_wild_impulses_are_defined(bad):
     problem = lv.Problem.lcp(np.diag(np.full(5, 2.0)) + 0.1, np.ones(5))
     assert len(compute_states(problem, np.full(5, bad)).names) == 5
-
-
-def test_states_are_copied_and_pickled():
-    problem = lv.Problem.lcp(sp.csr_array(np.eye(2)), [1.0, 0.0])
-    states = lv.solve(problem, tol=1e-12).states
-    for other in (copy.deepcopy(states), pickle.loads(pickle.dumps(states))):
-        assert list(other) == list(states)
-    assert len(lv.solve(lv.Problem.linear(np.zeros((0, 0)), [])).states) == 0
 
 
 @pytest.mark.parametrize("block", [3, 4, -4])

@@ -1,8 +1,6 @@
 """The registry: what a spec refuses to be, names and their nearest, plug-ins that fail, capabilities as data."""
 
-import copy
 import dataclasses
-import pickle
 
 import numpy as np
 import pytest
@@ -19,15 +17,6 @@ def named(name, **more):
 
 
 # -- specs ------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("again", [copy.copy, copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
-def test_specs_are_copied_and_pickled(again):
-    for spec in registry.specs().values():
-        twin = again(spec)
-        # Factories of backends are partial functions, which equal nothing but themselves.
-        assert {**vars(twin), "factory": None} == {**vars(spec), "factory": None}
-    assert again(named("another", options={"x": "a number"})).options == {"x": "a number"}
 
 
 def test_solver_with_a_missing_factory_raises_an_error_that_names_it(register, tmp_path, monkeypatch):

@@ -101,6 +101,13 @@ package._TABLE = (*package._TABLE, "toy")
 import lavender as lv
 """
 USES = {
+    "imports": """
+import importlib, pkgutil
+
+for module in pkgutil.walk_packages(lv.__path__, "lavender."):
+    if not module.name.endswith("__main__") and module.name not in ("lavender.torch", "lavender.jax"):
+        importlib.import_module(module.name)
+""",
     "available": """
 assert lv.available(external=False)[-1] == "toy" and lv.get("toy").builtin and not lv.get("toy").distribution
 """,

@@ -10,11 +10,10 @@ from pathlib import Path
 import pytest
 
 import lavender as lv
-from lavender.base.errors import InputError, LavenderError
 from lavender.sim.scene import SCENES
 from lavender.sim.web import compile as wasm
 from lavender.sim.web import pages
-from lavender.sim.web.scenes import PRESETS_PATH, collect_page_data, describe_snapshot, write_scene
+from lavender.sim.web.scenes import PRESETS_PATH, collect_page_data, describe_snapshot
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[2]
@@ -111,20 +110,6 @@ def test_wasm_module_has_the_documented_size_and_can_grow(name, request):
     assert size < 0.95 * wasm.MAX_MODULE_BYTES
 
 
-def test_wasm_module_missing_or_stale_without_compiler_raises_the_remedy(tmp_path, monkeypatch):
-    monkeypatch.setattr(wasm, "explain_missing_requirement", lambda: "no compiler")
-    monkeypatch.setattr(pages, "SHIPPED", tmp_path)
-    with pytest.raises(LavenderError, match="lavender is not in this installation and cannot be built: no compiler"):
-        pages.get_or_build_module()
-    other = b"\0asm\1\0\0\0" + wasm.make_custom_section(wasm.SOURCES_SECTION, b"0" * 64)
-    (tmp_path / "lavender.wasm").write_bytes(other)
-    with pytest.raises(LavenderError, match="is of other kernels"):
-        pages.get_or_build_module()
-    fresh = b"\0asm\1\0\0\0" + wasm.make_custom_section(wasm.SOURCES_SECTION, wasm.hash_sources(ROOT).encode())
-    (tmp_path / "lavender.wasm").write_bytes(fresh)
-    assert pages.get_or_build_module() == fresh
-
-
 # -- Node ------------------------------------------------------------------------------------------------------
 
 
@@ -187,14 +172,3 @@ def test_presets_of_the_page_have_the_results_of_the_documentation(tmp_path):
     )
     cold_warm = results["experiment=5"]["numbers"][0]
     assert alternating["steps 21–90"] == f"{cold_warm['b'] / cold_warm['a']:.0f}"
-
-
-def test_wasm_build_without_a_compiler_names_it(tmp_path, monkeypatch):
-    monkeypatch.setenv("LAVENDER_WASM_CC", "no-such-compiler --target=wasm32-wasi")
-    with pytest.raises(LavenderError, match="names 'no-such-compiler', which does not exist"):
-        pages.build_module(tmp_path / "a.wasm")
-
-
-def test_write_scene_with_another_solver_is_refused_with_the_remedy(tmp_path):
-    with pytest.raises(InputError, match="select newton in the page"):
-        write_scene(lv.Scene("stack", solver="newton"), tmp_path / "scene.json")
