@@ -58,27 +58,15 @@ ERROR_DEFINITION = (
 
 @dataclass(frozen=True)
 class ResultPage:
-    """Page of a result with its files.
+    """Page of a result with its files."""
 
-    Parameters
-    ----------
-    make_page : callable (folder of the figures or None) -> Page
-        Without a folder, no figure is drawn.
-    numbers : dict
-        Contents of `numbers.json`.
-    tables : list of DataFrame
-        Tables of a terminal.
-    is_stopped : bool
-        Whether the measurement ended early, so that all numbers describe only its completed part.
-    provenance : str
-        Last line: versions, settings, model, date and command.
-    """
-
+    # callable (folder of the figures or None) -> Page: without a folder, no figure is drawn.
     make_page: Callable[[Path | None], Page]
-    numbers: dict[str, Any]
-    tables: Sequence[pd.DataFrame] = ()
+    numbers: dict[str, Any]  # Contents of `numbers.json`.
+    tables: Sequence[pd.DataFrame] = ()  # Tables of a terminal.
+    # Whether the measurement ended early, so that all numbers describe only its completed part.
     is_stopped: bool = False
-    provenance: str = ""
+    provenance: str = ""  # Last line: versions, settings, model, date and command.
 
     def write(self, folder: str | os.PathLike[str]) -> Path:
         """Write `index.html`, `numbers.json` and `figures/*`; return the path of the page."""
@@ -429,18 +417,12 @@ MIN_CONTACT_SHARE = 0.2
 
 @dataclass(frozen=True, eq=False)
 class StepSizes:
-    """Rows and contacts of each judged step.
+    """Rows and contacts of each judged step."""
 
-    Parameters
-    ----------
-    rows, contacts : (steps,) int
-        Contacts that have rows.
-    can_touch : bool
-        Whether the model has geoms that can collide. If not, the fraction of steps with rows decides.
-    """
-
+    # (steps,) int: contacts that have rows.
     rows: np.ndarray
     contacts: np.ndarray
+    # Whether the model has geoms that can collide. If not, the fraction of steps with rows decides.
     can_touch: bool
 
     @property

@@ -26,42 +26,24 @@ CONTACT_NUMBER = re.compile(r"^(contact|limit) \d+\b ?")
 
 
 class Judging(NamedTuple):
-    """How steps are judged and which are kept.
+    """How steps are judged and which are kept."""
 
-    Parameters
-    ----------
-    precision : {"float64", "float32"}
-    threshold : float, m/s
-    keep : int or None
-        Number of worst steps to keep; None: the worst step of each of `N_WORST_WORLDS` worlds.
-    contact_share : float
-        Up to this fraction of the steps have contact and their state before the step kept.
-    """
-
-    precision: str
-    threshold: float
+    precision: str  # {"float64", "float32"}
+    threshold: float  # [m/s]
+    # Number of worst steps to keep; None: the worst step of each of `N_WORST_WORLDS` worlds.
     keep: int | None = None
+    # Up to this fraction of the steps have contact and their state before the step kept.
     contact_share: float = 0.0
 
 
 class LostDigits(NamedTuple):
-    """Steps with forces that have lost digits, because R is far below the diagonal of J M^-1 J^T.
-
-    Parameters
-    ----------
-    steps : int
-    digits : float
-        Largest number of digits.
-    moved_by_forces : int
-        Steps with an acceleration that is exact to `acceleration_error`, which the integrator moves by the forces.
-    acceleration_error : float, m/s
-        Largest velocity error of the accelerations of these steps.
-    """
+    """Steps with forces that have lost digits, because R is far below the diagonal of J M^-1 J^T."""
 
     steps: int = 0
-    digits: float = 0.0
+    digits: float = 0.0  # Largest number of digits.
+    # Steps with an acceleration that is exact to `acceleration_error`, which the integrator moves by the forces.
     moved_by_forces: int = 0
-    acceleration_error: float = 0.0
+    acceleration_error: float = 0.0  # [m/s] Largest velocity error of the accelerations of these steps.
 
     def merge(self, other: LostDigits) -> LostDigits:
         """Return the union of two sets of steps."""
@@ -70,24 +52,12 @@ class LostDigits(NamedTuple):
 
 
 class Prediction(NamedTuple):
-    """Comparison of velocities after steps with those that the judged answers predict.
+    """Comparison of velocities after steps with those that the judged answers predict."""
 
-    Parameters
-    ----------
-    steps : int
-        Steps that were compared.
-    different : int
-        Steps with a difference above `PREDICTION_TOLERANCE`.
-    largest : float, m/s or rad/s
-        Largest difference of these steps.
-    first : (world, step), optional
-        The first of these steps.
-    """
-
-    steps: int = 0
-    different: int = 0
-    largest: float = 0.0
-    first: tuple[int, int] | None = None
+    steps: int = 0  # Steps that were compared.
+    different: int = 0  # Steps with a difference above `PREDICTION_TOLERANCE`.
+    largest: float = 0.0  # [m/s or rad/s] Largest difference of these steps.
+    first: tuple[int, int] | None = None  # (world, step): the first of these steps.
 
     @classmethod
     def of_steps(cls, predicted: FloatArray, after: FloatArray, world: Any, step: Any) -> Prediction:
@@ -116,76 +86,40 @@ class StepState(NamedTuple):
 
 @dataclass(frozen=True)
 class Worst:
-    """The worst step of a world.
+    """The worst step of a world."""
 
-    Parameters
-    ----------
-    velocity : float, m/s
-        Largest velocity error of a row.
-    world, step : int
-    where : str
-        Name of the row with this error.
-    problem : Problem
-    impulse : (m,) N s
-        The engine's answer.
-    state : dict
-        State before the step, by the engine's names.
-    """
-
-    velocity: float
+    velocity: float  # [m/s] Largest velocity error of a row.
     world: int
     step: int
-    where: str
+    where: str  # Name of the row with this error.
     problem: Problem = field(repr=False)
-    impulse: FloatArray = field(repr=False)
-    state: dict[str, FloatArray] = field(repr=False)
+    impulse: FloatArray = field(repr=False)  # (m,) N s: the engine's answer.
+    state: dict[str, FloatArray] = field(repr=False)  # State before the step, by the engine's names.
 
 
 class Piece(NamedTuple):
-    """Results of k judged steps.
+    """Results of k judged steps."""
 
-    Parameters
-    ----------
-    world, step : (k,) int
-        World and number of each step.
-    numbers : (len(WORST_ROW_ERRORS), k)
-        Errors of the worst row of each step, one row for each name in `WORST_ROW_ERRORS`.
-    verdict : (k,) int
-        Indices in AUDIT_VERDICTS.
-    rows, contacts : (k,) int
-    where : list of (int, str)
-        Index of a step that stopped before convergence, and the name of its worst row.
-    worst : list of Worst
-    converged : (k,) bool, optional
-        The engine's claims.
-    divergences : sequence of Divergence
-    engine_warnings : dict
-        MuJoCo's own warnings, and how often each occurred.
-    contact_states : sequence of StepState
-    n_dropped : int
-        Number of constraint rows for which the engine had no memory.
-    lost_digits : LostDigits
-    prediction : Prediction
-    against : Piece, optional
-        Results of the other model on the same states.
-    """
-
+    # (k,) int: world and number of each step.
     world: Any
     step: Any
+    # (len(WORST_ROW_ERRORS), k): errors of the worst row of each step, one row for each name in `WORST_ROW_ERRORS`.
     numbers: FloatArray
-    verdict: Any
-    rows: Any
-    contacts: Any
+    verdict: Any  # (k,) int: indices in AUDIT_VERDICTS.
+    rows: Any  # (k,) int
+    contacts: Any  # (k,) int
+    # list of (int, str): index of a step that stopped before convergence, and the name of its worst row.
     where: list[tuple[int, str]]
     worst: list[Worst]
-    converged: Any = None
+    converged: Any = None  # (k,) bool: the engine's claims.
     divergences: Sequence[Divergence] = ()
+    # MuJoCo's own warnings, and how often each occurred.
     engine_warnings: Mapping[str, int] = MappingProxyType({})
     contact_states: Sequence[StepState] = ()
-    n_dropped: int = 0
+    n_dropped: int = 0  # Number of constraint rows for which the engine had no memory.
     lost_digits: LostDigits = LostDigits()
     prediction: Prediction = Prediction()
-    against: Piece | None = None
+    against: Piece | None = None  # Results of the other model on the same states.
 
     @classmethod
     def of_lost_steps(cls, world: int, step: Any, divergence: Divergence) -> Piece:

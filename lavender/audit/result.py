@@ -153,7 +153,7 @@ class Audit:
             self.against.add_piece(piece.against, keep)
 
     def _make_space(self, piece: Piece) -> None:
-        """Enlarge the arrays for steps of a loop whose length and number of worlds were not known."""
+        """Enlarge the arrays for steps of a loop of unknown length and number of worlds."""
         size = self.verdict.shape
         worlds, steps = (max(n, int(np.max(x, initial=-1)) + 1) for n, x in zip(size, piece[:2], strict=True))
         if (worlds, steps) == size:

@@ -18,20 +18,11 @@ PROBLEM_OPTIONS = ("cone", "impratio", "noslip_iterations")  # Options that chan
 
 @dataclass(frozen=True)
 class MujocoSetting:
-    """Attributes of MuJoCo's `<option>` that differ from the model's.
+    """Attributes of MuJoCo's `<option>` that differ from the model's."""
 
-    Parameters
-    ----------
-    options : tuple of (str, value)
-    is_default : bool
-        Whether these are MuJoCo's default options.
-    iterations : int
-        Iteration limit, also if it is the model's own.
-    """
-
-    options: tuple[tuple[str, Any], ...] = ()
-    is_default: bool = field(default=False, compare=False)
-    iterations: int = field(default=0, compare=False)
+    options: tuple[tuple[str, Any], ...] = ()  # tuple of (str, value)
+    is_default: bool = field(default=False, compare=False)  # Whether these are MuJoCo's default options.
+    iterations: int = field(default=0, compare=False)  # Iteration limit, also if it is the model's own.
 
     @classmethod
     def from_options(cls, mj: Any, model: Any, **options: Any) -> MujocoSetting:

@@ -68,38 +68,22 @@ N_TRIAL_WORLDS = 3
 
 @dataclass(frozen=True, eq=False)
 class Runs:
-    """Parameters of a simulation of several worlds.
+    """Parameters of a simulation of several worlds."""
 
-    Parameters
-    ----------
-    name : str
-        Name of the model in sentences and tables.
-    model : mujoco.MjModel or None
-        Without sleep; None for scenes of other engines.
-    worlds, steps : int
-    control : "random", "zero", "hold", array (any, nu) or callable
-        See `lavender.io.record`; every world applies an array step by step.
-    seed : int
-    spread : float, m/s, rad/s
-        Standard deviation of the noise that is added to the velocities at the start.
-    starts : StartStates, optional
-        States in which the worlds start; default: the model's own.
-    against : (str, mujoco.MjModel), optional
-        Name and model of the other model that solves the same steps.
-    notes : tuple of str
-        Sentences about the differences from a simulation of the model as it is.
-    """
-
-    name: str
-    model: Any
+    name: str  # Name of the model in sentences and tables.
+    model: Any  # mujoco.MjModel or None: without sleep; None for scenes of other engines.
     worlds: int
     steps: int
+    # "random", "zero", "hold", array (any, nu) or callable: see `lavender.io.record`; every world applies an array step
+    # by step.
     control: Control = "random"
     seed: int = 0
+    # [m/s, rad/s] Standard deviation of the noise that is added to the velocities at the start.
     spread: float = SPREADS[0]
-    starts: StartStates | None = None
+    starts: StartStates | None = None  # States in which the worlds start; default: the model's own.
+    # (str, mujoco.MjModel): name and model of the other model that solves the same steps.
     against: tuple[str, Any] | None = None
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # Sentences about the differences from a simulation of the model as it is.
 
     def __post_init__(self) -> None:
         for name in ("worlds", "steps"):
@@ -235,50 +219,26 @@ def can_any_geoms_collide(mj: Any, model: Any) -> bool:
 
 
 class Divergence(NamedTuple):
-    """The step in which a world diverged: MuJoCo resets the simulation, or raises an error.
-
-    Parameters
-    ----------
-    world, step : int
-    cause : str
-        The quantity that was not finite or above mjMAXVAL, or MuJoCo's error.
-    is_outside : bool
-        Whether the quantity is the state or the unconstrained acceleration, so that the constraint solve of this step
-        is not the cause.
-    """
+    """The step in which a world diverged: MuJoCo resets the simulation, or raises an error."""
 
     world: int
     step: int
-    cause: str
+    cause: str  # The quantity that was not finite or above mjMAXVAL, or MuJoCo's error.
+    # Whether the quantity is the state or the unconstrained acceleration, so that the constraint solve of this step is
+    # not the cause.
     is_outside: bool
 
 
 class Frame(NamedTuple):
-    """All worlds before one step: problems, the engine's answers, and the state to restart from.
-
-    Parameters
-    ----------
-    batch : Batch
-    impulse : array, N s
-    state : dict of (worlds, ...)
-        State before the step, by the names of MjData.
-    rows : (worlds,) int
-        Number of rows that are not padding.
-    contacts : (worlds,) int
-        Number of contacts with rows that are not padding.
-    converged : (worlds,) bool, optional
-        The engine's claims.
-    n_dropped : int
-        Number of rows for which the engine had no memory.
-    """
+    """All worlds before one step: problems, the engine's answers, and the state to restart from."""
 
     batch: Batch
-    impulse: FloatArray
-    state: dict[str, FloatArray]
-    rows: np.ndarray
-    contacts: np.ndarray
-    converged: np.ndarray | None = None
-    n_dropped: int = 0
+    impulse: FloatArray  # [N s]
+    state: dict[str, FloatArray]  # dict of (worlds, ...): state before the step, by the names of MjData.
+    rows: np.ndarray  # (worlds,) int: number of rows that are not padding.
+    contacts: np.ndarray  # (worlds,) int: number of contacts with rows that are not padding.
+    converged: np.ndarray | None = None  # (worlds,) bool: the engine's claims.
+    n_dropped: int = 0  # Number of rows for which the engine had no memory.
 
     @classmethod
     def of_step(cls, step: EngineStep) -> Frame:

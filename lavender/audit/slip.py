@@ -59,23 +59,14 @@ UNDEFINED_LAW = "Coulomb's law is not defined for its round cones"
 
 @dataclass(frozen=True, eq=False)
 class SlipVariant:
-    """Slip of the chosen contacts in one variant of the step.
+    """Slip of the chosen contacts in one variant of the step."""
 
-    Parameters
-    ----------
-    name : str
-        Key of `CAUSES`.
-    velocity : tuple of (tangents,) arrays, m/s
-        Tangential velocity of each contact after the step.
-    relative : float
-        Relative residual of the impulses in this variant's problem; at most 1e-9 for solutions that were found.
-    note : str
-        Reason why the variant equals the previous one, or why its solution is not accepted; "" otherwise.
-    """
-
-    name: str
+    name: str  # Key of `CAUSES`.
+    # [m/s] tuple of (tangents,) arrays: tangential velocity of each contact after the step.
     velocity: tuple[FloatArray, ...]
+    # Relative residual of the impulses in this variant's problem; at most 1e-9 for solutions that were found.
     relative: float
+    # Reason why the variant equals the previous one, or why its solution is not accepted; "" otherwise.
     note: str = ""
 
     @property
@@ -89,33 +80,20 @@ class Remedy:
     """Slip of the fastest contact with a setting of MuJoCo, simulated from several states.
 
     Steps in which the geoms do not touch have no slip and do not count.
-
-    Parameters
-    ----------
-    setting : str
-        Text for the model's file; the first remedy of an explanation is the model without a change.
-    slip : float, m/s
-        Mean speed of the contact's points in the explained step, simulated with the setting.
-    later : float, m/s
-        The same, as a mean of the steps with contact among the next `REMEDY_STEPS` steps of all states; nan if there is
-        none, or if a run diverges.
-    diverged_step : int
-        First step in which MuJoCo restarted one of the runs because it diverged; 0 is the explained step, -1 means that
-        no run diverged.
-    touching : float
-        Fraction of these steps with contact.
-    kept : int
-        Number of states in which the geoms touch in the last of these steps.
-    speeds : (1 + REMEDY_STEPS,) tuple, m/s
-        Mean speed in each step, from the explained one on; nan without contact.
     """
 
+    # Text for the model's file; the first remedy of an explanation is the model without a change.
     setting: str
-    slip: float
+    slip: float  # [m/s] Mean speed of the contact's points in the explained step, simulated with the setting.
+    # [m/s] The same, as a mean of the steps with contact among the next `REMEDY_STEPS` steps of all states; nan if
+    # there is none, or if a run diverges.
     later: float
+    # First step in which MuJoCo restarted one of the runs because it diverged; 0 is the explained step, -1 means that
+    # no run diverged.
     diverged_step: int = -1
-    touching: float = 0.0
-    kept: int = 0
+    touching: float = 0.0  # Fraction of these steps with contact.
+    kept: int = 0  # Number of states in which the geoms touch in the last of these steps.
+    # [m/s] (1 + REMEDY_STEPS,) tuple: mean speed in each step, from the explained one on; nan without contact.
     speeds: tuple[float, ...] = ()
 
     @classmethod

@@ -46,29 +46,17 @@ FRICTION_FACTOR = 2.0  # The friction coefficient is multiplied by this in one o
 
 @dataclass(frozen=True, eq=False)
 class SlipOfStates:
-    """Slip of contacts at several states of a model.
+    """Slip of contacts at several states of a model."""
 
-    Parameters
-    ----------
-    explanations : tuple of SlipExplanation
-        One for each state that has a contact with friction. The one with the fastest contact has `remedies`: settings
-        of MuJoCo, each simulated from up to 8 states, those in which this contact slides fastest.
-    n_states : int
-        Number of states.
-    diverged : tuple of int
-        Indices of the states that are left out, because MuJoCo restarts the simulation in a step up to the explained
-        one: its numbers are not finite, or above 1e10.
-    misfit : str
-        Sentence on states that do not fit the model; else empty.
-    provenance : dict
-        Result of `describe_provenance`.
-    """
-
+    # One for each state that has a contact with friction. The one with the fastest contact has `remedies`: settings of
+    # MuJoCo, each simulated from up to 8 states, those in which this contact slides fastest.
     explanations: tuple[SlipExplanation, ...]
-    n_states: int
+    n_states: int  # Number of states.
+    # Indices of the states that are left out, because MuJoCo restarts the simulation in a step up to the explained one:
+    # its numbers are not finite, or above 1e10.
     diverged: tuple[int, ...] = ()
-    misfit: str = ""
-    provenance: dict[str, Any] = field(default_factory=dict)
+    misfit: str = ""  # Sentence on states that do not fit the model; else empty.
+    provenance: dict[str, Any] = field(default_factory=dict)  # Result of `describe_provenance`.
 
     @property
     def worst(self) -> SlipExplanation:

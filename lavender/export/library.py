@@ -52,7 +52,7 @@ def write(out: Path, *, replace: bool = False) -> list[Path]:
     out : Path
         Folder, which is created if it does not exist. Files with other names in it are kept.
     replace : bool
-        Whether to replace existing files whose contents differ.
+        Whether to replace existing files with other contents.
 
     Returns
     -------

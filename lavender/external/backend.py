@@ -28,79 +28,42 @@ _HANDLER_LOCK = threading.Lock()
 
 @dataclass(frozen=True)
 class Backend:
-    """Requirements and capabilities of a backend.
-
-    Parameters
-    ----------
-    name : str
-    modules : tuple of str
-        Modules that can be imported if the backend is installed.
-    install : str
-        Packages that pip installs.
-    summary, reference : str
-    behaviour : namespace or None
-        Results of the backend alone on the programs of `backends.json`, found by `findings/probes/backend_probes.py`;
-        None if it was not run.
-    call : callable, optional
-        Function that calls the backend's own interface. Default: the backend is called through qpsolvers.
-    settings : mapping, optional
-        Options to pass through qpsolvers: name -> a field of `Limits` (a str), or a fixed value. None if the backend
-        runs at its own tolerance, or has a function `call`.
-    min_tolerance : float
-        Smallest tolerance that the backend accepts.
-    max_iter : int
-        Default limit of the iterations of a call.
-    first_tolerance : float
-        Tolerance of the first call, as a multiple of tol; above 1 if a Newton step is cheaper than the iterations.
-    row_iterations : float
-        Most iterations of the first call for each variable and row; daqp may cycle for all of `max_iter`.
-    interior : bool
-        Whether the backend is an interior-point method.
-    dense : bool
-        Whether the backend accepts dense matrices only.
-    prefers_dense : bool
-        Whether the backend gets dense matrices if they are small or full.
-    starts : bool
-        Whether a start point is passed to the backend.
-    stoppable : bool
-        Whether the backend accepts a time limit.
-    overruns : bool
-        Whether the backend reads its time limit rarely: 20 ms took daqp 2 s on 400 contacts.
-    finite : bool
-        Whether the backend rejects infinite bounds, or qpsolvers would pass them as rows with a right-hand side of inf
-        or 1e10. Finite bounds are then passed as rows.
-    noisy : bool
-        Whether the backend prints even if its output is disabled.
-    cones : bool
-        Whether the backend accepts second-order cones, and so the convex relaxation of friction.
-    interrupts : bool
-        Whether the backend replaces the handler of Ctrl-C while it solves.
-    jax : bool
-        Whether the backend runs in JAX, which computes in 32 bits unless its option jax_enable_x64 is set.
-    """
+    """Requirements and capabilities of a backend."""
 
     name: str
-    modules: tuple[str, ...]
-    install: str
+    modules: tuple[str, ...]  # Modules that can be imported if the backend is installed.
+    install: str  # Packages that pip installs.
     summary: str
     reference: str
+    # namespace or None: results of the backend alone on the programs of `backends.json`, found by
+    # `findings/probes/backend_probes.py`; None if it was not run.
     behaviour: Any = None
+    # Function that calls the backend's own interface. Default: the backend is called through qpsolvers.
     call: Call | None = None
+    # Options to pass through qpsolvers: name -> a field of `Limits` (a str), or a fixed value. None if the backend runs
+    # at its own tolerance, or has a function `call`.
     settings: Mapping[str, Any] | None = None
-    min_tolerance: float = 0.0
-    max_iter: int = 10_000
+    min_tolerance: float = 0.0  # Smallest tolerance that the backend accepts.
+    max_iter: int = 10_000  # Default limit of the iterations of a call.
+    # Tolerance of the first call, as a multiple of tol; above 1 if a Newton step is cheaper than the iterations.
     first_tolerance: float = FIRST_TOLERANCE
+    # Most iterations of the first call for each variable and row; daqp may cycle for all of `max_iter`.
     row_iterations: float = 1e9
-    interior: bool = False
-    dense: bool = False
-    prefers_dense: bool = False
-    starts: bool = False
-    stoppable: bool = False
+    interior: bool = False  # Whether the backend is an interior-point method.
+    dense: bool = False  # Whether the backend accepts dense matrices only.
+    prefers_dense: bool = False  # Whether the backend gets dense matrices if they are small or full.
+    starts: bool = False  # Whether a start point is passed to the backend.
+    stoppable: bool = False  # Whether the backend accepts a time limit.
+    # Whether the backend reads its time limit rarely: 20 ms took daqp 2 s on 400 contacts.
     overruns: bool = False
+    # Whether the backend rejects infinite bounds, or qpsolvers would pass them as rows with a right-hand side of inf or
+    # 1e10. Finite bounds are then passed as rows.
     finite: bool = False
-    noisy: bool = False
+    noisy: bool = False  # Whether the backend prints even if its output is disabled.
+    # Whether the backend accepts second-order cones, and so the convex relaxation of friction.
     cones: bool = False
-    interrupts: bool = False
+    interrupts: bool = False  # Whether the backend replaces the handler of Ctrl-C while it solves.
+    # Whether the backend runs in JAX, which computes in 32 bits unless its option jax_enable_x64 is set.
     jax: bool = False
 
     @property

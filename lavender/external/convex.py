@@ -63,33 +63,17 @@ MAX_SINGULAR_STEP_PIVOT = 1e-13  # [-] A dense matrix counts as singular below t
 
 @dataclass(frozen=True, eq=False)
 class ConvexProgram:
-    """A convex program; see the module.
+    """A convex program; see the module."""
 
-    Parameters
-    ----------
-    P : (indptr, indices, data)
-        Both triangles, in compressed rows.
-    q : (n,)
-    J : (indptr, indices, data)
-    t : (m,)
-    free : int
-        Number of equations, which are the first rows.
-    variable : (m,) int
-        Variable of a row that is a bound, x_j >= t_i or -x_j >= t_i; -1 for other rows.
-    cones : tuple of int
-        Sizes of the second-order cones, which are the last rows.
-    definite : bool
-        Whether P is known to be positive definite.
-    """
-
-    P: Compressed
-    q: FloatArray
-    J: Compressed
-    t: FloatArray
-    free: int
+    P: Compressed  # (indptr, indices, data): both triangles, in compressed rows.
+    q: FloatArray  # (n,)
+    J: Compressed  # (indptr, indices, data)
+    t: FloatArray  # (m,)
+    free: int  # Number of equations, which are the first rows.
+    # (m,) int: variable of a row that is a bound, x_j >= t_i or -x_j >= t_i; -1 for other rows.
     variable: IntArray
-    cones: tuple[int, ...] = ()
-    definite: bool = False
+    cones: tuple[int, ...] = ()  # Sizes of the second-order cones, which are the last rows.
+    definite: bool = False  # Whether P is known to be positive definite.
 
     @cached_property
     def hessian(self) -> Any:
@@ -257,18 +241,11 @@ class ConvexProgram:
 
 @dataclass(frozen=True, eq=False)
 class ScaledProgram(ConvexProgram):
-    """A scaled program as backends receive it: A x = b, G x <= h, lb <= x <= ub, and G' x <= h' in cones.
+    """A scaled program as backends receive it: A x = b, G x <= h, lb <= x <= ub, and G' x <= h' in cones."""
 
-    Parameters
-    ----------
-    is_kept : (m,) bool, optional
-        Rows that the backend receives; default: all.
-    shift : float
-        Number that was added to the diagonal of P.
-    """
-
+    # (m,) bool: rows that the backend receives; default: all.
     is_kept: npt.NDArray[np.bool_] | None = field(default=None)
-    shift: float = 0.0
+    shift: float = 0.0  # Number that was added to the diagonal of P.
 
     @property
     def n(self) -> int:

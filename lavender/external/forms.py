@@ -51,33 +51,16 @@ FrictionComponent = tuple[int, tuple[int, ...], tuple[float, ...]]
 
 @dataclass(frozen=True, eq=False)
 class Form:
-    """A problem as a convex program, and the conversion of its answers to impulses.
+    """A problem as a convex program, and the conversion of its answers to impulses."""
 
-    Parameters
-    ----------
-    name : {"impulse", "velocity", "program"}
-    problem : Problem
-    program : ConvexProgram
-    unknown_rows : (k,) int
-        Rows of the problem with impulses that the program determines.
-    fixed : (m,), N s
-        Known impulses of the other rows; 0 for unknown rows.
-    recovery : (k, r) or None
-        S T of the velocity form.
-    shift : (k,) or None
-        S r of the velocity form.
-    is_definite : bool
-        Whether P is known to be positive definite.
-    """
-
-    name: str
+    name: str  # {"impulse", "velocity", "program"}
     problem: Problem
     program: ConvexProgram
-    unknown_rows: IntpArray
-    fixed: FloatArray
-    recovery: sp.csr_matrix | None = None
-    shift: FloatArray | None = None
-    is_definite: bool = False
+    unknown_rows: IntpArray  # (k,) int: rows of the problem with impulses that the program determines.
+    fixed: FloatArray  # [N s] (m,): known impulses of the other rows; 0 for unknown rows.
+    recovery: sp.csr_matrix | None = None  # (k, r) or None: S T of the velocity form.
+    shift: FloatArray | None = None  # (k,) or None: S r of the velocity form.
+    is_definite: bool = False  # Whether P is known to be positive definite.
 
     def recover_impulse(self, x: FloatArray, lam: FloatArray) -> FloatArray:
         """Compute the impulses (m,) [N s] of a point, clipped to constant bounds."""

@@ -33,44 +33,25 @@ FINAL = (Status.TIME_LIMIT, Status.INTERRUPTED, Status.INFEASIBLE)
 
 @dataclass(frozen=True)
 class Limits:
-    """Tolerance and limits of one call.
+    """Tolerance and limits of one call."""
 
-    Parameters
-    ----------
-    eps : float
-        Residual of stationarity and of the constraints, in scaled units.
-    gap : float
-        Gap of the primal and dual objectives, absolute and relative.
-    max_iter : int
-    time_limit : float or None, s
-    """
-
-    eps: float
-    gap: float
+    eps: float  # Residual of stationarity and of the constraints, in scaled units.
+    gap: float  # Gap of the primal and dual objectives, absolute and relative.
     max_iter: int
-    time_limit: float | None
+    time_limit: float | None  # [s]
 
 
 @dataclass(frozen=True)
 class Answer:
-    """Result of one call of a backend, in the units of the scaled program.
-
-    Parameters
-    ----------
-    status : Status
-    message : str
-        The backend's own text.
-    x, lam : (n,), (m,) or None
-        Point and multipliers of the rows. With INFEASIBLE, they may be a direction in which the objective is unbounded,
-        or multipliers that prove that the rows contradict each other.
-    work : mapping of str to int
-    """
+    """Result of one call of a backend, in the units of the scaled program."""
 
     status: Status
-    message: str
+    message: str  # The backend's own text.
+    # (n,), (m,) or None: point and multipliers of the rows. With INFEASIBLE, they may be a direction in which the
+    # objective is unbounded, or multipliers that prove that the rows contradict each other.
     x: FloatArray | None = None
     lam: FloatArray | None = None
-    work: Mapping[str, int] = field(default_factory=dict)
+    work: Mapping[str, int] = field(default_factory=dict)  # mapping of str to int
 
 
 @dataclass

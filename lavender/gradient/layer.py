@@ -27,20 +27,11 @@ ARGUMENT_AXES = (2, 2, 1, 1, 1, 1)  # Number of axes of each argument without ba
 
 @dataclass(frozen=True)
 class Step:
-    """Settings of a step that are not arrays of numbers.
+    """Settings of a step that are not arrays of numbers."""
 
-    Parameters
-    ----------
-    cones : Cones
-        Blocks of the rows. The coefficients `cones.mu` are not used; mu is an argument.
-    bounds : tuple of bytes
-        Contents of all other fields of `cones`, by which two steps are compared.
-    friction, solver : str
-    tol : float, -
-    """
-
+    # Blocks of the rows. The coefficients `cones.mu` are not used; mu is an argument.
     cones: Cones = field(compare=False)
-    bounds: tuple[bytes, ...]
+    bounds: tuple[bytes, ...]  # Contents of all other fields of `cones`, by which two steps are compared.
     friction: str
     solver: str
     tol: float

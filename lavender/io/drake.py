@@ -164,50 +164,26 @@ def _check_no_locked_joints(plant: Any, context: Any) -> None:
 
 @dataclass(frozen=True)
 class _Contact:
-    """One point contact.
-
-    Parameters
-    ----------
-    name : str
-    jac : (3, nv)
-        Jacobian of the normal and two tangential velocities of body B relative to body A.
-    depth : float, m
-    mu : float, -
-    force : (3,) N
-        SAP's own contact force.
-    """
+    """One point contact."""
 
     name: str
+    # (3, nv): Jacobian of the normal and two tangential velocities of body B relative to body A.
     jac: FloatArray
-    depth: float
+    depth: float  # [m]
     mu: float
-    force: FloatArray
+    force: FloatArray  # (3,) N: SAP's own contact force.
 
 
 @dataclass(frozen=True)
 class _Limit:
-    """One limit of a joint.
-
-    Parameters
-    ----------
-    name : str
-    jac : (1, nv)
-    gap : float, m or rad
-        Distance to the limit; negative if it is violated.
-    velocity : int
-        Index of the joint's velocity.
-    sign : float
-        1 for a lower limit, -1 for an upper limit.
-    is_angular : bool
-        Whether the joint rotates.
-    """
+    """One limit of a joint."""
 
     name: str
-    jac: FloatArray
-    gap: float
-    velocity: int
-    sign: float
-    is_angular: bool
+    jac: FloatArray  # (1, nv)
+    gap: float  # m or rad: distance to the limit; negative if it is violated.
+    velocity: int  # Index of the joint's velocity.
+    sign: float  # 1 for a lower limit, -1 for an upper limit.
+    is_angular: bool  # Whether the joint rotates.
 
 
 def compute_free_motion(plant: Any, context: Any, dt: float) -> tuple[FloatArray, FloatArray]:

@@ -67,17 +67,10 @@ NEFC_ADVICE = "MuJoCo Warp leaves rows of earlier steps beyond nefc: pass nefc o
 
 
 class Imported(NamedTuple):
-    """Problems of many worlds, and the engine's own answers.
-
-    Parameters
-    ----------
-    batch : Batch
-    impulse : array or None, N s
-        dt efc_force in the rows and in the shape of the batch.
-    """
+    """Problems of many worlds, and the engine's own answers."""
 
     batch: Batch
-    impulse: FloatArray | None
+    impulse: FloatArray | None  # [N s] dt efc_force in the rows and in the shape of the batch.
 
 
 @np.errstate(divide="ignore", over="ignore", invalid="ignore")  # Unused rows may hold any numbers.

@@ -46,25 +46,15 @@ MAX_SOLUTION_ERROR = 0.1
 
 @dataclass(frozen=True, eq=False)
 class EngineMotion:
-    """The part of an engine's answer to one problem that its integrator uses; `residual` judges it.
+    """The part of an engine's answer to one problem that its integrator uses; `residual` judges it."""
 
-    Parameters
-    ----------
-    impulse : (m,), N s
-        The engine's forces times the time step; the motion belongs to exactly these impulses.
-    change : (nv,), m/s, rad/s
-        Velocity change by the constraints, dt (a - a0).
-    compliance : (m,), 1/kg
-        The engine's R, in the rows of the problem.
-    moved_by : {"acceleration", "forces"}
-    momentum : (nv,), N s, N m s, optional
-        J^T impulse as the engine computed it (dt qfrc_constraint), which differs by rounding if large forces cancel.
-    """
-
+    # [N s] (m,): the engine's forces times the time step; the motion belongs to exactly these impulses.
     impulse: FloatArray
-    change: FloatArray
-    compliance: FloatArray
-    moved_by: str
+    change: FloatArray  # [m/s, rad/s] (nv,): velocity change by the constraints, dt (a - a0).
+    compliance: FloatArray  # [1/kg] (m,): the engine's R, in the rows of the problem.
+    moved_by: str  # {"acceleration", "forces"}
+    # [N s, N m s] (nv,): J^T impulse as the engine computed it (dt qfrc_constraint), which differs by rounding if large
+    # forces cancel.
     momentum: FloatArray | None = None
 
     def judge(self, problem: Problem, forces: Residual) -> Residual:

@@ -44,30 +44,17 @@ MAX_MASS_FACTOR_ENTRIES = 2**27
 
 
 class Contents(NamedTuple):
-    """Contents of an FCLIB file: nothing is condensed, rescaled or symmetrised.
+    """Contents of an FCLIB file: nothing is condensed, rescaled or symmetrised."""
 
-    Parameters
-    ----------
-    group : str
-        Name of the problem's group in the file.
-    spacedim : int
-        Rows of each contact, normal first: 2, 3, or 5 with rolling friction.
-    parts : dict
-        Matrices (CSR) and vectors by the names of `PARTS` of the form; absent ones are not in it.
-    solution, guesses : dict, sequence of dict
-        The stored solution and guesses: "r" and "u" (m,), "v" (n,), "l" (p,).
-    info : dict of str to str
-    compare : str
-        Not part of FCLIB: "r,u", "u" or "error" if the file has a group `reference`.
-    """
-
-    group: str
-    spacedim: int
+    group: str  # Name of the problem's group in the file.
+    spacedim: int  # Rows of each contact, normal first: 2, 3, or 5 with rolling friction.
+    # Matrices (CSR) and vectors by the names of `PARTS` of the form; absent ones are not in it.
     parts: Mapping[str, Any]
+    # The stored solution and guesses: "r" and "u" (m,), "v" (n,), "l" (p,).
     solution: Mapping[str, FloatArray] = MappingProxyType({})
     guesses: Sequence[Mapping[str, FloatArray]] = ()
-    info: Mapping[str, str] = MappingProxyType({})
-    compare: str = ""
+    info: Mapping[str, str] = MappingProxyType({})  # dict of str to str
+    compare: str = ""  # Not part of FCLIB: "r,u", "u" or "error" if the file has a group `reference`.
 
     def build_problem(self, name: str = "") -> Problem:
         """Return the problem.

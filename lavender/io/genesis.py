@@ -29,7 +29,7 @@ from lavender.io.engine_step import Claims, EngineStep
 
 LIMIT, PYRAMIDAL = 3, 6  # Values of mjtConstraint: a joint limit, an edge of a pyramid.
 ROWS_OF_NORMAL_AND_TANGENTS = 3
-DEFAULT_FRICTION = 1.0  # [-] Coefficient of a geom whose material has none, such as `morphs.Plane()`.
+DEFAULT_FRICTION = 1.0  # [-] Coefficient of a geom with a material that has none, such as `morphs.Plane()`.
 GENESIS_ADVICE = "genesis-world 1.4 is known"
 
 

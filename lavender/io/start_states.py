@@ -140,24 +140,13 @@ def make_controller(model: Any, control: Control, seed: int) -> Callable[[Any, i
 
 @dataclass(frozen=True, eq=False)
 class StartStates:
-    """States in which simulations start.
+    """States in which simulations start."""
 
-    Parameters
-    ----------
-    vectors : (n, size)
-        State vectors of mjSTATE_INTEGRATION, as `mj_getState` returns them.
-    controls : (n, nu), optional
-        Controls of the first step; None if the source has none.
-    missing : tuple of str
-        Quantities on which a step depends and that arrays of states lack: "warm start", "controls".
-    misfit : str
-        Sentence on states that do not fit the model; else empty.
-    """
-
-    vectors: FloatArray
-    controls: FloatArray | None = None
+    vectors: FloatArray  # (n, size): state vectors of mjSTATE_INTEGRATION, as `mj_getState` returns them.
+    controls: FloatArray | None = None  # (n, nu): controls of the first step; None if the source has none.
+    # Quantities on which a step depends and that arrays of states lack: "warm start", "controls".
     missing: tuple[str, ...] = ()
-    misfit: str = ""
+    misfit: str = ""  # Sentence on states that do not fit the model; else empty.
 
     @property
     def notes(self) -> list[str]:
@@ -196,7 +185,7 @@ def can_sleep(mj: Any, model: Any) -> bool:
 def without_sleep(mj: Any, model: Any) -> Any:
     """Return a copy of the model with <flag sleep="disable"/>, or the model itself if it has this flag.
 
-    A state does not contain which trees sleep. A simulation whose steps are repeated from states must not use sleep.
+    A state does not contain which trees sleep. Steps that are repeated from states must not use sleep.
     """
     if not can_sleep(mj, model):
         return model

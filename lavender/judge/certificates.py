@@ -77,24 +77,14 @@ PRODUCT_COLUMNS = 8
 
 @dataclass(frozen=True)
 class Proof:
-    """Result of checking a direction y as a certificate of infeasibility.
+    """Result of checking a direction y as a certificate of infeasibility."""
 
-    Parameters
-    ----------
-    y : (m,)
-        The direction, as given or polished.
-    impulse_bound : float, N s
-        Lower bound (2) of sum |lambda| over all solutions: inf if none exists, 0 if y implies no bound.
-    reason : str
-        Reason why y does not prove that no impulse meets the tolerance; empty if it proves this.
-    conflict : str
-        If y is a proof: names of the conflicting blocks.
-    """
-
-    y: FloatArray
+    y: FloatArray  # (m,): the direction, as given or polished.
+    # [N s] Lower bound (2) of sum |lambda| over all solutions: inf if none exists, 0 if y implies no bound.
     impulse_bound: float
+    # Reason why y does not prove that no impulse meets the tolerance; empty if it proves this.
     reason: str = ""
-    conflict: str = ""
+    conflict: str = ""  # If y is a proof: names of the conflicting blocks.
 
     @property
     def message(self) -> str:

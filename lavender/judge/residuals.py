@@ -86,21 +86,11 @@ VERDICTS = AT_FLOOR, CLOSE, UNCONVERGED, WRONG = (
 
 @dataclass(frozen=True)
 class Rounding:
-    """Contributions of float32 to the round-off floor, as relative residuals.
+    """Contributions of float32 to the round-off floor, as relative residuals."""
 
-    Parameters
-    ----------
-    impulse : float, -
-        Rounding of the impulse, (1) of the module.
-    data : float, -
-        Rounding of the problem's data, or of A and b formed from it, (2, 3, 4).
-    velocities : float, -
-        Impulses computed from rounded velocities, (5); 0 if an active row is rigid.
-    """
-
-    impulse: float
-    data: float
-    velocities: float
+    impulse: float  # Rounding of the impulse, (1) of the module.
+    data: float  # Rounding of the problem's data, or of A and b formed from it, (2, 3, 4).
+    velocities: float  # Impulses computed from rounded velocities, (5); 0 if an active row is rigid.
 
     def __str__(self) -> str:
         more = f", velocities {self.velocities:.1e}" if self.velocities else ""
@@ -108,30 +98,16 @@ class Rounding:
 
 
 class Islands(NamedTuple):
-    """Errors of n islands: sets of blocks that share no moving body, tree of M or entry of A with other blocks.
+    """Errors of n islands: sets of blocks that share no moving body, tree of M or entry of A with other blocks."""
 
-    Parameters
-    ----------
-    label : (k,)
-        Island of each block.
-    relative : (n,), -
-        Larger of E / E0 and V / V0.
-    energy : (n,), sqrt J
-        E.
-    velocity : (n,), m/s
-        V.
-    energy_at_zero : (n,), sqrt J
-        E0; -1 if the zero impulse solves the island and no row is active: each row is then compared with its own b.
-    velocity_at_zero : (n,), m/s
-        V0.
-    """
-
-    label: IntArray
-    relative: FloatArray
-    energy: FloatArray
-    velocity: FloatArray
+    label: IntArray  # (k,): island of each block.
+    relative: FloatArray  # (n,): larger of E / E0 and V / V0.
+    energy: FloatArray  # (n,), sqrt J: E.
+    velocity: FloatArray  # [m/s] (n,): V.
+    # (n,), sqrt J: E0; -1 if the zero impulse solves the island and no row is active: each row is then compared with
+    # its own b.
     energy_at_zero: FloatArray
-    velocity_at_zero: FloatArray
+    velocity_at_zero: FloatArray  # [m/s] (n,): V0.
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -200,22 +200,12 @@ def _make_figure(caller: str, n_axes: int) -> tuple[Any, Any]:
 
 @dataclass(frozen=True)
 class SolverRun:
-    """Name, options, formulation and sweep order of the solver that ran.
-
-    Parameters
-    ----------
-    name : str
-    options : mapping of str to object
-    form : str
-        Formulation that was solved, if the solver has several.
-    order : str
-        Name of the order in which a sweep visits the blocks; empty if the solver has no order.
-    """
+    """Name, options, formulation and sweep order of the solver that ran."""
 
     name: str
-    options: Mapping[str, Any]
-    form: str = ""
-    order: str = ""
+    options: Mapping[str, Any]  # mapping of str to object
+    form: str = ""  # Formulation that was solved, if the solver has several.
+    order: str = ""  # Name of the order in which a sweep visits the blocks; empty if the solver has no order.
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -366,7 +356,7 @@ class Solution:
 
     @property
     def is_contradicted(self) -> bool:
-        """Whether the judge's figures exclude what `status` claims."""
+        """Whether the judge's figures contradict `status`."""
         # Fields that `late` postponed belong to claims that have been checked, so they are not computed here.
         return self.__dict__.get("claim_check") == CONTRADICTED
 

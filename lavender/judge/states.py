@@ -25,21 +25,14 @@ assert tuple(CASES.values()) == tuple(range(len(NAMES)))
 
 @dataclass(frozen=True)
 class State:
-    """State of one block; `str()` is a short sentence.
+    """State of one block; `str()` is a short sentence."""
 
-    Parameters
-    ----------
-    name : {"open", "closed", "sticks", "slides", "free", "at a bound"}
-        "closed" is a contact without friction that bears an impulse. "slides" means that at least one friction
-        component slides, "at a bound" that at least one row is at a bound.
-    rows : tuple of str
-        State of each row; the normal of a contact is open or closed.
-    margin : float, N s (N m s on angular rows)
-        Distance of this impulse to the nearest other state; inf if there is none.
-    """
-
+    # {"open", "closed", "sticks", "slides", "free", "at a bound"}: "closed" is a contact without friction that bears an
+    # impulse. "slides" means that at least one friction component slides, "at a bound" that at least one row is at a
+    # bound.
     name: str
-    rows: tuple[str, ...]
+    rows: tuple[str, ...]  # State of each row; the normal of a contact is open or closed.
+    # [N s (N m s on angular rows)] Distance of this impulse to the nearest other state; inf if there is none.
     margin: float
 
     def __str__(self) -> str:

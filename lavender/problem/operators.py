@@ -381,7 +381,7 @@ class Operators(ProblemData):
     def energy_change(self, impulse: ArrayLike) -> float:
         """Compute the change of the kinetic energy [J] by `impulse` (m,) [N s]: its work lambda.J (v* + v+) / 2.
 
-        A solution of contacts whose target is 0 never gains energy.
+        A solution of contacts with target 0 never gains energy.
 
         Raises
         ------

@@ -37,27 +37,13 @@ SWEEP_ORDERS = (*ENGINE_ORDERS, "local")
 
 @dataclass
 class Order:
-    """A sweep order for the kernels; `blocks` and `rng` change with every sweep.
+    """A sweep order for the kernels; `blocks` and `rng` change with every sweep."""
 
-    Parameters
-    ----------
-    blocks : (k,) int
-        Order of the next sweep, modified in place.
-    split : int
-        blocks[:split] and blocks[split:] (joints and contacts) are permuted separately.
-    mode : int
-        GIVEN, SYMMETRIC or RANDOM.
-    rng : (1,) uint64
-        State of the random number generator.
-    is_given : bool
-        Whether every sweep uses the order of the problem.
-    """
-
-    blocks: IntArray
-    split: int
-    mode: int
-    rng: np.ndarray
-    is_given: bool = False
+    blocks: IntArray  # (k,) int: order of the next sweep, modified in place.
+    split: int  # blocks[:split] and blocks[split:] (joints and contacts) are permuted separately.
+    mode: int  # GIVEN, SYMMETRIC or RANDOM.
+    rng: np.ndarray  # (1,) uint64: state of the random number generator.
+    is_given: bool = False  # Whether every sweep uses the order of the problem.
 
     @property
     def is_fixed(self) -> bool:

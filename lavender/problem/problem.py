@@ -27,22 +27,12 @@ class VelocityForm:
         K = D^-1/2 J M^-1/2,  theta = compliance / d,  g = D^-1/2 b,  lambda = D^-1/2 z
 
     Then K K^T + diag(theta) = D^-1/2 A D^-1/2, and y is the mass-scaled change of velocity M^1/2 (v - v*).
-
-    Parameters
-    ----------
-    jacobian : (m, 6 n) or (m, nv), CSR
-        K, with rows of norm 1.
-    rhs : (m,), sqrt J
-        g.
-    theta : (m,), -
-    scale : (m,), sqrt kg
-        D^-1/2.
     """
 
-    jacobian: sp.csr_array
-    rhs: FloatArray
-    theta: FloatArray
-    scale: FloatArray
+    jacobian: sp.csr_array  # (m, 6 n) or (m, nv), CSR: K, with rows of norm 1.
+    rhs: FloatArray  # (m,), sqrt J: g.
+    theta: FloatArray  # (m,)
+    scale: FloatArray  # (m,), sqrt kg: D^-1/2.
 
     def impulse(self, multiplier: FloatArray) -> FloatArray:
         """Compute lambda (m,) [N s] from a multiplier z (m,) [sqrt J]."""

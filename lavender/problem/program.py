@@ -195,42 +195,21 @@ class QPSolution:
 
 @dataclass(frozen=True, eq=False)
 class QuadraticProgram:
-    """Quadratic program of a problem built by `Problem.from_qp` (`problem.qp`).
+    """Quadratic program of a problem built by `Problem.from_qp` (`problem.qp`)."""
 
-    Parameters
-    ----------
-    q : (n,)
-    target : (m,)
-        Right-hand sides of (2).
-    free : int
-        Number of rows of A and of variables with lb = ub, which are the first rows.
-    generalized : Generalized
-        J of (2) and M = P, which is not factored if P is singular.
-    is_singular : bool
-        Whether P is singular: the problem is (5), which only solvers of quadratic programs accept.
-    n_equalities, n_inequalities : int or None
-        Number of rows of A and of G; None without A or G.
-    variable : (m,) int
-        Variable of each row of J that is a bound, -1 for rows of A and G.
-    has_bounds : bool
-        Whether lb or ub was given.
-    kept : (mi,) int or None
-        Rows of G that are in J; None if all are.
-    has_impossible_rows : bool
-        Whether rows G x <= -inf were given, which became 0 <= -1.
-    """
-
-    q: FloatArray
-    target: FloatArray
-    free: int
-    generalized: Generalized
+    q: FloatArray  # (n,)
+    target: FloatArray  # (m,): right-hand sides of (2).
+    free: int  # Number of rows of A and of variables with lb = ub, which are the first rows.
+    generalized: Generalized  # J of (2) and M = P, which is not factored if P is singular.
+    # Whether P is singular: the problem is (5), which only solvers of quadratic programs accept.
     is_singular: bool
+    # Number of rows of A and of G; None without A or G.
     n_equalities: int | None
     n_inequalities: int | None
-    variable: IntArray
-    has_bounds: bool = False
-    kept: IntpArray | None = None
-    has_impossible_rows: bool = False
+    variable: IntArray  # (m,) int: variable of each row of J that is a bound, -1 for rows of A and G.
+    has_bounds: bool = False  # Whether lb or ub was given.
+    kept: IntpArray | None = None  # (mi,) int or None: rows of G that are in J; None if all are.
+    has_impossible_rows: bool = False  # Whether rows G x <= -inf were given, which became 0 <= -1.
 
     def problem_fields(self) -> dict[str, Any]:
         """Return the fields b, cones and matrix or generalized of the constraint problem, and its names."""

@@ -278,8 +278,8 @@ def _holds_recorded_steps(folder: Path) -> bool:
 def _list_recorded_steps(folder: Path, items: list[Item]) -> list[Item]:
     """List the steps of a folder, in sequences with names that differ from the earlier `items`.
 
-    A sequence whose name is taken gets the parent folder's name as prefix, or a number. Figures are files named after
-    sequences, so names must differ as file names, too.
+    A name that is taken gets the parent folder's name as prefix, or a number. Figures are files named after sequences,
+    so names must differ as file names, too.
     """
     found: list[Item] = []
     for name, group in groupby(list_steps_in_folder(folder), key=lambda item: item.sequence):

@@ -44,43 +44,20 @@ MAX_ROWS = 500  # Largest number of rows of a table on a page; files have all ro
 
 @dataclass
 class Page:
-    """Contents of a page.
+    """Contents of a page."""
 
-    Parameters
-    ----------
-    title : str
-        Name of the command.
-    source : str
-        Command, input and its size.
-    verdict : str
-        The answer in one sentence, with its size in the user's unit.
-    sentences : list of str
-        Up to three sentences on the answer.
-    code : list of str
-        Lines to copy.
-    mark, is_bad : str, bool
-        Result of a comparison with a limit, shown before the verdict.
-    alarms : list of str
-        Sentences on wrong results, shown first.
-    warnings : list of str
-        Sentences on conditions on which shown numbers depend.
-    blocks : list
-        Blocks as the module describes them.
-    footer : list
-        Files, versions, machine, date and command.
-    """
-
-    title: str
-    source: str
-    verdict: str
-    sentences: Sequence[str] = ()
-    code: Sequence[str] = ()
+    title: str  # Name of the command.
+    source: str  # Command, input and its size.
+    verdict: str  # The answer in one sentence, with its size in the user's unit.
+    sentences: Sequence[str] = ()  # Up to three sentences on the answer.
+    code: Sequence[str] = ()  # Lines to copy.
+    # Result of a comparison with a limit, shown before the verdict.
     mark: str = ""
     is_bad: bool = False
-    alarms: Sequence[str] = ()
-    warnings: Sequence[str] = ()
-    blocks: Sequence[Any] = ()
-    footer: Sequence[Any] = field(default_factory=list)
+    alarms: Sequence[str] = ()  # Sentences on wrong results, shown first.
+    warnings: Sequence[str] = ()  # Sentences on conditions on which shown numbers depend.
+    blocks: Sequence[Any] = ()  # Blocks as the module describes them.
+    footer: Sequence[Any] = field(default_factory=list)  # Files, versions, machine, date and command.
 
     def render(self) -> str:
         """Return the page as HTML."""

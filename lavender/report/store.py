@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 Row: TypeAlias = dict[str, Any]  # Content of one line.
 KINDS = ("machine", "case", "run", "skip")
 MAX_LINE_BYTES = 2**26  # A longer last line is not of a records file; lines have a few thousand bytes.
-ERROR = "ERROR"  # Status of a run whose solver raised an exception, in addition to the statuses of a solve.
+ERROR = "ERROR"  # Status of a run after an exception of its solver, in addition to those of a solve.
 #: Columns that are equal in two lines about the same measurement; the later line counts.
 KEY = ("run", "case", "sha", "solver", "start", "mode", "tol", "max_iter", "time_limit", "order")
 #: Columns of runs with their defaults, which are the values of a run without an answer and determine the types.

@@ -26,7 +26,7 @@ from lavender.report.page import make_table
 from lavender.report.tables import Contents, list_plain_sweeps, read_own_answers
 from lavender.report.text import format_count, format_percent, format_speed, format_time, split_row_unit
 
-EQUAL_RATIO = 1.1  # Solvers whose errors differ by a smaller factor at every number of sweeps are one line.
+EQUAL_RATIO = 1.1  # Solvers are one line if their errors differ by less at every number of sweeps.
 MAX_SWEEP_COLUMNS = 400  # Columns of the strip of steps; a column of more steps has their largest error.
 SWEEPS_SHOWN_RATIO = (
     1e-4  # Errors below this fraction of the limit lie in the strip at the bottom of the figure.

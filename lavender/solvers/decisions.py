@@ -11,25 +11,13 @@ from typing import Any, NamedTuple
 
 
 class Number(NamedTuple):
-    """A number on which a decision of `auto` depends.
+    """A number on which a decision of `auto` depends."""
 
-    Parameters
-    ----------
-    name : str
-        Attribute of `DECISIONS`.
-    value : float
-    unit : str
-    meaning : str
-        What happens below and above the value.
-    fit : str
-        How the value was found.
-    """
-
-    name: str
+    name: str  # Attribute of `DECISIONS`.
     value: float
     unit: str
-    meaning: str
-    fit: str
+    meaning: str  # Behaviour below and above the value.
+    fit: str  # How the value was found.
 
 
 REPLAY = "least mean regret in replays of recorded solvers on problems drawn at random"

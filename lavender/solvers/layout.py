@@ -24,23 +24,12 @@ MIN_CONTACTS_FOR_COPY = 8_000
 
 @dataclass(frozen=True)
 class Layout:
-    """A problem in sweep order, with the permutation of its rows and bodies.
+    """A problem in sweep order, with the permutation of its rows and bodies."""
 
-    Parameters
-    ----------
-    data : lavender_ext.core.problem.Data
-    rows : (m,) intp
-        Row of the problem at each position of the sweep order.
-    position : (m,) intp
-        Position of each row of the problem in the sweep order.
-    rank : (n,) int32
-        Number of each body in the copy.
-    """
-
-    data: Any
-    rows: np.ndarray
-    position: np.ndarray
-    rank: IntArray
+    data: Any  # lavender_ext.core.problem.Data
+    rows: np.ndarray  # (m,) intp: row of the problem at each position of the sweep order.
+    position: np.ndarray  # (m,) intp: position of each row of the problem in the sweep order.
+    rank: IntArray  # (n,) int32: number of each body in the copy.
 
     def to_sweep_order(self, impulse: FloatArray) -> FloatArray:
         """Return an impulse (m,) in sweep order as a new array."""

@@ -36,20 +36,11 @@ from lavender.solvers.registry import Solver
 
 @dataclass(frozen=True)
 class BoundedRowForm:
-    """A problem with friction and its conversion to bounded rows in z (n,), with lambda = E z.
-
-    Parameters
-    ----------
-    problem : Problem
-    rows : Problem
-        The converted problem.
-    to_impulse : (m, n) sparse array
-        E.
-    """
+    """A problem with friction and its conversion to bounded rows in z (n,), with lambda = E z."""
 
     problem: Problem
-    rows: Problem
-    to_impulse: sp.csr_array
+    rows: Problem  # The converted problem.
+    to_impulse: sp.csr_array  # (m, n) sparse array: E.
 
     def convert_start(self, impulse: FloatArray) -> FloatArray:
         """Return a z (n,) of a feasible impulse (m,), or of its projection."""

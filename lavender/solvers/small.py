@@ -121,28 +121,15 @@ def describe_small_call(problem: Problem) -> str:
 
 @dataclass(frozen=True)
 class SmallCall:
-    """The compiled call of a solver for small problems (`SolverSpec.small`).
+    """The compiled call of a solver for small problems (`SolverSpec.small`)."""
 
-    Parameters
-    ----------
-    name : str
-        Name of the solver.
-    limits : Limits or None
-        Limits of the cost over generalised velocities; None if it does not accept them.
-    pivots : bool
-        Whether the call accepts bounded rows.
-    hands_over : bool
-        Whether the call also accepts friction. It then returns a start that is already a solution, and replaces a
-        start that is worse than the zero impulse.
-    rules : Rules
-        Options of the compiled call.
-    """
-
-    name: str
-    limits: Limits | None
-    pivots: bool
+    name: str  # Name of the solver.
+    limits: Limits | None  # Limits of the cost over generalised velocities; None if it does not accept them.
+    pivots: bool  # Whether the call accepts bounded rows.
+    # Whether the call also accepts friction. It then returns a start that is already a solution, and replaces a start
+    # that is worse than the zero impulse.
     hands_over: bool = False
-    rules: Rules = field(init=False)
+    rules: Rules = field(init=False)  # Options of the compiled call.
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "rules", Rules(DECISIONS, self.pivots, self.hands_over))

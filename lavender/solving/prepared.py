@@ -369,7 +369,7 @@ class Prepared:
         return setup
 
     def _complete_set_up(self) -> None:
-        """Form and factor what does not depend on b."""
+        """Form and factor all matrices that do not depend on b."""
         begin, setup = perf_counter(), self._setup
         if not self.problem.has_singular_program:
             if self.spec.builtin and not self.spec.external and self.problem.m > SMALL_ROWS:

@@ -26,7 +26,7 @@ def map_scalar(function: Callable[[float], float], x: Any) -> FloatArray:
 
 
 class Bodies:
-    """Bodies whose inertia is isotropic or has 3 principal moments; v_free is the velocity after a step of gravity."""
+    """Bodies with isotropic inertia or 3 principal moments; v_free is the velocity after a step of gravity."""
 
     def __init__(self, position: Any, mass: Any, inertia_per_mass: Any) -> None:
         self.position = np.asarray(position, float).reshape(-1, 3)  # (n, 3) m

@@ -116,26 +116,13 @@ class Draft:
 
 @dataclass(frozen=True)
 class Family:
-    """A family function under one of its names.
-
-    Parameters
-    ----------
-    name : str
-    make : callable
-        Builds the case of all parameters.
-    signature : inspect.Signature
-        Signature of the family function.
-    preset : mapping
-        Parameters that the name fixes, e.g. friction="coulomb".
-    summary : str
-        First line of the function's docstring.
-    """
+    """A family function under one of its names."""
 
     name: str
-    make: Callable[..., Case]
-    signature: inspect.Signature
-    preset: Mapping[str, Any]
-    summary: str
+    make: Callable[..., Case]  # Builds the case of all parameters.
+    signature: inspect.Signature  # Signature of the family function.
+    preset: Mapping[str, Any]  # Parameters that the name fixes, e.g. friction="coulomb".
+    summary: str  # First line of the function's docstring.
 
     def build_case(self, **parameters: Any) -> Case:
         """Build the case of these parameters; parameters that are not given have their defaults."""

@@ -42,26 +42,13 @@ MAX_BUFFER_BYTES = 2**32  # [bytes] Larger buffers (the three together) are reje
 
 
 class ObservationViews(NamedTuple):
-    """Functions that copy the arrays of an observation, for given numbers of contacts and of contact rows.
+    """Functions that copy the arrays of an observation, for given numbers of contacts and of contact rows."""
 
-    Parameters
-    ----------
-    arrays : mapping of str to callable
-        Copies of the arrays of an observation, by name.
-    contacts : mapping of str to callable
-        Copies of the arrays of its contacts, by name.
-    gap : (c,) m
-    impulses : callable or None
-        Copy of the contact impulses; None if contacts have different numbers of rows.
-    per : int
-        Largest number of rows of a contact of this scene.
-    """
-
-    arrays: dict[str, Copy]
-    contacts: dict[str, Copy]
-    gap: np.ndarray
-    impulses: Copy | None
-    per: int
+    arrays: dict[str, Copy]  # mapping of str to callable: copies of the arrays of an observation, by name.
+    contacts: dict[str, Copy]  # mapping of str to callable: copies of the arrays of its contacts, by name.
+    gap: np.ndarray  # (c,) m
+    impulses: Copy | None  # Copy of the contact impulses; None if contacts have different numbers of rows.
+    per: int  # Largest number of rows of a contact of this scene.
 
 
 class State:

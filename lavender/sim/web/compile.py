@@ -53,18 +53,10 @@ MAX_MODULE_BYTES = 270_000
 
 @dataclass(frozen=True)
 class Part:
-    """One WebAssembly module of the page.
+    """One WebAssembly module of the page."""
 
-    Parameters
-    ----------
-    modules : tuple of str
-        Kernel modules of lavender_ext.
-    imports_memory : bool
-        The module uses the memory of the first one.
-    """
-
-    modules: tuple[str, ...]
-    imports_memory: bool = False
+    modules: tuple[str, ...]  # Kernel modules of lavender_ext.
+    imports_memory: bool = False  # The module uses the memory of the first one.
 
 
 #: Modules of the page by name; the first is independent.
@@ -98,20 +90,11 @@ class BuildFailed(Exception):
 
 @dataclass(frozen=True)
 class Built:
-    """Result of a build.
+    """Result of a build."""
 
-    Parameters
-    ----------
-    size : int, bytes
-    functions : tuple of str
-        Exported functions.
-    compiler : str
-        Command of the compiler.
-    """
-
-    size: int
-    functions: tuple[str, ...]
-    compiler: str
+    size: int  # [bytes]
+    functions: tuple[str, ...]  # Exported functions.
+    compiler: str  # Command of the compiler.
 
 
 def explain_missing_requirement() -> str:

@@ -119,26 +119,13 @@ class Token(NamedTuple):
 
 @dataclass
 class Item:
-    """One declaration.
+    """One declaration."""
 
-    Parameters
-    ----------
-    kind : str
-        "macro", "type", "prototype", "variable", "function" or "group".
-    part : list of Token
-    defines : set of str
-        Names that the declaration defines.
-    origin : str
-        Module that contains the declaration.
-    kept_names : frozenset of str
-        Core functions that keep their names.
-    """
-
-    kind: str
+    kind: str  # "macro", "type", "prototype", "variable", "function" or "group".
     part: list[Token]
-    defines: set[str] = field(default_factory=set)
-    origin: str = ""
-    kept_names: frozenset[str] = frozenset()
+    defines: set[str] = field(default_factory=set)  # Names that the declaration defines.
+    origin: str = ""  # Module that contains the declaration.
+    kept_names: frozenset[str] = frozenset()  # Core functions that keep their names.
 
     @cached_property
     def all_tokens(self) -> list[Token]:

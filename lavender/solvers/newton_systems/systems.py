@@ -50,20 +50,11 @@ UNLIMITED_STEPS = 2**31 - 1  # Budget of a kernel whose steps are limited by its
 
 
 class Bodies(NamedTuple):
-    """The bodies of a problem.
+    """The bodies of a problem."""
 
-    Parameters
-    ----------
-    pair : (n_blocks, 2) int32
-        Bodies of each block; -1 for a static or missing body.
-    n : int
-        Number of bodies.
-    column : (nv,) int32, optional
-        For J and M: 6 times the body of each velocity, plus its index in the body.
-    """
-
-    pair: IntArray
-    n: int
+    pair: IntArray  # (n_blocks, 2) int32: bodies of each block; -1 for a static or missing body.
+    n: int  # Number of bodies.
+    # (nv,) int32: for J and M: 6 times the body of each velocity, plus its index in the body.
     column: IntArray | None = None
 
 
