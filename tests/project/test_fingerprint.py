@@ -17,6 +17,9 @@ def test_fingerprint_is_the_same_in_another_process_and_names_a_change(tmp_path)
     assert items[1:] == sorted(items[1:]) or items == sorted(items)
     for word in ("problem box_stackF(n=10)", "solve box_stackF(n=10) | newton", "| random", "| colored"):
         assert any(word in item for item in items), word
+    run("--only", "two_particles | pgs", "--out", file)  # Only these items of the file are written.
+    assert set(before.splitlines()) < set(file.read_text().splitlines())
+    run(*only, "--out", file)
     lines, named = before.splitlines(keepends=True), []
     for word in ("| pgs | random", "| newton"):  # the second goes through LAPACK
         at = next(i for i, line in enumerate(lines) if word in line)
