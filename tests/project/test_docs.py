@@ -26,7 +26,7 @@ BLOCK = re.compile(r"^( *)```(python|pycon|sh|console)\n(.*?)^\1```$", re.MULTIL
 #: Largest number of pages in docs/, and of words in them and README.md (as `wc -w` counts). Shorten another page before
 #: you raise a limit: nobody reads more.
 MAX_PAGES = 30
-MAX_WORDS = 43500
+MAX_WORDS = 42500  # without the page of solvers, which is generated
 FLAGS = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
 
 
@@ -296,7 +296,8 @@ def test_the_page_of_examples_lists_every_example():
 
 def test_pages_are_few_and_short():
     assert len(PAGES) - 1 <= MAX_PAGES  # without README.md
-    assert sum(len(page.read_text(encoding="utf-8").split()) for page in PAGES) <= MAX_WORDS
+    written = [page for page in PAGES if page.name != "solvers.md"]
+    assert sum(len(page.read_text(encoding="utf-8").split()) for page in written) <= MAX_WORDS
 
 
 @pytest.mark.parametrize(
