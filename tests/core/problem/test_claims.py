@@ -141,34 +141,6 @@ def test_false_claim_in_every_form_and_law_is_contradicted(form, status, plug_in
     assert seen == {"linear", "lcp", "coulomb", "cone"}
 
 
-@pytest.mark.parametrize(
-    "claim",
-    [
-        None, "CONVERGED", lv.Claim(None, 1), lv.Claim(lv.Status.CONVERGED, None), lv.Claim(lv.Status.CONVERGED, 1.5),
-        lv.Claim(lv.Status.CONVERGED, -1), lv.Claim(lv.Status.CONVERGED, 1, {"sweeps": None}),
-        lv.Claim(lv.Status.CONVERGED, 1, {1: 1}), lv.Claim(lv.Status.CONVERGED, 1, message=None),
-        lv.Claim(lv.Status.CONVERGED, 1, form=3), lv.Claim(lv.Status.INFEASIBLE, 1, certificate=[[1.0], [1.0, 2.0]]),
-    ],
-    ids=repr,
-)  # fmt: skip
-@pytest.mark.parametrize("resumable", [False, True])
-def test_invalid_claim_of_a_plug_in_is_a_numerical_error(plug_in, claim, resumable):
-    problem = random_lcp(11)
-    answer = lv.solve(problem, "pgs", tol=1e-9).impulse
-
-    def run(problem, impulse):
-        impulse[:] = answer
-        return claim
-
-    name = plug_in(run, resumable=resumable)
-    solution = lv.solve(problem, name)
-    assert solution.status is lv.Status.NUMERICAL_ERROR
-    assert f"solver {name!r}" in solution.message
-    assert solution.success  # the judge reads the impulse, whatever was said of it
-    assert str(solution)
-    assert lv.solve_many([problem], name)[0].status is lv.Status.NUMERICAL_ERROR
-
-
 # -- the floor does not excuse an impulse that ran away ------------------------------------------------
 
 
@@ -202,28 +174,3 @@ def test_unsolvable_problem_with_growing_impulses_is_not_accepted(name, problem)
         if name == "auto":
             assert solution.status is lv.Status.INFEASIBLE
             assert solution.iterations <= budget.get("max_iter", np.inf)
-
-
-@pytest.mark.parametrize("error", [FloatingPointError("underflow"), MemoryError()])
-@pytest.mark.parametrize("where", ["prepare", "run"])
-@pytest.mark.parametrize("limit", [None, 10.0])
-def test_plug_in_with_an_arithmetic_error_has_the_status_numerical_error(error, where, limit, register):
-    class Breaks:
-        def prepare(self, problem):
-            if where == "prepare":
-                raise error
-
-        def update(self, state, problem):
-            return self.prepare(problem)
-
-        def run(self, state, impulse, n, tol, time_limit=None):
-            impulse[0] = np.nan
-            raise error
-
-    register(lv.SolverSpec(name="breaks", factory=Breaks, laws={"lcp"}, summary="", resumable=False))
-    solver = lv.prepare(random_lcp(4), "breaks")
-    for _ in range(2):
-        solution = solver.solve(time_limit=limit)
-        assert solution.status is lv.Status.NUMERICAL_ERROR
-        assert type(error).__name__ in solution.message
-        assert np.isfinite(solution.impulse).all()
