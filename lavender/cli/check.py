@@ -12,7 +12,6 @@ from lavender.cli.completion import complete_case_or_file, complete_solver
 from lavender.cli.options import (
     ErrorReporter,
     ListType,
-    MultiValueCommand,
     is_option_set,
     limit_to_one_thread,
     make_console,
@@ -33,7 +32,7 @@ NARROW_CHECK_OMITS = (
 )  # fmt: skip
 
 
-@click.command(cls=MultiValueCommand)
+@click.command()
 @click.argument(
     "files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...", shell_complete=complete_case_or_file
 )

@@ -34,61 +34,6 @@ Option = tuple[tuple[str, ...], dict[str, Any]]  # Positional (names) and keywor
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
 
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
-
-
-def _is_order_name(word: str) -> bool:
-    from lavender.problem.ordering import SWEEP_ORDERS
-
-    return word.partition(":")[0] in SWEEP_ORDERS
-
-
-def _is_solver_name(word: str) -> bool:
-    from lavender import suite
-    from lavender.solvers import registry
-
-    if Path(word).exists():
-        return False
-    names = {family.partition("(")[0] for family in suite.families()}
-    # A word that is neither a case nor a path counts as a misspelt solver name, for which a later check raises an
-    # error.
-    return word in registry.specs() or not (word in names or set(word) & set("(*?[/\\."))
-
-
-class MultiValueCommand(click.Command):
-    """Command that accepts `--tolerances 1e-3 1e-6` as well as `--tolerances 1e-3,1e-6`."""
-
-    VALUE_TESTS: dict[str, Callable[[str], bool]] = {  # noqa: RUF012 - a constant of the class
-        "--tolerances": _is_number,
-        "--budgets": _is_number,
-        "--time-budgets": _is_number,
-        "--solvers": _is_solver_name,
-        "--orders": _is_order_name,
-    }
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Join the values that follow an option of `VALUE_TESTS` into one word, then parse as click does."""
-        folded: list[str] = []
-        i = 0
-        while i < len(args):
-            word = args[i]
-            folded.append(word)
-            i += 1
-            if word in self.VALUE_TESTS and i < len(args):
-                values = [args[i]]
-                i += 1
-                while i < len(args) and not args[i].startswith("-") and self.VALUE_TESTS[word](args[i]):
-                    values.append(args[i])
-                    i += 1
-                folded.append(",".join(values))
-        return super().parse_args(ctx, folded)
-
-
 class ListType(_ParamType):
     """Option type: numbers or words, separated by commas or blanks."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,7 +18,6 @@ from lavender.cli.options import (
     PATH,
     RECORDING_NAMES,
     ListType,
-    MultiValueCommand,
     describe_solvers,
     exit_after_interrupt,
     limit_option,
@@ -31,10 +29,10 @@ from lavender.cli.options import (
     reject_options_without_effect,
 )
 from lavender.io.start_states import MODEL_SUFFIXES
-from lavender.io.stored import check_writable, write_text
+from lavender.io.stored import check_writable
 
 
-@click.command(cls=MultiValueCommand)
+@click.command()
 @click.argument(
     "files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...", shell_complete=complete_case_or_file
 )
@@ -116,7 +114,7 @@ def report(
     check_writable(out, folder=True)
     used_folders: set[Path] = set()
     recording = {name: options[name] for name in RECORDING_NAMES}
-    files = tuple(_record_model(f, out, used_folders, not options["no_reuse"], recording) for f in files)
+    files = tuple(_record_model(f, out, used_folders, recording) for f in files)
     old = None if options["compare"] is None else read(options["compare"])
     path = out / "records.jsonl"
     records_files = [f for f in files if f.endswith(".jsonl")]
@@ -209,14 +207,11 @@ def _reject_unused_options(
     )  # fmt: skip
 
 
-def _record_model(
-    word: str, out: Path, used_folders: set[Path], reuse: bool, recording: Mapping[str, Any]
-) -> str:
+def _record_model(word: str, out: Path, used_folders: set[Path], recording: Mapping[str, Any]) -> str:
     """Record the steps of a model *.xml or *.mjb in the report's folder `out`, and return their folder.
 
-    Any other word is returned unchanged. With `reuse`, steps that were recorded with the same settings are kept. The
-    new folder is added to `used_folders`. Its name contains the folder and the file of the model, since many files are
-    called scene.xml.
+    Any other word is returned unchanged. The new folder is added to `used_folders`. Its name contains the folder and
+    the file of the model, since many files are called scene.xml.
     """
     path = Path(word)
     if path.suffix.lower() not in MODEL_SUFFIXES:
@@ -224,43 +219,14 @@ def _record_model(
     from lavender.io.recording import record_file
     from lavender.report.text import make_file_name
 
-    model, n = str(path.resolve()), 1
-    first = out / "recorded" / make_file_name(f"{path.resolve().parent.name}-{path.stem}")
+    first, n = out / "recorded" / make_file_name(f"{path.resolve().parent.name}-{path.stem}"), 1
     folder = first
-    while folder in used_folders or _read_recorded_model(folder) not in ("", model):
+    while folder in used_folders:
         n += 1
         folder = first.with_name(f"{first.name}-{n}")
     used_folders.add(folder)
-    settings_file = folder / "how.json"
-    settings = json.dumps(
-        {
-            "model": model,
-            "changed": _describe_sources(path, recording["control"], recording["states"]),
-            **recording,
-        }
-    )
-    if not reuse or not settings_file.is_file() or settings_file.read_text(encoding="utf-8") != settings:
-        # Without the settings file, a recording that is interrupted now will not be reused.
-        settings_file.unlink(missing_ok=True)
-        recorded = record_file(path, folder, **recording, replace=True)
-        print_escaped(str(recorded))
-        if recorded.is_interrupted:
-            exit_after_interrupt()
-        write_text(settings_file, settings)
+    recorded = record_file(path, folder, **recording, replace=True)
+    print_escaped(str(recorded))
+    if recorded.is_interrupted:
+        exit_after_interrupt()
     return str(folder)
-
-
-def _read_recorded_model(folder: Path) -> str:
-    """Return the path of the model from which the steps in a folder were recorded, or an empty text."""
-    try:
-        return str(json.loads((folder / "how.json").read_text(encoding="utf-8"))["model"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return ""
-
-
-def _describe_sources(path: Path, controls: str, states: str | None) -> list[Any]:
-    """Return a hash of the model, and the modification times of the files of model, controls and start states."""
-    from lavender.io.start_states import hash_model, load_model
-
-    files = [file for file in (path, Path(controls), Path(states or "")) if file.is_file()]
-    return [hash_model(load_model(path)[1], options=True), *(file.stat().st_mtime for file in files)]

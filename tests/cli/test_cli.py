@@ -19,12 +19,12 @@ import lavender as lv
 from lavender import cli
 from lavender.cli import entry
 
-QUICK = ("--tolerances", "1e-3", "1e-6", "--budgets", "2", "4", "--repeats", "1", "--no-figures")
+QUICK = ("--tolerances", "1e-3,1e-6", "--budgets", "2,4", "--repeats", "1", "--no-figures")
 
 
 def test_report_and_check_of_a_false_claim_mark_it_contradicted(lavender, path, plug_in):
     plug_in(lambda problem, impulse: lv.Claim(lv.Status.CONVERGED, 1), "liar", laws={"lcp"})
-    code, out, _ = lavender("report", path, "--solvers", "liar", *QUICK[:3], *QUICK[-3:], "--tables")
+    code, out, _ = lavender("report", path, "--solvers", "liar", *QUICK[:2], *QUICK[-3:], "--tables")
     assert code == 0
     assert "false claim, the first of 2: liar on stack8: says CONVERGED" in out and "✗ says CONVERGED" in out
     code, out, _ = lavender("check", path, "--solvers", "liar")
@@ -239,7 +239,7 @@ def test_solve_json_has_the_judged_result(lavender, path):
 
 
 def test_check_json_is_the_only_output(lavender, path):
-    code, out, _ = lavender("check", path, path, "--solvers", "newton", "pgs", "--json")
+    code, out, _ = lavender("check", path, path, "--solvers", "newton,pgs", "--json")
     entries = json.loads(out, parse_constant=reject_constant)
     assert code == 0 and len(entries) == 2
     assert [row["solver"] for row in entries[0]["solvers"]] == ["newton", "pgs"]

@@ -26,7 +26,7 @@ ENDS = [
     (0, "contract sor --list"), (2, "contract nobody"), (0, "run stack --steps 2"),
     (1, "run stack --steps 9 --set gravity=1e60 --set dt=1e60 --set mass=1e60 --set substeps=60"), (2, "run nowhere"),
     (2, "view nothing.npz"), (2, "export c PROBLEM"), (1, "check granularF(n=3) --solvers sor"),
-    (0, "check granularF(n=3) --solvers sor newton"),
+    (0, "check granularF(n=3) --solvers sor,newton"),
 ]  # fmt: skip
 #: Commands with a wrong word, number or combination of options.
 WRONG = """

@@ -79,7 +79,7 @@ def test_solvers_of_a_plug_in_names_its_package_and_version(install):
 def test_report_with_a_plug_in_that_ends_the_process_keeps_its_rows_and_continues(install, tmp_path):
     environment = install("good = plugin_module:GOOD", "other = plugin_module:OTHER")
     words = ("report", "toy_stack", "--repeats", "1", "--no-figures", "--out", str(tmp_path / "o"))
-    words += ("--solvers", "direct", "pgs", "good")
+    words += ("--solvers", "direct,pgs,good")
     python("-m", "lavender", *words, env=environment | {"END": "1"}, status=7)
     kept = lv.report.select_runs(lv.report.read(tmp_path / "o"))
     assert set(kept["solver"]) == {"direct", "pgs"}
