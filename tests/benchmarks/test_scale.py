@@ -2,14 +2,12 @@
 
 import json
 
-import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
 import lavender as lv
-from benchmarks import scale
-from benchmarks.scale import build_without, command, compute_regret, fit_exponent
+from benchmarks.scale import command, compute_regret, fit_exponent
 from benchmarks.scale_structures import STRUCTURES, build
 
 
@@ -69,37 +67,3 @@ def test_command_measures_auto_and_a_mix_and_writes_what_it_measured(tmp_path, a
         assert found["solved"] == (found["residual"] <= 1e-6)
         assert found["time"] > 0.0
     assert line["runs"]["auto"]["solved"]
-
-
-def test_command_reads_measurements_prints_their_exponent_and_draws_them(tmp_path):
-    def line(m, sliding, time, solved):
-        auto = {"time": time, "memory": 1.0, "residual": 1e-7 if solved else 1e-3, "solved": solved, "work": {}}
-        runs = {"auto": auto, "newton": auto | {"time": 2.0 * time, "solved": True}}
-        return {"structure": "wall", "m": m, "sliding": sliding, "spread": 0.0, "seed": 7, "runs": runs}
-
-    written, figure = tmp_path / "scale.json", tmp_path / "scale.png"
-    rest = [line(m, 0.0, 1e-6 * m**1.5, True) for m in (3_000, 10_000, 30_000)]
-    written.write_text(json.dumps({"lines": [*rest, line(3_000, 0.5, 5.0, False)]}))
-    done = CliRunner().invoke(command, ["--from", str(written), "--figure", str(figure)])
-    assert done.exit_code == 0, done.output
-    assert "| wall | 0 | 3000 | 30000 | 1.50 | 0 |" in done.output
-    assert "median 0.50, worst 0.50; 1 of 4 problems not solved by auto" in done.output
-    assert figure.read_bytes().startswith(b"\x89PNG")
-
-
-def test_copy_without_a_state_begins_no_phase_in_it(tmp_path, monkeypatch):
-    root = tmp_path / "checkout"
-    plan = root / scale.PLAN
-    plan.parent.mkdir(parents=True)
-    plan.write_text((scale.ROOT / scale.PLAN).read_text())
-    (root / "setup.py").write_text("")
-    monkeypatch.setattr(scale, "ROOT", root)
-    name, _, copy, contestant = build_without("FIRST_FLOW", tmp_path)
-    changed = [line for line in (copy / scale.PLAN).read_text().splitlines() if line not in plan.read_text()]
-    assert (name, contestant, changed) == (
-        "newton without FIRST_FLOW",
-        "newton",
-        ["        pass", "    elif state < 0:"],
-    )
-    with pytest.raises(click.BadParameter, match="COULOMB_END"):
-        build_without("DE_SAXCE_END", tmp_path)

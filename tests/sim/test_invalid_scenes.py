@@ -370,23 +370,6 @@ def caller(plug_in):
     return make
 
 
-def test_scene_call_from_inside_a_step_raises(caller):
-    rejected = []
-
-    def inside():
-        for call in calls:
-            with pytest.raises(lv.LavenderError, match="inside a step"):
-                call()
-            rejected.append(call)
-
-    caller(inside, 1)
-    sim = lv.Simulation(lv.Scene("stack", solver="caller"))
-    calls = (sim.step, sim.snapshot, sim.constraint_problem, sim.reset, lambda: sim.set_warm_start(False))
-    sim.step()
-    assert len(rejected) == len(calls)
-    sim.step()
-
-
 # -- Ctrl-C --------------------------------------------------------------------------------------------
 
 

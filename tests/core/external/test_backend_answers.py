@@ -1,19 +1,13 @@
 """Answers of backends by this package against the KKT conditions and against the backend called alone."""
 
-import sys
-import types
-
 import numpy as np
 import pytest
 from backend_truth import MAX_RATIO, TOL, call_alone, call_here, draw_lcp, draw_program
 from calls import BACKENDS, installed
 from random_problems import spd
-from worked import python
 
 import lavender as lv
-from lavender.external import backends
 from lavender.external.forms import build_form, choose_program_form, get_program
-from lavender.external.running import Limits
 
 
 @pytest.mark.parametrize("name", BACKENDS)
@@ -107,63 +101,7 @@ def test_backend_form_has_a_p_that_is_symmetric_in_every_bit():
 
 
 @pytest.mark.skipif("highs" not in BACKENDS, reason="highspy is not installed")
-@pytest.mark.parametrize("threads", [0, 2])
-def test_highs_solves_after_and_before_other_uses_of_highs_in_the_process(threads):
-    script = f"""if True:
-        import highspy, lavender as lv
-
-        def use():
-            user = highspy.Highs()
-            user.setOptionValue("output_flag", False)
-            user.setOptionValue("threads", {threads})
-            user.addVar(0.0, 1.0)
-            user.changeColCost(0, -1.0)
-            return user.run() == highspy.HighsStatus.kOk
-
-        problem = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, 1.0])
-        print([lv.solve(problem, "highs").success, use(), lv.solve(problem, "highs").success])
-        """
-    first = "use()\n        problem" if threads else "problem"
-    said = python("-c", script.replace("problem =", f"{first} =", 1) if threads else script)
-    assert said.stdout.splitlines()[-1] == "[True, True, True]"
-
-
-@pytest.mark.skipif("highs" not in BACKENDS, reason="highspy is not installed")
 def test_highs_does_not_round_small_numbers_to_zero():
     for b in ([1.0, 5e-5], [1.0, 1e-8]):
         assert lv.solve(lv.Problem.linear(np.eye(2), b), "highs", tol=1e-9).success
         assert lv.solve(lv.Problem.lcp(np.eye(2), b), "highs", tol=1e-9).success
-
-
-def stub_qpsolvers(monkeypatch):
-    """Replace qpsolvers by a module that records the settings and returns x = 0."""
-    received = {}
-
-    def solve_problem(problem, solver, initvals, **settings):
-        received.update(settings)
-        zero = np.zeros(2)
-        return types.SimpleNamespace(x=zero, y=None, z=zero, z_box=zero, found=True, extras={})
-
-    module = types.SimpleNamespace(Problem=lambda *arrays: arrays, solve_problem=solve_problem)
-    monkeypatch.setitem(sys.modules, "qpsolvers", module)
-    return received
-
-
-@pytest.mark.parametrize(
-    ("name", "settings"),
-    [
-        ("jaxopt_osqp", {"tol": 1e-7, "maxiter": 50}),
-        ("sip", {"eps_abs": 1e-7, "eps_rel": 0.0, "max_iterations": 50}),
-        ("qpax", {"solver_tol": 1e-7}),
-    ],
-)
-def test_tolerance_reaches_the_backend_and_32_bits_of_jax_are_reported(name, settings, monkeypatch):
-    received = stub_qpsolvers(monkeypatch)
-    backend = next(b for b in backends.BACKENDS if b.name == name)
-    program = build_form(lv.Problem.lcp(np.eye(2), np.ones(2)), "impulse").program.scaled
-    for is_64_bit in (False, True):
-        config = types.SimpleNamespace(jax_enable_x64=is_64_bit)
-        monkeypatch.setitem(sys.modules, "jax", types.SimpleNamespace(config=config))
-        answer = backend.run(program, None, Limits(1e-7, 1e-9, 50, None), {})
-        assert received == settings
-        assert ("jax_enable_x64" in answer.message) is (name != "sip" and not is_64_bit)

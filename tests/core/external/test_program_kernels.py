@@ -8,8 +8,6 @@ from lavender import Problem
 from lavender.base.deadline import NEVER, Deadline
 from lavender.external.forms import get_program
 from lavender.external.qp_solver import ProgramJudge
-from lavender.external.running import Answer, call_backend_until_accepted
-from lavender.judge.solution import Status
 from lavender_ext.judge.convex import NewtonStep, make_columns, make_dense
 
 
@@ -68,23 +66,3 @@ def test_no_long_step_begins_shortly_before_the_deadline(monkeypatch, deadline, 
     judge.accepts(np.zeros(9), np.zeros(len(program.t)))
     assert set(sizes) <= {largest}
     assert sizes or deadline.is_set
-
-
-@pytest.mark.parametrize("first", [Status.CONVERGED, Status.MAX_ITERATIONS])
-def test_interior_point_methods_get_few_iterations_in_the_second_call(first):
-    program, limits = draw_program(1), []
-
-    class Judge:
-        def accepts(self, x, lam, is_last):
-            assert is_last == (len(limits) == 2)
-            return False
-
-    def call(scaled, start, limit, settings):
-        limits.append(limit.max_iter)
-        count = limit.max_iter if first is Status.MAX_ITERATIONS and len(limits) == 1 else 20
-        return Answer(first, "", np.ones(9), np.zeros(len(scaled.t)), {"iterations": count})
-
-    call_backend_until_accepted(
-        program, Judge(), call, max_iter=500, tol=1e-6, deadline=NEVER, settings={}, call_iterations=250, interior=True
-    )
-    assert limits == [100, 35 if first is Status.CONVERGED else 115]

@@ -93,10 +93,3 @@ def test_packed_workspace_is_reused_for_a_new_problem():
     state.sweeps.start(lam)
     prepared.solver.run(state, lam, 20, 0.0)
     assert lam.tobytes() == sweep_in_parts(problem, [20], start=start, packs=False)[0].tobytes()
-
-
-@pytest.mark.parametrize("name", ["sequential_impulses", "nncg"])
-def test_packed_sweeps_of_extreme_numbers_end(name):
-    prepared = prepare_sweeps(lattice_pile(300), name)
-    for bad in (np.nan, np.inf, 1e300, -1e300):
-        prepared.solver.run(prepared.state, np.full(prepared.problem.m, bad), 40, 0.0)

@@ -104,17 +104,6 @@ def test_newton_over_velocities_reaches_the_floor_or_tol(friction, soft, seed):
     assert solution.solver.form in ("generalized coordinates", "velocity")  # "velocity" if J and M describe free bodies
 
 
-@pytest.mark.parametrize("seed", range(5))
-@pytest.mark.parametrize("nv", [2, 3])
-def test_newton_over_velocities_continues_centering_with_many_rows(nv, seed):
-    """Errors of velocities are errors of every row: measured by the rows' they were small before the first step."""
-    rng = np.random.default_rng(seed)
-    jac, v, cones = rng.normal(size=(1800, nv)), rng.normal(size=nv), lv.Cones.contacts(np.full(600, 0.5))
-    problem = lv.Problem.from_jacobian(jac, np.eye(nv), v, cones=cones, friction="cone")
-    solution = lv.solve(problem, "newton", form="velocity", tol=1e-6, max_iter=10)  # measured: 4 at most
-    assert solution.success, str(solution)
-
-
 def test_problem_updated_has_the_same_structure_and_new_numbers():
     problem = random_generalized_problem(9, "cone")
     general = problem.generalized
@@ -219,10 +208,3 @@ def test_generalized_order_of_many_small_trees_fills_in_little(seed):
     v = problem.velocity(solution.impulse)
     given = problem.generalized
     np.testing.assert_allclose(given.mass @ (v - given.v_free), problem.jacobian.T @ solution.impulse, atol=1e-11)
-
-
-def test_workspace_for_a_larger_pattern_grows():
-    """More entries in a row than there is room for at first, of more columns than are kept dense for that."""
-    problem = cloth(50, 0)
-    assert lv.solve(problem, "newton", form="velocity", tol=1e-9).success
-    assert lv.solve_many([problem], tol=1e-6)[0].success

@@ -18,12 +18,10 @@ from random_problems import (
     random_generalized_problem,
     seeds,
     side_by_side,
-    touching,
     with_ground_as_body,
 )
 
 import lavender as lv
-from benchmarks.core_problems import forms, stacks
 from lavender.problem.ordering import compute_block_colors, compute_block_levels_from_ground
 from lavender.solvers.islands import find_islands
 from lavender.solvers.registry import get
@@ -277,13 +275,6 @@ def test_residual_row_with_zero_b_at_rest_is_compared_with_its_own_terms():
     assert lv.solve(rolls, tol=1e-9).success
 
 
-def test_residual_rounding_of_moving_immovable_bodies_is_satisfied():
-    """b = 0.2 - (0.3 - 0.1) of two immovable bodies is rounding of its terms, so that no impulse is needed."""
-    problem = unmoved_row_beside(1e-3, "bodies", 1.0).updated(b=[1e-3, 2.8e-17])
-    solution = lv.solve(problem, tol=1e-6)
-    assert solution.success and solution.residual.relative < 1e-15
-
-
 # -- immovable bodies and entries that are zero --------------------------------------------------------
 
 
@@ -308,35 +299,3 @@ def test_find_islands_ground_given_as_immovable_body_equals_ground_minus_one(see
         one, other = (lv.solve(p, name, tol=1e-8) for p in (both, given))
         assert one.status is other.status, name
         np.testing.assert_allclose(lv.residual(both, other.impulse).islands.relative, other.residual.islands.relative)
-
-
-def test_newton_block_between_two_immovable_bodies_is_an_island_of_its_own():
-    rows = touching([(0, 1), (1, 2)], inv_mass=[0.0, 0.0, 1.0], inv_inertia=[np.zeros((3, 3))] * 2 + [np.eye(3)])
-    problem = lv.Problem.from_rows(rows, target=[0.0, 0.0, 0.0, 1.0, 0.5, 0.0], mu=0.5)
-    assert find_islands(problem) == (2, pytest.approx([0, 1]))
-    for name in ("newton", "auto", "admm", "block_gauss_seidel"):
-        solution = lv.solve(problem, name, tol=1e-9)
-        assert solution.success, name
-        np.testing.assert_allclose(problem.velocity(solution.impulse)[2, :2], [0.5, 0.0], atol=1e-8)
-
-
-def test_find_islands_stored_zero_of_matrix_connects_nothing():
-    a = sp.csr_array((np.array([2.0, 0.0, 0.0, 2.0]), np.array([0, 1, 0, 1]), np.array([0, 2, 4])), shape=(2, 2))
-    assert a.nnz == 4
-    assert find_islands(lv.Problem.lcp(a, [1.0, 1000.0]))[0] == 2
-
-
-@pytest.mark.parametrize("law", ["coulomb", "cone"])
-def test_solve_stored_zeros_between_islands_with_friction_have_no_effect(law):
-    """Forty small stacks over A with an entry for each pair of rows: the compiled call copies each island out of A."""
-    sparse = forms(stacks(40, 2, 0.4, False, 1))["matrix"].relaxed(law)
-    m = sparse.m
-    stored = (sparse.csr.toarray().ravel(), np.tile(np.arange(m), m), np.arange(0, m * m + 1, m))
-    full = lv.Problem(sparse.b, sparse.cones, sp.csr_array(stored, shape=(m, m)), friction=sparse.friction).relaxed(law)
-    assert full.csr.nnz == m * m
-    assert find_islands(full)[0] == 40
-    for name in ("auto", "newton", "anderson", "admm"):
-        one, other = (lv.solve(p, name, tol=1e-8) for p in (sparse, full))
-        assert one.success and other.success, name
-        # Both are solutions to 1e-8 of impulses up to 1 N s; A is well conditioned.
-        np.testing.assert_allclose(other.impulse, one.impulse, atol=1e-6)

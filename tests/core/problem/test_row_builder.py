@@ -355,17 +355,6 @@ def test_row_builder_with_arrays_of_blocks_has_the_bits_of_single_calls(dimensio
     assert [first.names[0], *first.names] == [second.names[0], *second.names]
 
 
-@pytest.mark.parametrize(("length", "cause"), [(None, "length is None"), (0.0, "length is 0")])
-def test_row_builder_distance_of_length_zero_raises_and_recommends_ball(length, cause):
-    builder = spatial(np.zeros((1, 6)), np.zeros((1, 3)))
-    point = (0.0, 0.0, 1.0)
-    lengths = {} if length is None else {"length": [1.0, length]}
-    with pytest.raises(lv.InputError, match=f"{cause}.*use ball"):
-        builder.distance(-1, 0, point, point, length)
-    with pytest.raises(lv.InputError, match=f"distance 1: .*{cause}"):
-        builder.joints("distance", [(-1, 0)] * 2, anchor_a=[(1.0, 0.0, 0.0), point], anchor_b=[point] * 2, **lengths)
-
-
 @pytest.mark.parametrize("planar", [True, False])
 @pytest.mark.parametrize("e", [1.0, 0.5])
 def test_contact_restitution_on_the_velocity_before_the_step_bounces_as_the_closed_form(e, planar):

@@ -57,19 +57,6 @@ def test_factor_after_breakdown_of_panels_is_full_and_ends_at_the_deadline(clock
     assert late.factor is None
 
 
-def test_admm_factor_beyond_index_range_raises(monkeypatch):
-    class Large(admm.LinearSystem):
-        def analyse(self):
-            raise OverflowError("the factor has 2^31 entries or more")
-
-    monkeypatch.setattr(admm, "LinearSystem", Large)
-    a = sp.diags_array([np.full(89, -1.0), np.full(90, 2.0), np.full(89, -1.0)], offsets=[-1, 0, 1])
-    problem = lv.Problem.lcp(sp.csr_array(a), np.ones(90))
-    for limit in (None, 60.0):
-        failed = lv.solve(problem, "admm", time_limit=limit)
-        assert failed.status is lv.Status.NUMERICAL_ERROR and "entries" in failed.message
-
-
 def test_admm_without_memory_equals_plain_admm_by_hand():
     """Five iterations against the formulas in NumPy with a dense inverse."""
     problem = random_lcp(4, m=7)

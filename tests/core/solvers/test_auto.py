@@ -37,26 +37,7 @@ def test_restrict_to_islands_gives_blocks_of_the_matrix(form, seed):
         assert not a[np.ix_(rows, others)].any()
 
 
-def test_restrict_to_an_island_of_b_1e_300_gives_zero():
-    """1e-300 m/s beside 1 m/s: no problem alone may ask for so little, beside which nothing is."""
-    problem = lv.Problem(np.array([1.0, 1e-300]), lv.Cones.free(2), np.eye(2))
-    _, label = find_islands(problem)
-    parts = [restrict_to_blocks(problem, np.flatnonzero(label == i), np.flatnonzero(label == i)) for i in range(2)]
-    assert [part.b.tolist() for part in parts] == [[1.0], [0.0]]
-
-
 # -- the convex relaxation -----------------------------------------------------------------------------
-
-
-def test_relaxed_problem_shares_arrays_and_differs_only_in_its_law():
-    problem = lv.suite.case("granularF(n=4)").problem
-    problem.metric, problem.csr  # noqa: B018 - computed before the relaxation is made
-    relaxed, alone = problem.relaxed("cone"), lv.suite.case("granularF(n=4)").problem.relaxed("cone")
-    assert relaxed.csr is problem.csr and np.shares_memory(relaxed.d, problem.d)
-    impulse = np.random.default_rng(0).normal(size=problem.m)
-    for tried in (impulse, np.zeros(problem.m)):
-        assert lv.residual(relaxed, tried).relative == lv.residual(alone, tried).relative
-    assert lv.residual(relaxed, impulse).relative != lv.residual(problem, impulse).relative
 
 
 def test_auto_solves_a_resting_pile_by_its_relaxation():

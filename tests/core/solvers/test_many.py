@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import lavender as lv
-from lavender.problem.cones import project_impulse
 
 DISKS = lv.Cones.contacts(0.5, count=4)
 
@@ -303,31 +302,6 @@ def test_invalid_world_of_a_batch_is_named_and_others_are_solved(threads):
     ]
 
 
-@pytest.mark.parametrize("listed", [False, True])
-def test_solve_many_with_a_start_that_is_not_finite_fails_in_its_world_only(listed):
-    batch = lv.Batch(*worlds(6), cones=DISKS)
-    clean = lv.solve_many(batch, tol=1e-8)
-    start = clean.impulse.copy()
-    start[2, 5], start[4] = np.nan, np.inf
-    given, starts = (list(batch), {"impulses": start}) if listed else (batch, {"impulse": start})
-    with pytest.raises(lv.InputError, match=r"world 2: impulse \[N s\] is nan at row 5"):
-        lv.solve_many(given, tol=1e-8, **starts)
-    many = lv.solve_many(given, tol=1e-8, errors="status", **starts)
-    impulse, velocity = many.impulse.reshape(6, -1), many.velocity.reshape(6, -1)
-    assert sorted(many.faults) == [2, 4] and not many.success[[2, 4]].any()
-    assert np.isnan(impulse[[2, 4]]).all() and np.isnan(velocity[[2, 4]]).all()
-    for i in (0, 1, 3, 5):
-        # Each start is a solution; its friction exceeded its bound by at most 4e-12 of it, and is projected on it.
-        np.testing.assert_allclose(impulse[i], project_impulse(DISKS, start[i]), rtol=1e-15)
-        np.testing.assert_allclose(impulse[i], start[i], rtol=1e-11)
-        assert many.iterations[i] == 0
-    again, inside = start.copy(), [0, 1, 3, 5]
-    again[inside] = impulse[inside].reshape(again[inside].shape)
-    starts = {"impulses" if listed else "impulse": again}
-    again = lv.solve_many(given, tol=1e-8, errors="status", **starts).impulse.reshape(6, -1)
-    assert again[inside].tobytes() == impulse[inside].tobytes()
-
-
 def test_solve_many_index_selects_worlds_as_entries_of_an_array():
     batch = lv.Batch(*worlds(5), cones=DISKS)
     many = lv.solve_many(batch)
@@ -345,34 +319,6 @@ def test_solve_many_index_selects_worlds_as_entries_of_an_array():
         many["a"]
     with pytest.raises(IndexError, match="world 5 does not exist; there are 5"):
         batch[5]
-
-
-@pytest.mark.parametrize("listed", [False, True])
-def test_solve_many_results_are_read_only(listed):
-    """A world is read when it is asked for: what was written over by then would be handed out as its answer."""
-    batch = lv.Batch(*worlds(3), cones=DISKS)
-    given = list(batch) if listed else batch
-    many = lv.solve_many(given, tol=1e-9)
-    found = lv.residual_many(given, [s.impulse for s in lv.solve_many(given, tol=1e-9)])
-    names = [(of, name) for of in (many, found) for name in dir(of) if name[0] != "_"]
-    arrays = {f"{type(of).__name__}.{name}": getattr(of, name) for of, name in names}
-    new = {"Solutions.ptr", "Solutions.success", "Residuals.excess"}  # at each call
-    arrays = {name: x for name, x in arrays.items() if isinstance(x, np.ndarray) and name not in new}
-    assert len(arrays) >= 16
-    assert [name for name, x in arrays.items() if x.flags.writeable] == []
-    assert all(one.success and not one.status_conflict for one in many)
-
-
-def test_a_world_written_over_before_it_is_read_contradicts_its_status():
-    jac, mass, free = worlds(4)
-    batch = lv.Batch(jac, mass, free, cones=DISKS)
-    many = lv.solve_many(batch, tol=1e-9)
-    assert many[0].success and not many[0].status_conflict
-    free[1:3] *= -2.0
-    for i in (1, 2):
-        assert many[i].residual.relative > 1e-3
-        assert "CONVERGED of other data" in many[i].status_conflict and f"world {i}" in str(many[i])
-    assert many[3].success and not many[3].status_conflict
 
 
 def test_solve_many_of_a_list_begins_at_its_impulses():

@@ -11,8 +11,6 @@ from functools import partial
 
 import numpy as np
 import pytest
-from random_problems import random_lcp
-from stacks import stack
 
 import lavender as lv
 from lavender.batch import residuals as loop
@@ -76,16 +74,6 @@ def test_ctrl_c_during_solve_many_starts_no_more_problems(solver, monkeypatch):
     assert 1 <= len(begun) < n / 2
 
 
-@pytest.mark.parametrize("name", ["auto", "newton", "direct", "pgs", "anderson", "lemke"])
-def test_solve_stores_no_result_in_its_problem(name):
-    """A residual was stored with the problem for the next call of the judge."""
-    problem = random_lcp(3, m=90)
-    lv.solve(problem, name)
-    keys = set(problem.derived.cache)
-    assert lv.solve(problem, name).success and set(problem.derived.cache) == keys
-    assert not any("judged" in str(key) for key in keys)
-
-
 @pytest.mark.parametrize("solver", ["auto", "newton", "pgs"])
 @pytest.mark.parametrize("form", ["matrix", "jacobian"])
 def test_prepared_solve_of_another_b_has_the_bits_of_a_new_problem(solver, form):
@@ -128,17 +116,3 @@ def test_problems_that_differ_in_b_share_memory_of_the_operator_and_free_each_ot
         seen.append(weakref.ref(prepared.problem))
     gc.collect()
     assert [ref() is not None for ref in seen] == [False] * 4 + [True]
-
-
-@pytest.mark.parametrize("arguments", [{}, {"max_iter": 50}, {"time_limit": 5.0}, {"velocity_tol": 1e-6}])
-@pytest.mark.parametrize("name", ["auto", "pgs", "newton"])
-def test_text_of_a_solution_names_its_start(name, arguments):
-    problem = stack(6)
-    stored = problem.updated(guess=0.5 * lv.solve(problem, "direct").impulse)
-    given = np.full(6, 0.25)
-    for solve in (lv.solve, lambda p, name, **more: lv.prepare(p, name).solve(**more)):
-        assert ", from " not in str(solve(problem, name, **arguments))
-        assert "from problem.guess," in str(solve(stored, name, **arguments))
-        assert "from the given impulses," in str(solve(stored, name, impulse=given, **arguments))
-    starts = [solution.start for solution in lv.solve_many([problem, stored], name, impulses=[given, None], tol=1e-6)]
-    assert starts == ["the given impulses", "problem.guess"]

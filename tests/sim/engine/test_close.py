@@ -25,19 +25,3 @@ def test_simulation_closes_when_its_block_raises():
         raise ZeroDivisionError
     with pytest.raises(lv.LavenderError, match="closed"):
         sim.step()
-
-
-def test_close_from_inside_a_step_is_refused(plug_in):
-    refused = []
-
-    def run(problem, impulse):
-        with pytest.raises(lv.LavenderError, match="inside a step"):
-            sim.close()
-        refused.append(sim.time)
-        return lv.Claim(lv.Status.MAX_ITERATIONS, 1)
-
-    plug_in(run, "closer", supports_rolling=True)
-    sim = lv.Simulation(lv.Scene("stack", n=2, solver="closer"))
-    sim.step()
-    assert len(refused) == 1
-    sim.step()

@@ -67,16 +67,6 @@ def test_motion_has_the_same_bits_for_every_unit_of_mass(name):
         assert (unit * seen["joint_impulses"]).tobytes() == scaled["joint_impulses"].tobytes()
 
 
-def test_sweeps_outside_four_to_sixty_four_raise():
-    for n in (4, 64):
-        lv.Simulation(lv.Scene("stack", solver_iterations=n)).set_solver_iterations(n)
-    for n in (3, 65):
-        with pytest.raises(lv.InputError, match="solver_iterations"):
-            lv.Scene("stack", solver_iterations=n)
-        with pytest.raises(lv.InputError, match="solver_iterations"):
-            lv.Simulation("stack").set_solver_iterations(n)
-
-
 @pytest.mark.parametrize("shape", ["sphere", "box"])
 def test_scene_body_slower_than_the_documented_bound_does_not_pass_a_wall(shape):
     """The bound on the motion of a substep is half of the body's thickness plus the margin, at any initial distance."""
