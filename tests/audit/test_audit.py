@@ -243,47 +243,6 @@ def test_audit_with_a_wrong_argument_raises_an_error_that_names_it(boxes, tmp_pa
         audit(boxes(), **{"worlds": 1, "steps": 2, "workers": 1} | given)
 
 
-def test_audit_with_warnings_of_mujoco_counts_them_without_printing(boxes, monkeypatch, tmp_path, capfd):
-    monkeypatch.chdir(tmp_path)
-    handler = mj.get_mju_user_warning()
-    found = audit(boxes(), worlds=3, steps=5, workers=1, spread=1e12)
-    ((text, count),) = found.engine_warnings.items()
-    assert count >= found.n_diverged == 2 and text.startswith("Nan, Inf or huge value in QVEL at DOF N")
-    assert f"MuJoCo's own warnings: {text} ({count} times)." in words_of(found)
-    assert found.totals["engine_warnings"] == {text: count}
-    assert "WARNING" not in "".join(capfd.readouterr()) and not (tmp_path / "MUJOCO_LOG.TXT").exists()
-    assert mj.get_mju_user_warning() is handler
-    assert not audit(boxes(), worlds=1, steps=5, workers=1).engine_warnings
-
-
-SLEEPING = BOXES.format(options="").replace("<worldbody>", '<option><flag sleep="enable"/></option><worldbody>')
-
-
-def test_audit_of_a_model_with_sleep_simulates_and_replays_without_it(tmp_path):
-    # Replayed states of sleeping boxes woke them with the warm start of a free fall: most solves seemed unconverged.
-    path = tmp_path / "sleep.xml"
-    path.write_text(SLEEPING)
-    data = mj.MjData(mj.MjModel.from_xml_path(str(path)))
-    if not hasattr(data, "tree_asleep"):
-        pytest.skip("this MuJoCo has no sleep")
-    found = audit(path, worlds=1, steps=400, workers=1, control="zero")
-    awake = mj.MjModel.from_xml_string(SLEEPING.replace("enable", "disable"))
-    data = mj.MjData(awake)
-    for step in range(400):
-        mj.mj_forward(awake, data)
-        judged = lv.residual(lv.io.from_mujoco(awake, data), lv.io.mujoco.impulse(awake, data))
-        assert found.numbers[0, 0, step] == pytest.approx(judged.velocity, rel=1e-6, abs=1e-12)
-        mj.mj_step(awake, data)
-    assert "Sleep was off" in words_of(found)
-    assert "Sleep" not in words_of(audit(path_without_sleep(tmp_path), worlds=1, steps=2, workers=1))
-
-
-def path_without_sleep(folder):
-    path = folder / "awake.xml"
-    path.write_text(BOXES.format(options=""))
-    return path
-
-
 # A joint whose damping is negative above 0.025 rad/s: it runs away from larger velocities, and from no smaller one.
 FRAGILE = """<mujoco><option timestep="0.01"/><worldbody><geom type="plane" size="5 5 .1"/>
   <body pos="0 0 .099"><joint type="slide" axis="0 0 1"/><geom type="box" size=".1 .1 .1"/></body>

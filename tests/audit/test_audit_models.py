@@ -108,25 +108,6 @@ def test_audit_of_an_environment_judges_each_step_with_the_model_at_its_time(tmp
     assert any("give the changed model" in note for note in notes)
 
 
-class FallingOff(Environment):
-    """An environment whose velocity becomes infinite in its third step."""
-
-    def step(self, action):
-        self.data.ctrl[:] = action
-        if self.count == 2:
-            self.data.qvel[0] = np.inf
-        mj.mj_step(self.model, self.data, nstep=3)
-        self.count += 1
-        return self.data.qpos.copy(), 0.0, False, False, {}
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_audit_of_an_environment_that_diverges_judges_the_steps_before():
-    found = audit(FallingOff(), worlds=2, steps=12)
-    assert (found.n_judged, found.n_unjudged, found.n_diverged) == (12, 12, 2)
-    assert [(d.world, d.step) for d in found.divergences] == [(0, 6), (1, 6)]
-
-
 @pytest.mark.filterwarnings("ignore")
 def test_audit_of_a_gymnasium_environment_counts_its_steps():
     gymnasium = pytest.importorskip("gymnasium")

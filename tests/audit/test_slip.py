@@ -133,45 +133,6 @@ def test_slip_advice_lists_only_settings_that_reduce_simulated_slip():
     assert stiff.variants[0].speeds.max() < soft.variants[0].speeds.max() / 5.0
 
 
-# A box that slides with 0.44 m/s, and a weight whose motor amplifies its velocity until MuJoCo restarts the simulation.
-DIVERGING = """<mujoco><option timestep=".01"/><worldbody><geom name="floor" type="plane" size="5 5 1"/>
-  <body pos="0 0 .099"><freejoint/><geom name="box" type="box" size=".1 .1 .1" friction=".3"/></body>
-  <body pos="1 0 1" gravcomp="1"><joint name="h" type="slide" axis="0 0 1"/>
-    <geom size=".05" contype="0" conaffinity="0" mass=".01"/></body></worldbody>
-  <actuator><general joint="h" gaintype="fixed" biastype="affine" gainprm="1" biasprm="0 0 90"/></actuator></mujoco>"""
-
-
-def make_diverging_states(weight_speeds):
-    """Return the model and states in which the weight of `DIVERGING` has these speeds [m/s]."""
-    model = mujoco.MjModel.from_xml_string(DIVERGING)
-    qpos = np.repeat(np.array([[0, 0, 0.099, 1, 0, 0, 0, 0.1]]), len(weight_speeds), axis=0)
-    qvel = np.zeros((len(weight_speeds), 7))
-    qvel[:, 0], qvel[:, 6] = 1.0, weight_speeds
-    return model, {"qpos": qpos, "qvel": qvel}
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_explain_slip_of_states_diverging_step_is_left_out():
-    """A weight of 1e9 m/s is accelerated above MuJoCo's limit of 1e10 in the explained step."""
-    model, states = make_diverging_states([1e9, 0.0])
-    result = explain_slip_of_states(model, states)
-    assert (result.diverged, [e.state for e in result.explanations]) == ((0,), [1])
-    assert "1 state of 2 is left out, the first is state 0" in result.notes[0]
-    assert result.table["slip [m/s]"].max() < 1.0
-    # A step before the explained one counts, too.
-    assert explain_slip_of_states(model, {k: x[:1] for k, x in states.items()}, steps=4).diverged == (0,)
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_slip_remedies_start_only_from_states_that_do_not_diverge():
-    model, states = make_diverging_states([1.0, 0.0])
-    states["qvel"][0, 0] = 2.0  # The diverging state slides faster.
-    result = explain_slip_of_states(model, states)
-    assert result.worst.state == 0 and result.worst.n_states == 1
-    (alone,) = explain_slip_of_states(model, {k: x[1:] for k, x in states.items()}).explanations
-    assert [r.later for r in result.worst.remedies] == pytest.approx([r.later for r in alone.remedies], nan_ok=True)
-
-
 def test_slip_remedies_start_from_all_states_with_the_fastest_contact():
     model = block(0.2, friction=0.4, option='cone="elliptic"')
     speeds = np.array([0.5, 1.0, 0.2])

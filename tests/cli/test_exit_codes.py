@@ -61,7 +61,7 @@ def split_lines(text):
     return [words.strip() for line in text.strip().splitlines() for words in line.split("|")]
 
 
-def test_documented_exit_codes_equal_those_of_the_package():
+def test_documented_exit_codes_equal_the_package():
     rows = re.findall(r"^\| (\d+) \| (.*) \|$", COMMANDS_PAGE.read_text().partition("## Exit codes")[2], re.M)
     assert {int(code): meaning for code, meaning in rows} == cli.EXIT_CODES
 

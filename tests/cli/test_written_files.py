@@ -2,7 +2,6 @@
 
 import contextlib
 import errno
-import json
 import os
 from ast import literal_eval
 from importlib.util import find_spec
@@ -10,13 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from stacks import stack
 from worked import python
 
 import lavender as lv
 from lavender import io, report
 from lavender.io.stored import write_text
-from lavender.report.store import Store, to_jsonable
+from lavender.report.store import Store
 from lavender.sim.engine import run
 from lavender.sim.engine.picture import Film
 
@@ -169,19 +167,3 @@ def test_every_command_writes_files_under_temporary_names_first(tmp_path):
 
 
 # -- records ------------------------------------------------------------------------------------------------------
-
-
-def test_read_records_of_a_malformed_line_names_its_number(tmp_path):
-    for text in ("[" * 100_000, "1" * 5000, '{"kind": ["run"]}', "null", "\x00\x00"):
-        (tmp_path / "records.jsonl").write_text(f"{text}\n")
-        with pytest.raises(lv.InputError, match="line 1"):
-            report.read(tmp_path)
-
-
-def test_a_record_of_an_undescribed_case_is_rejected(tmp_path):
-    plan, rows = report.Plan(tolerances=(1e-3,), budgets=(), repeats=1), []
-    report.run([stack(name="one")], ["pgs"], plan, into=rows)
-    lines = [json.dumps(to_jsonable(row)) for row in rows if row["kind"] != "case"]
-    (tmp_path / "records.jsonl").write_text("\n".join(lines) + "\n")
-    with pytest.raises(lv.InputError, match="a record belongs to a case that no line describes"):
-        report.read(tmp_path)

@@ -199,7 +199,7 @@ def test_vectors_are_of_methods_that_the_library_takes(library):
         ("anderson", {"convex": 5}, {"convex": 5}),
     ],
 )
-def test_options_are_those_of_the_package(library, method, asked, words):
+def test_options_equal_the_options_of_the_package(library, method, asked, words):
     given = self_test_problem()
     found = lv.solve(given, method, tol=0, max_iter=25, **words)
     solver = library.open(library.problem(given), library.options(method, **asked))
@@ -250,7 +250,7 @@ def test_c_library_carries_impulses_by_key(library):
     assert not solver.impulse().any()
 
 
-def test_c_library_velocities_are_those_of_the_package(library):
+def test_c_library_velocities_equal_the_package(library):
     given = self_test_problem()
     solver = library.open(library.problem(given), library.options("sequential_impulses"))
     solver.run(30, 0.0)
@@ -361,7 +361,7 @@ def test_c_library_newton_on_singular_rows_ends_by_a_line_search(library):
     assert descended
 
 
-def test_motion_errors_are_those_of_the_package(library):
+def test_motion_errors_equal_the_package(library):
     looked = 0
     for given in GIVEN:
         try:

@@ -217,34 +217,6 @@ def test_from_efc_of_a_world_with_a_bad_acceleration_has_no_answer(bad):
     assert np.isfinite(judged).tolist() == [True, False, True]
 
 
-def test_from_mujoco_many_of_a_model_with_sleep_is_rejected_and_agrees_with_from_mujoco_without():
-    if not hasattr(mj.mjtEnableBit, "mjENBL_SLEEP"):
-        pytest.skip("this MuJoCo has no sleep")
-    box = '<body pos="{} 0 .1"><freejoint/><geom type="box" size=".1 .1 .1"/></body>'
-    text = (
-        '<mujoco><option timestep=".005"><flag sleep="enable"/></option><worldbody>'
-        f'<geom type="plane" size="9 9 .1"/>{box.format(0)}{box.format(1)}</worldbody></mujoco>'
-    )
-    for word in ("enable", "disable"):
-        model = mj.MjModel.from_xml_string(text.replace("enable", word))
-        data = mj.MjData(model)
-        for _ in range(400):
-            mj.mj_step(model, data)
-        kind = mj.mjtState.mjSTATE_INTEGRATION
-        state = np.empty(mj.mj_stateSize(model, kind))
-        mj.mj_getState(model, data, state, kind)
-        mj.mj_forward(model, data)
-        if word == "enable":
-            assert data.nefc == 0 and data.ntree_awake == 0
-            with pytest.raises(lv.InputError, match=r"trees that sleep.*mjENBL_SLEEP"):
-                lv.io.from_mujoco_many(model, state[None])
-        else:
-            batch, impulse = lv.io.from_mujoco_many(model, state[None])
-            one = lv.residual(lv.io.from_mujoco(model, data), lv.io.mujoco.impulse(model, data))
-            assert batch.row_counts[0] == data.nefc > 0
-            assert lv.residual_many(batch, impulse).velocity_error[0] == pytest.approx(one.velocity)
-
-
 def test_from_efc_of_coulomb_law_on_unsupported_contacts_raises():
     model = mj.MjModel.from_xml_string(scene(cone="elliptic", condim=4))
     given = stacked(model, states_of(model, 2), np.float64)

@@ -101,7 +101,7 @@ CLAIMS = claims(CLAIMS_TEXT)[0]
 
 
 @pytest.mark.parametrize("command", sorted(CLAIMS))
-def test_chapter_numbers_equal_those_of_the_command(command):
+def test_chapter_numbers_equal_the_command(command):
     assert f"`{command}`" in PAGE
     for numbers, tolerance, line in CLAIMS[command]:
         check(numbers, tolerance, line, printed(command))

@@ -226,3 +226,9 @@ def test_comparison_of_models_names_the_values_that_a_converter_lost(capsys):
     assert not any("damping" in line or "limits" in line for line in lines)
     module.compare(source, source)
     assert "hinge" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in EXAMPLES.glob("*.py")))
+def test_every_example_can_be_imported(name):
+    module = example(name)
+    assert Path(module.__file__).stem == name and module.__doc__

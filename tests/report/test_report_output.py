@@ -1,7 +1,6 @@
 """Terminal, page, files and figures of one report in which every part has something to show."""
 
 import html.parser
-import io
 import re
 from pathlib import Path
 from xml.etree import ElementTree
@@ -10,10 +9,9 @@ import numpy as np
 import pandas as pd
 import pytest
 from approved_texts import check_text
-from rich.console import Console
 
 from lavender.report import drawing, figures, write
-from lavender.report.render import print_table, write_files
+from lavender.report.render import write_files
 from tests.report.synthetic import EVIL, FALSE_CLAIM, example, record, report_of, shown, skip
 
 
@@ -154,18 +152,6 @@ def test_terminal_short_report_of_any_size_has_the_answer_first_and_ten_solvers(
     assert sum(bool(re.match(r"solver_\d+ +\d", line)) for line in lines) == 10
     text = "\n".join(lines)
     assert all(word in text for word in ("false claim, the", "left out", "suspicious", "machine was busy"))
-
-
-def test_print_table_that_is_too_wide_names_the_columns_that_it_leaves_out():
-    name = "worlds/worst_of_a_long_name_1.npz"
-    table = pd.DataFrame({"file": [name], **{f"number {i} [m/s]": ["1.234567"] for i in range(12)}})
-    out = io.StringIO()
-    print_table(Console(file=out, width=80), table, optional=["number 3 [m/s]"])
-    text = out.getvalue()
-    left_out = text[text.index("not shown: ") :]
-    assert left_out.startswith("not shown: number 3 [m/s], number 11 [m/s]") and "number 0" not in left_out
-    assert max(map(len, text.splitlines())) <= 80 and "number 0" in " ".join(text.split())
-    assert name in "".join(line[:80].split("  ")[0].strip() for line in text.splitlines()[1:]).replace("file", "")
 
 
 def test_write_files_has_frames_as_csv_and_data_as_json(tmp_path):

@@ -146,24 +146,6 @@ def test_run_solver_that_raises_costs_its_own_record(plug_in):
     assert sum(r.solver == "fake_raise" for r in found) == 2  # After it, no tolerance can be reached.
 
 
-def test_run_plug_in_that_tests_nothing_is_timed_with_its_default_budget(register):
-    class Untested:
-        def prepare(self, problem):
-            return lv.prepare(problem, "pgs")
-
-        def run(self, state, impulse, n, tol, time_limit=None):
-            assert n < 1000, "it would never end"
-            impulse[:] = state.solve(impulse=impulse, tol=0.0, max_iter=n).impulse
-            return lv.Claim(lv.Status.MAX_ITERATIONS, n)
-
-    laws = {"coulomb", "lcp", "linear", "cone"}
-    register(lv.SolverSpec("untested", Untested, laws=laws, summary="of a test", max_iter=200))
-    plan = report.Plan(tolerances=(1e-3,), budgets=(), repeats=1)
-    (record,) = rows_of(report.run([stack(2)], ["untested"], plan))
-    assert (record.status, record.iterations) == ("CONVERGED", 200)
-    assert format_call(record) == ('lv.solve(problem, "untested", tol=1e-3)',)
-
-
 def test_run_solver_of_free_rows_is_replaced_by_its_bounded_variant():
     free = lv.Problem.linear(np.diag([2.0, 3.0]), np.ones(2), name="free")
     found = report.run([stack(4), free], ["gauss_seidel"], QUICK)
@@ -395,18 +377,6 @@ def test_run_recording_from_step_30_of_a_warm_engine_has_its_error_in_the_table(
     assert study.cold.loc["sequential_impulses", sweeps] > 2.0 * max(errors[1:])
 
 
-def test_run_sequence_names_a_suspicious_step_with_the_number_of_such_steps():
-    cones, eye = lv.Cones.contacts(0.5), np.eye(3)
-    problems = [
-        lv.Problem.from_jacobian(eye, eye, [-1.0, 0.0, 0.0], cones=cones, target=[speed, 0.0, 0.0])
-        for speed in (0.0, 100.0, 0.0, 200.0)
-    ]
-    plan = report.Plan(tolerances=(), budgets=(2,), repeats=1)
-    found = report.Report(report.run(report.make_sequence(problems, "load"), ["pgs"], plan)).warnings
-    (text,) = (text for text in found if text.startswith("suspicious"))
-    assert text.startswith("suspicious: load[1], 2 of 4 steps: targets: 1 contacts have targets up to 100 m/s")
-
-
 def test_run_sequence_pass_ends_at_its_time_limit_with_a_note(tmp_path, monkeypatch):
     items = report.make_sequence(moving_stack(5), "load")
     # No solve takes less than a picosecond: each pass ends after its first step.
@@ -448,16 +418,6 @@ def test_campaign_one_worker_and_two_give_equal_bits_and_no_times(tmp_path):
         report.run(["toy_stack"], ["direct"], report.Plan(), workers=2)
 
 
-def test_campaign_exception_of_the_watch_stops_workers_without_warnings(tmp_path, recwarn):
-    def stop(event):
-        raise OSError("no room")
-
-    path, stored = tmp_path / "records.jsonl", []
-    with pytest.raises(OSError, match="no room"):
-        report.run(NAMES, ["pgs", "direct"], CAMPAIGN, path, workers=2, watch=stop, into=stored)
-    assert not recwarn.list and texts(make_lines(stored)) == texts(report.read(path))
-
-
 def test_campaign_problems_files_and_local_solvers_are_sent_to_workers(tmp_path, plug_in):
     short = report.CampaignPlan(tolerances=(1e-6,), budgets=())
     p = lv.Problem.lcp(np.array([[2.0, 1.0], [1.0, 2.0]]), np.ones(2), name="mine")
@@ -470,15 +430,6 @@ def test_campaign_problems_files_and_local_solvers_are_sent_to_workers(tmp_path,
         plug_in(lambda problem, impulse: lv.Claim(lv.Status.MAX_ITERATIONS, 1, {"mine": 1}), name)
     found = report.run(["toy_stack"], ["here_alone", "pgs"], short, workers=2)
     assert [json.loads(r.work) for r in rows_of(found)] == 2 * [{"mine": 1}]
-
-
-def test_campaign_changed_file_is_measured_again(tmp_path):
-    short, file = report.CampaignPlan(tolerances=(1e-6,), budgets=()), tmp_path / "file.npz"
-    shas = []
-    for factor in (1.0, 1.0, 2.0):
-        lv.Problem.lcp(factor * np.eye(2), np.ones(2)).save(file)
-        shas.append({r.sha for r in rows_of(report.run([file], ["pgs"], short, tmp_path / "records.jsonl"))})
-    assert shas[0] == shas[1] != shas[2]
 
 
 @pytest.mark.parametrize(

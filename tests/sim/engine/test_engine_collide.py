@@ -175,7 +175,7 @@ def overlapping(sim):
     spread=st.floats(1.0, 30.0),
     decades=st.floats(0.0, 6.0),
 )
-def test_broad_phase_pairs_equal_those_of_testing_all(seed, n, spread, decades):
+def test_broad_phase_finds_all_pairs(seed, n, spread, decades):
     rng = np.random.default_rng(seed)
     scene = lv.Scene(gravity=0.0)
     scene.add_plane((1, 2, 3), -1.0)

@@ -36,55 +36,6 @@ def recording(tmp_path_factory):
 
 
 HEAD = "from libc.stdint cimport int32_t\n"
-BAD = {
-    "a parallel loop": """
-from cython.parallel cimport prange
-cdef public double lav_bad(const double* x, int32_t n) noexcept nogil:
-    cdef int32_t i
-    cdef double s = 0.0
-    for i in prange(n):
-        s += x[i]
-    return s
-""",
-    "a division that raises": """
-cimport cython
-@cython.cdivision(False)
-cdef public double lav_bad(double x, double y) noexcept nogil:
-    return x / y
-""",
-    "libm": """
-from libc.math cimport sin
-cdef public double lav_bad(double x) noexcept nogil:
-    return sin(x)
-""",
-    "a module-level variable": """
-cdef double EPS = 1e-9
-cdef public double lav_bad(double x) noexcept nogil:
-    return x + EPS
-""",
-    "a table": """
-cdef extern from *:
-    '''
-    static const double TABLE[64] = {3, 1, 4, 1, 5};
-    '''
-    const double TABLE[64]
-cdef public double lav_bad(int32_t i) noexcept nogil:
-    return TABLE[i]
-""",
-}
-SIGNS = {"libm": "symbol: sin", "a parallel loop": "PyEval_SaveThread"}  # else: Python's side
-
-
-@needs_compiler
-@pytest.mark.parametrize("kind", BAD)
-def test_wasm_kernel_that_needs_python_does_not_link(tmp_path, kind):
-    path = tmp_path / "bad.pyx"
-    path.write_text(HEAD + BAD[kind])
-    with pytest.raises(wasm.BuildFailed, match=SIGNS.get(kind, "the Python part")):
-        wasm.build(tmp_path / "bad.wasm", ROOT, [path])
-    assert not (tmp_path / "bad.wasm").exists()
-
-
 GOOD = HEAD + "cdef public int32_t lav_good(int32_t x) noexcept nogil:\n    return 2 * x + <int32_t>sizeof(void*)\n"
 
 
