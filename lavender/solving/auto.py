@@ -31,7 +31,8 @@ Linear problems given by a matrix, and others with a narrow band as A, start wit
 is solved by backends (`singular_programs.py`). The result is the best impulse of all stages. Costs are estimated, never
 measured, so the same problem is solved in the same way on every machine. Under a time limit, a factorising solver
 starts only if its estimated cost fits in the remaining time; sweeps before it use at most the fraction `time_share` of
-the time, or all of it if no factorising solver fits. `Solution.stages` lists the stages that ran, `lavender.explain`
+the time, or all of it if no factorising solver fits. These are `nncg` under Coulomb's law, except on few bodies, and
+else `anderson`. `Solution.stages` lists the stages that ran, `lavender.explain`
 the stages that would run. The decisions depend on these numbers (`decisions.py`):
 
 """
@@ -62,7 +63,7 @@ from lavender.solvers.certify import (
 from lavender.solvers.decisions import DECISIONS, SMALL_ROWS, describe_numbers
 from lavender.solvers.islands import get_rows_of_blocks, restrict_to_blocks
 from lavender.solvers.registry import Solver, SolverSpec, get
-from lavender.solvers.small import AUTO, describe_stages
+from lavender.solvers.small import AUTO, describe_work
 from lavender.solving import steps as step_types
 from lavender.solving.compiled_call import choose_call_deadline, fits_in_time
 from lavender.solving.log import Recorder, SolveLog
@@ -77,9 +78,13 @@ __doc__ += describe_numbers() + "\n"
 
 # Under a time limit below this multiple of the least cost of Newton's method, sweeps use their share of the time first.
 AMPLE_TIME = 8.0
+# Newton's method follows them if this multiple of its cost fits. The sweeps leave as much time for it, but have at
+# least MIN_SWEEP_SHARE. The number of its steps varies more with friction.
+NEWTON_TIME, NEWTON_TIME_WITH_FRICTION, MIN_SWEEP_SHARE = 1.4, 2.0, 0.25
+# A factorising solver is assumed to take this multiple of the time that sweeps take per counted work: these and their
+# checks take 1.2 to 2.8 of it.
+PACE_MARGIN = 0.6
 MIN_ITERATIONS_FOR_COMPILED_CALL = 200  # With fewer allowed, the compiled call is not made.
-# Up to so many sweeps under a time limit, the start is returned if its relative residual is lower.
-MIN_DECISIVE_SWEEPS = 64
 # Under a time limit, `admm` follows sweeps if the time of this many sweeps remains.
 MIN_ADMM_SWEEPS = 500.0
 # [ns] Newton's method that has not ended runs on up to this cost: nine rows of masses over many orders took 4.4e7.
@@ -146,8 +151,9 @@ class Auto(Solver):
             if result_of_sweeps is not None:
                 return result_of_sweeps
         may_call = counts is None and max_iter >= MIN_ITERATIONS_FOR_COMPILED_CALL
-        if may_call and fits_in_time(problem, deadline):
-            own = choose_call_deadline(problem, deadline)
+        if may_call and (first is not None or fits_in_time(problem, deadline)):
+            # The impulse of sweeps is returned if the call does not end.
+            own = deadline if first is not None else choose_call_deadline(problem, deadline)
             result, counts = AUTO.solve_and_judge(problem, impulse, tol, own)
             if result is not None and result.relative <= tol:
                 claim = AUTO.make_claim(problem, counts, impulse, result.relative)
@@ -164,8 +170,8 @@ class Auto(Solver):
         log.start_from_better_impulse(impulse)
         log.recorder = recorder
         if first is not None:
-            tree.pace, tree.has_swept = first.pace, True
-            log.record_stage("anderson", first.claim, first.before)
+            tree.pace, tree.has_swept = 1.0, True
+            log.record_stage(first.name, first.claim, first.before)
         try:
             if max_iter > 0 and log.best > tol and not log.done():
                 for name, claim in failed:
@@ -175,7 +181,7 @@ class Auto(Solver):
             log.interrupted = True  # Return the best impulse so far also after Ctrl-C.
         except BREAKDOWN as error:
             log.failure = format_error(error)
-        impulse[:] = log.result if log.best > tol else log.impulse
+        impulse[:] = log.choose_result()
         return log.make_claim()
 
 
@@ -184,12 +190,20 @@ class FactoringTime:
 
     def __init__(self, problem: Problem, deadline: Deadline) -> None:
         self.deadline, self.cost = deadline, get("newton").load()().cost(problem)
-        self.total = self.cost.total  # [ns]
+        self.total, self.has_friction = self.cost.total, problem.law == "coulomb"  # [ns]
 
     def fits(self, margin: float = 1.0) -> bool:
         """Return whether this multiple of the cost fits."""
         fits = self.deadline.fits
         return fits(margin * self.total) and fits(margin * (self.total + self.cost.setup))
+
+    def choose_sweep_share(self) -> float:
+        """Return the fraction of the remaining time for sweeps before Newton's method; 1 if it does not follow."""
+        margin = NEWTON_TIME_WITH_FRICTION if self.has_friction else NEWTON_TIME
+        if not self.fits(margin):
+            return 1.0
+        rest = 1.0 - margin * (self.total + self.cost.setup) / self.deadline.get_remaining_nanoseconds()
+        return min(max(rest, MIN_SWEEP_SHARE), DECISIONS.time_share)
 
 
 class FirstSweeps:
@@ -201,11 +215,12 @@ class FirstSweeps:
 
     def __init__(self, problem: Problem, impulse: FloatArray, tol: float, time: FactoringTime) -> None:
         deadline = time.deadline
-        self.problem, self.tol, self.time, self.pace = problem, tol, time, 1.0
+        self.problem, self.tol, self.time = problem, tol, time
+        self.name = step_types.name_limited_sweeps(problem)
         self.start = impulse.copy()
         at_start = find_relative_at_zero(problem, self.start)
         self.before = nan if at_start is None else at_start
-        solver = step_types.make_solver("anderson", problem)
+        solver = step_types.make_solver(self.name, problem)
         state = step_types.prepare_sweeps(solver, problem, deadline)
         self.loop = Loop(problem=problem, solver=solver, state=state, impulse=impulse, tol=tol)
 
@@ -213,39 +228,38 @@ class FirstSweeps:
     def run(self, max_iter: int) -> Claim | None:
         """Sweep; return the claim of the solve, or None if other solvers continue from the result."""
         loop, deadline, problem = self.loop, self.time.deadline, self.problem
-        shares = self.time.fits()
-        left = deadline.get_remaining_seconds() or 0.0
-        loop.deadline = Deadline(DECISIONS.time_share * left) if shares else deadline
+        share = self.time.choose_sweep_share()
+        loop.deadline, left = deadline, deadline.get_remaining_nanoseconds()
+        if share < 1.0:
+            loop.deadline = Deadline(1e-9 * share * left)
         claim = loop.run_chunks(max_iter)
-        if shares and claim.status is Status.TIME_LIMIT:
-            cost = estimate_cost("anderson", problem).iteration
-            self.pace = step_types.measure_pace(loop.time, loop.done, cost)
-            shares = self.time.fits(self.pace)
-            if not shares:
-                loop.deadline = deadline
+        if share < 1.0 and claim.status is Status.TIME_LIMIT:
+            counted = loop.done * estimate_cost(self.name, problem).iteration
+            pace = PACE_MARGIN * (left - deadline.get_remaining_nanoseconds()) / max(counted, 1.0)
+            if not self.time.fits(max(pace, 1.0)):
+                share, loop.deadline = 1.0, deadline
                 claim = loop.run_chunks(max_iter)
         if loop.state.watch.has_best:
             loop._keep_best()
         else:
             loop.replace_by_best_impulse(self.start)
         self.claim = claim
-        is_over = claim.status in (Status.MAX_ITERATIONS, Status.TIME_LIMIT) and not shares
-        if not is_over and claim.status is not Status.CONVERGED:
-            return None
         judged = reuse_or_judge_impulse(problem, loop.impulse, loop.judged)
-        if loop.done < MIN_DECISIVE_SWEEPS and judged.relative > self.tol:
-            # Few sweeps may raise the error.
+        if not judged.relative <= self.tol:  # Sweeps may raise the error.
             if isnan(self.before):
                 first = judge_impulse(problem, choose_start(problem, self.start, self.tol))
                 self.before = float(first.relative)
-            if judged.relative > self.before:
+            if not judged.relative <= self.before:
                 loop.impulse[:] = choose_start(problem, self.start, self.tol)
                 judged = judge_impulse(problem, loop.impulse.copy())
+        is_over = claim.status in (Status.MAX_ITERATIONS, Status.TIME_LIMIT) and share == 1.0
+        if not is_over and claim.status is not Status.CONVERGED:
+            return None
         status = Status.CONVERGED if judged.relative <= self.tol else claim.status
         if claim.status is Status.CONVERGED is not status:
             return None
-        stages = (SolverStage("anderson", dict(claim.work), self.before, judged.relative),)
-        text = describe_stages(stages)
+        stages = (SolverStage(self.name, dict(claim.work), self.before, judged.relative),)
+        text = describe_work(self.name, claim.work)
         return replace(claim, status=status, message=text, form="", stages=stages, judged=judged)
 
 
@@ -270,6 +284,10 @@ def solve(log: SolveLog, tree: DecisionTree) -> None:
         step = steps.get(stage.solver)
         if step is None:
             step = steps[stage.solver] = create_solver_step(stage.solver, log, tree)
+        has_swept = tree.has_swept and not steps.keys() & {"newton", "direct", "newton on the relaxation"}
+        if has_swept and isinstance(step, Sweeps):
+            tree.skip(stage)
+            continue
         if log.deadline.is_set and not step.over:
             if isinstance(step, Sweeps):
                 cost = min(stage.cost, DECISIONS.time_share * log.deadline.get_remaining_nanoseconds())
@@ -278,8 +296,10 @@ def solve(log: SolveLog, tree: DecisionTree) -> None:
                     return
             elif not tree.leaves_time(stage, step):
                 step.over = step.late = log.timed_out = True
-        has_swept = tree.has_swept and not steps.keys() & {"newton", "direct", "newton on the relaxation"}
-        if step.over or (isinstance(step, Sweeps) and (has_swept or step.is_hopeless(stage.least))):
+                if tree.has_swept:
+                    sweep_until_deadline(log, tree, steps)
+                    return
+        if step.over or (isinstance(step, Sweeps) and step.is_hopeless(stage.least)):
             tree.skip(stage)
         else:
             step.least = stage.least

@@ -54,6 +54,7 @@ class SolveLog:
         # Smallest relative residual, the impulse (m,) [N s] with this residual, and the judge's result if it is known.
         self.best, self.impulse = inf, problem._start
         self.judged: Any = None
+        self.start = problem._start, inf  # First impulse (m,) [N s], and its relative residual.
         self._best_islands: Any = (
             None  # `BestImpulse` from the start of the solve; None before a start is stored.
         )
@@ -77,11 +78,26 @@ class SolveLog:
         self.impulse = start.copy()
         relative = find_relative_at_zero(self.problem, start)
         self.best = float(residual(self.problem, start).relative) if relative is None else relative
+        self.start = self.impulse, self.best
 
     @property
     def result(self) -> FloatArray:
         """Impulse (m,) [N s] with the best impulse of each island, until one impulse meets tol in all islands."""
         return self.problem._start if self._best_islands is None else self._best_islands.impulse
+
+    def choose_result(self) -> FloatArray:
+        """Return the impulse (m,) [N s] of the solve: one that meets tol, or the best one of each island.
+
+        After a deadline, it is the start if the islands' best impulses together have a larger residual than the start.
+        """
+        if self.best <= self.tol:
+            return self.impulse
+        if self.timed_out or self.deadline.has_passed():
+            start, at_start = self.start
+            self.judged = reuse_or_judge_impulse(self.problem, self.result, self.judged)
+            if not self.judged.relative <= at_start:
+                return start
+        return self.result
 
     def judge_and_store_best(self, impulse: FloatArray, judged: Any = None) -> None:
         """Judge an impulse (m,) [N s] and store it in the islands in which it is the best.

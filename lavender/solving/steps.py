@@ -31,14 +31,18 @@ FIRST_SWEEPS_OF_LARGE_PROBLEM = 8  # Sweeps of `is_large` problems before the fi
 FIRST_RELAXED_FACTORISATIONS = 6  # Interior points on the relaxation need at least as many factorisations.
 RELAXED_TOLERANCE = 0.01  # The relaxation's tolerance relative to tol, since Coulomb's residual is larger.
 FORMATION_COST_RATIO = 4.0  # Sweeps use a formed A only if this multiple of the cost to form it remains.
-# A factorising solver is assumed to take this multiple of the time that sweeps take per counted work, at most MAX_PACE.
-PACE_MARGIN, MAX_PACE = 1.5, 20.0
 HALVING_FACTORISATIONS = 30  # A turn of Newton's method continues while the last ones halve the residual.
 #: Solver of each step, by its name. On large piles, `admm` needs fewer iterations from zero than from sweeps.
 METHODS = {
     "anderson": "anderson", "newton": "newton", "direct": "direct", "admm": "admm", "admm from zero": "admm",
-    "newton on the relaxation": "newton",
+    "newton on the relaxation": "newton", "nncg": "nncg",
 }  # fmt: skip
+
+
+def name_limited_sweeps(problem: Problem) -> str:
+    """Return the name of the sweeps under a tight time limit: `nncg` under Coulomb's law, except on few bodies."""
+    is_small = problem.rows is not None and problem.m <= DECISIONS.island_rows
+    return "anderson" if problem.law != "coulomb" or is_small else "nncg"
 
 
 def make_solver(name: str, problem: Problem) -> Any:
@@ -46,6 +50,8 @@ def make_solver(name: str, problem: Problem) -> Any:
     if name == "direct" and problem.law == "linear":
         return SufficientDirect()  # `auto` needs no refinement of a solution that meets tol.
     # Solve blocks exactly under the cone law, and for a matrix: rows of a contact may differ in unit.
+    if name == "nncg":
+        return get(name).load()(restart="against")
     exact = problem.law == "cone" or (problem.law == "coulomb" and problem.matrix is not None)
     spec = get(METHODS[name])
     return spec.load()(**({"sweep": "blocks"} if exact and "sweep" in spec.options else {}))
@@ -75,11 +81,6 @@ def prepare_sweeps(solver: Any, problem: Problem, deadline: Deadline) -> Any:
         FORMATION_COST_RATIO * estimate_formation_cost(problem)
     )
     return build_state_in_given_form(solver, problem) if too_late else solver.prepare(problem)
-
-
-def measure_pace(seconds: float, iterations: int, cost: float) -> float:
-    """Return the time of counted work on this machine as a multiple of its cost [ns], with a margin."""
-    return min(max(PACE_MARGIN * seconds / max(1e-9 * iterations * cost, 1e-9), 1.0), MAX_PACE)
 
 
 class Step:
@@ -352,6 +353,6 @@ class Sweeps(Iterations):
 
 #: Class of the step of each solver; the other solvers have `Iterations`.
 STEP_CLASSES = {
-    "anderson": Sweeps, "direct": Step, "newton": Newton,
+    "anderson": Sweeps, "nncg": Sweeps, "direct": Step, "newton": Newton,
     "newton on the relaxation": RelaxedNewton,
 }  # fmt: skip
