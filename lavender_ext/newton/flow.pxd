@@ -64,7 +64,6 @@ cdef inline void begin_flow(newton_t* n, const double* z, int32_t limit, int32_t
     """
     cdef flow_t* x = &n.flow
     cdef int32_t i, j
-    x.has_run = 1
     for i in range(n.depth):
         if n.stack[i] == FLOW or n.stack[i] == DAMPED_NEWTON:   # Damped Newton has one state, which trials overwrite.
             n.depth = i

@@ -11,29 +11,27 @@
                                               if joints are rigid
                     CONVEX_DAMPED_NEWTON      proximal damped Newton; its direction may prove     CONVEX_END
                                               that there is no solution
-    Coulomb's       START_FLOW                Euler steps, if the start solves the convex law     START_DAMPED_NEWTON
-                    START_DAMPED_NEWTON       proximal damped Newton from the start               FIRST_DE_SAXCE
-                    FIRST_DE_SAXCE            De Saxce's interior point, 0.95 of phi's derivative FIRST_FLOW
+    Coulomb's       START_DAMPED_NEWTON       proximal damped Newton from the start               DE_SAXCE
+                    DE_SAXCE                  De Saxce's interior point                           DE_SAXCE_END
+                    DE_SAXCE_END              damped Newton from its best point, unless that is   FIRST_FLOW
+                                              far from a solution
                     FIRST_FLOW                Euler steps, if this point is near a solution       CONVEX_POINT
                     CONVEX_POINT              interior point of the convex law, judged under      CONVEX_FLOW
-                                              Coulomb's law, unless the start solves it; ends
-                                              if many contacts slide
-                    CONVEX_FLOW               Euler steps from it, if few contacts slide          FIRST_PATH
-                    FIRST_PATH                path of smoothed problems, unless joints are rigid  SECOND_DE_SAXCE
-                    SECOND_DE_SAXCE           De Saxce's interior point with 0.7 of it            AUGMENTED_DE_SAXCE
-                    AUGMENTED_DE_SAXCE        the same on the augmented system, if joints are     LAST_PATH
-                                              rigid
-                    LAST_PATH                 the path of smoothed problems, if joints are rigid  LAST_FLOW
-                    LAST_FLOW                 Euler steps from the best point                     COULOMB_DAMPED_NEWTON
+                                              Coulomb's law; ends if many contacts slide
+                    CONVEX_FLOW               Euler steps from it, if few contacts slide          AUGMENTED_DE_SAXCE
+                    AUGMENTED_DE_SAXCE        De Saxce's interior point on the augmented system,  PATH_OR_FLOW
+                                              if joints are rigid and the best point is near
+                    PATH_OR_FLOW              path of smoothed problems; if the problem is at     FLOW_OR_PATH
+                                              rest, Euler steps from the best point
+                    FLOW_OR_PATH              the other of these two                              COULOMB_DAMPED_NEWTON
                     COULOMB_DAMPED_NEWTON     proximal damped Newton from the best point          COULOMB_END
 
 A large problem is at rest if the impulse that holds all contacts puts little load on contacts whose friction exceeds its
-bound. De Saxce's interior point, which computes this impulse, then takes fewer steps, and the steps of LAST_FLOW come before
-the path.
+bound. De Saxce's interior point, which computes this impulse, then takes fewer steps.
 
 Each state with a problem that needs it: without the state the problem is lost, or takes this many times as long. `python -m
-benchmarks scale --without STATE` measures this, except for states of DE_SAXCE. A problem is a structure of
-benchmarks/scale_structures.py with rows, sliding [m/s] and spread of log mass, a case of the suite, or a file of the test data.
+benchmarks scale --without STATE` measures this. A problem is a structure of benchmarks/scale_structures.py with rows, sliding
+[m/s] and spread of log mass, a case of the suite, or a file of the test data.
 tol is 1e-6 unless the line names another one.
 
     START_ACTIVE_SET          granular(n=6) from its solution, b changed by 1 %: 2.4
@@ -44,24 +42,17 @@ tol is 1e-6 unless the line names another one.
     THIRD_CONE_WEIGHT         pyramid(k=6, mass_ratio=1e6, friction="coulomb", sliding=0.5), cone law, to 1e-8
     AUGMENTED_INTERIOR_POINT, AUGMENTED_DE_SAXCE    Scene("bridge", friction=0.5), step 99, cone and Coulomb's law, to 1e-8
     CONVEX_DAMPED_NEWTON      lcpgen_psd-300, proof that it has no solution
-    START_FLOW                granularF(n=6, sliding=2, seed=2) from the solution of the cone law: 2.4
     START_DAMPED_NEWTON       engine/balls_step_0030: 4.6
-    FIRST_DE_SAXCE            cards 3000 0.1 0: 20
+    DE_SAXCE                  cards 3000 0.1 0: 20
     FIRST_FLOW                cards 900 0.1 0: 5.0
     CONVEX_POINT              pile 3000 0.5 0
     CONVEX_FLOW               granularF(n=4, sliding=2, seed=10): 9
-    FIRST_PATH                wall 3000 0.5 1
-    SECOND_DE_SAXCE           ragdolls 300 0.5 0: 1.9
-    DE_SAXCE_SECOND_END       ragdolls 3000 0.5 1, seed 31: 3.2
-    LAST_PATH                 ragdolls 3000 0 1, seed 31
-    LAST_FLOW, COULOMB_DAMPED_NEWTON    wall 3000 0.5 1: each solves it without the other
+    PATH_OR_FLOW              wall 3000 0.5 1
+    FLOW_OR_PATH              ragdolls 3000 0 1, seed 31
+    COULOMB_DAMPED_NEWTON     pyramid 3000 0.05 0.5, seed 151
 
 Every state ends the solve as soon as the best point is within tol or at the round-off limit, a certificate is proven,
-or the budget is spent. De Saxce's interior point has states of its own:
-
-    DE_SAXCE_INTERIOR    interior point                              far from a solution: end;  else DE_SAXCE_END
-    DE_SAXCE_END         damped Newton from its best point           DE_SAXCE_SECOND_END
-    DE_SAXCE_SECOND_END  the same with a smaller proximal weight     end
+or the budget is spent.
 """
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
@@ -79,15 +70,13 @@ from lavender_ext.newton.damped_newton cimport (begin_damped_newton, begin_dampe
 from lavender_ext.newton.interior_phases cimport (augmented_shift, begin_interior_steps, begin_interior_with_newton,
                                                   compute_overloaded_fraction, compute_sliding_fraction, step_augmented_newton,
                                                   step_interior_point, step_interior_with_newton)
-from lavender_ext.newton.run cimport (ACTIVE_SET, AUGMENTED_NEWTON, DAMPED_NEWTON, DAMPED_STRETCHES, DE_SAXCE, FLOW,
+from lavender_ext.newton.run cimport (ACTIVE_SET, AUGMENTED_NEWTON, DAMPED_NEWTON, DAMPED_STRETCHES, FLOW,
                                       INTERIOR_POINT, INTERIOR_WITH_NEWTON, MAX_INNER_STEPS, N_COUNTED, N_REFINEMENTS,
-                                      UNLIMITED, PLAN_CONVEX, PLAN_COULOMB, begin_separate_best, convex_residual,
-                                      compute_slack, copy_vector, de_saxce_t, end_separate_best, is_at_roundoff,
+                                      UNLIMITED, PLAN_CONVEX, PLAN_COULOMB, compute_slack, copy_vector, is_at_roundoff,
                                       is_budget_spent, is_finished, is_over, newton_t, pop_phase, push_phase,
                                       judge_and_keep_best_point, write_unknown)
 from lavender_ext.newton.steps cimport begin_interior_point, has_free_rows, compute_proximal_weight
-from lavender_ext.newton.system cimport (BARRIER, BODIES, factor_newton_system, has_passed_after_part, multiply_system_matrix,
-                                         solve_newton_system)
+from lavender_ext.newton.system cimport (BARRIER, BODIES, factor_newton_system, has_passed_after_part, solve_newton_system)
 
 
 cdef enum:                      # states of PLAN_CONVEX
@@ -102,32 +91,23 @@ cdef enum:                      # states of PLAN_CONVEX
     CONVEX_END = 8
 
 cdef enum:                      # states of PLAN_COULOMB
-    START_FLOW = 0
-    START_DAMPED_NEWTON = 1
-    FIRST_DE_SAXCE = 2
+    START_DAMPED_NEWTON = 0
+    DE_SAXCE = 1
+    DE_SAXCE_END = 2
     FIRST_FLOW = 3
     CONVEX_POINT = 4
     CONVEX_FLOW = 5
-    FIRST_PATH = 6
-    SECOND_DE_SAXCE = 7
-    AUGMENTED_DE_SAXCE = 8
-    LAST_PATH = 9
-    LAST_FLOW = 10
-    COULOMB_DAMPED_NEWTON = 11
-    COULOMB_END = 12
-
-cdef enum:                      # states of DE_SAXCE
-    DE_SAXCE_INTERIOR = 0
-    DE_SAXCE_END = 1
-    DE_SAXCE_SECOND_END = 2
-    DE_SAXCE_ENDED = 3
+    AUGMENTED_DE_SAXCE = 6
+    PATH_OR_FLOW = 7
+    FLOW_OR_PATH = 8
+    COULOMB_DAMPED_NEWTON = 9
+    COULOMB_END = 10
 
 cdef enum:
     POINT_REFINEMENTS = 3       # Refinements of an interior point's first z with the factor of its weighted system.
     EXACT_POINT_REFINEMENTS = 20    # Refinements of linear rows with a factor of nearly no weight, which is less exact.
     MIN_CONVEX_ROWS = 300      # With fewer rows the paths cost less than the convex point.
-    CONVEX_START_FACTORISATIONS = 40   # Budget of Euler steps from a convex start; many piles take fewer than 30.
-    CONVEX_FLOW_FACTORISATIONS = 300  # Its budget before the paths; piles that it solves take up to 240.
+    CONVEX_FLOW_FACTORISATIONS = 300  # Budget of Euler steps from the convex point; piles that they solve take up to 240.
     MIN_FLOW_ROWS = 900         # With fewer rows the paths take few factorisations.
     FLOW_PATIENCE = 60          # Euler steps from a near point end if so many factorisations do not halve the residual.
     LAST_FLOW_FACTORISATIONS = 1000     # Budget of the last Euler steps; sliding pyramids that they solve take up to 900.
@@ -136,17 +116,16 @@ cdef enum:
     START_FACTORISATIONS = 8    # First stretch of damped Newton; a start near a solution gains within it.
     END_INNER_STEPS = 10
     END_FACTORISATIONS = 15     # Factorisations of the damped Newton phase after De Saxce's interior point.
-    SECOND_END_FACTORISATIONS = 12  # Factorisations and inner steps of the second damped Newton phase after it.
     MAX_AUGMENTED_ROWS = 10000  # With more rows, one factorisation of the augmented system may exceed 0.2 s.
 
 
-cdef inline double first_derivative_fraction() noexcept nogil:
-    """Return the part of phi's derivative in the first De Saxce interior point. Near 1 it ends faster, but passes fewer folds."""
+cdef inline double derivative_fraction() noexcept nogil:
+    """Return the part of phi's derivative in De Saxce's interior point. Near 1 it ends faster, but passes fewer folds."""
     return 0.95
 
 
-cdef inline double second_derivative_fraction() noexcept nogil:
-    """Return the part of phi's derivative after a failure of the first part."""
+cdef inline double augmented_derivative_fraction() noexcept nogil:
+    """Return the part of phi's derivative in De Saxce's interior point on the augmented system, after a failure of the other."""
     return 0.7
 
 
@@ -275,9 +254,10 @@ cdef inline void begin_unbounded_point(newton_t* n) noexcept nogil:
         refine_point(n, n.trial, EXACT_POINT_REFINEMENTS, 1.0)
 
 
-cdef inline bint has_rigid_joints(const newton_t* n) noexcept nogil:
-    """Return whether rows may be nearly dependent, as in loops of rigid joints. It must not depend on the caller's factor."""
-    return n.s.form == BODIES and n.s.e.m <= MAX_AUGMENTED_ROWS and has_free_rows(n)
+cdef inline bint may_need_augmented_system(const newton_t* n) noexcept nogil:
+    """Return whether nearly dependent rows, as in loops of rigid joints, may prevent progress from a near point."""
+    return (n.best < 1e-3 and n.has_augmented and n.s.form == BODIES and n.s.e.m <= MAX_AUGMENTED_ROWS
+            and has_free_rows(n))
 
 
 # -- bounded rows and cones --------------------------------------------------------------------------------------------
@@ -317,7 +297,7 @@ cdef inline void enter_next_convex_state(newton_t* n) noexcept nogil:
         begin_interior_point(n, third_cone_weight(), 0.0)
         begin_interior_steps(n, False)
     elif state == AUGMENTED_INTERIOR_POINT:
-        if n.best < 1e-3 and n.has_augmented and has_rigid_joints(n):   # Nearly dependent rows may prevent further progress.
+        if may_need_augmented_system(n):
             begin_augmented_interior_point(n, 0.0)
     elif state == CONVEX_DAMPED_NEWTON:
         # Of cones, the last interior point is nearer to a solution than the point with the lowest residual, unless its
@@ -332,105 +312,57 @@ cdef inline void enter_next_convex_state(newton_t* n) noexcept nogil:
 # -- Coulomb's law -----------------------------------------------------------------------------------------------------
 
 
-cdef inline void begin_de_saxce(newton_t* n, double derivative_fraction, double max_residual) noexcept nogil:
-    """Begin De Saxce's interior point; damped Newton ends it if its residual is at most `max_residual`."""
-    n.de_saxce = de_saxce_t(derivative_fraction, max_residual, DE_SAXCE_INTERIOR)
-    push_phase(n, DE_SAXCE)
-
-
-cdef inline void begin_damped_newton_after_de_saxce(newton_t* n, double alpha, int32_t max_inner_steps,
-                                                    int32_t limit) noexcept nogil:
-    """Begin damped Newton from the best point of De Saxce's interior point."""
-    begin_damped_newton(n, n.progress.best_z, COULOMB, alpha, max_inner_steps)
-    begin_separate_best(n)
-    push_damped_newton(n, limit)
-
-
-cdef inline void enter_next_de_saxce_state(newton_t* n) noexcept nogil:
-    """Enter the next state of De Saxce's interior point."""
-    cdef de_saxce_t* x = &n.de_saxce
-    cdef int32_t state = x.stage
-    cdef double best
-    x.stage = state + 1
-    if state == DE_SAXCE_INTERIOR:
-        begin_interior_point(n, compute_proximal_weight(), x.derivative_fraction)
-        n.is_at_rest = (n.s.e.m >= MIN_FLOW_ROWS
-                        and compute_overloaded_fraction(n.s.e, n.ip.unbounded_z) < max_overload_at_rest())
-        begin_interior_with_newton(n, 0)
-    elif state == DE_SAXCE_END and n.progress.lowest <= x.max_residual and not is_over(n):
-        begin_damped_newton_after_de_saxce(n, min(n.progress.lowest, 1e-3), END_INNER_STEPS, END_FACTORISATIONS)
-    elif state == DE_SAXCE_END:
-        pop_phase(n)
-    else:
-        copy_vector(n, n.progress.best_z, n.best_z)
-        best = end_separate_best(n)
-        if state == DE_SAXCE_ENDED or is_over(n):
-            pop_phase(n)
-        else:
-            begin_damped_newton_after_de_saxce(n, min(best, 1e-7), SECOND_END_FACTORISATIONS, SECOND_END_FACTORISATIONS)
-
-
 cdef inline bint has_convex_law(const newton_t* n) noexcept nogil:
     """Return whether the convex point may be computed: H is symmetric, and the problem is large."""
     return n.s.symmetric and n.s.e.m >= MIN_CONVEX_ROWS
 
 
-cdef inline bint slides_mostly(newton_t* n, const double* z) noexcept nogil:
-    """Return whether too many contacts slide at z, a solution of the convex law, for Euler steps before the paths."""
-    return compute_sliding_fraction(n, z, 1e-6) > max_sliding_fraction()
+cdef inline void begin_path_or_flow(newton_t* n, bint is_flow) noexcept nogil:
+    """Begin Euler steps from the best point, or the path of smoothed problems."""
+    if is_flow:
+        begin_flow(n, n.best_z, LAST_FLOW_FACTORISATIONS, LAST_FLOW_PATIENCE)
+    else:
+        begin_path(n)
 
 
 cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
     """Enter the next state of Coulomb's law."""
     cdef int32_t state = n.stage
+    cdef double* z
     n.stage = state + 1
-    if state != START_FLOW and is_over(n):
+    if is_over(n):
         state = COULOMB_END
-    if state == START_FLOW:
-        if not n.is_cold:
-            multiply_system_matrix(&n.s, n.best_z, n.hz)
-            if has_convex_law(n) and convex_residual(n, n.best_z, n.hz) < 0.01 * n.best:
-                n.has_convex_start = 1
-                copy_vector(n, n.convex_z, n.best_z)
-                n.mostly_slides = slides_mostly(n, n.convex_z)
-                if not n.mostly_slides:
-                    begin_flow(n, n.best_z, CONVEX_START_FACTORISATIONS, CONVEX_START_FACTORISATIONS)
-    elif state == START_DAMPED_NEWTON:
+    if state == START_DAMPED_NEWTON:
         if n.s.e.m < MIN_FLOW_ROWS or n.best < max_start_residual():
             begin_damped_newton(n, n.best_z, COULOMB, start_alpha(), START_FACTORISATIONS)
             begin_damped_newton_stretches(n, START_FACTORISATIONS, 2.0 * max_start_residual_ratio() * n.best)
-    elif state == FIRST_DE_SAXCE:
-        begin_de_saxce(n, first_derivative_fraction(), far_from_end())
+    elif state == DE_SAXCE:
+        begin_interior_point(n, compute_proximal_weight(), derivative_fraction())
+        n.is_at_rest = (n.s.e.m >= MIN_FLOW_ROWS
+                        and compute_overloaded_fraction(n.s.e, n.ip.unbounded_z) < max_overload_at_rest())
+        begin_interior_with_newton(n, 0)
+    elif state == DE_SAXCE_END:
+        if n.progress.lowest <= far_from_end():
+            begin_damped_newton(n, n.progress.best_z, COULOMB, min(n.progress.lowest, 1e-3), END_INNER_STEPS)
+            begin_damped_newton_stretches(n, END_FACTORISATIONS, 0.0)
     elif state == FIRST_FLOW:
-        if n.s.e.m >= MIN_FLOW_ROWS and n.best < max_flow_residual() and not n.flow.has_run:
+        if n.s.e.m >= MIN_FLOW_ROWS and n.best < max_flow_residual():
             begin_flow(n, n.best_z, FIRST_FLOW_FACTORISATIONS, FLOW_PATIENCE)
     elif state == CONVEX_POINT:
-        if not n.has_convex_start and has_convex_law(n):
+        if has_convex_law(n):
             begin_interior_point(n, compute_proximal_weight(), 0.0)
             begin_interior_steps(n, False)
     elif state == CONVEX_FLOW:
-        if not n.has_convex_start and has_convex_law(n):
-            n.has_convex_start = 1
-            copy_vector(n, n.convex_z, n.progress.best_z)
-            n.mostly_slides = n.mostly_slides or slides_mostly(n, n.convex_z)
-        if n.has_convex_start and not n.mostly_slides:
-            begin_flow(n, n.convex_z, CONVEX_FLOW_FACTORISATIONS, CONVEX_FLOW_FACTORISATIONS)
-    elif state == FIRST_PATH:
-        if n.is_at_rest:
-            begin_flow(n, n.best_z, LAST_FLOW_FACTORISATIONS, LAST_FLOW_PATIENCE)
-        elif not has_rigid_joints(n):
-            begin_path(n)
-    elif state == SECOND_DE_SAXCE:
-        begin_de_saxce(n, second_derivative_fraction(), 1.0 / 0.0)
+        z = n.progress.best_z
+        if has_convex_law(n) and not n.mostly_slides and compute_sliding_fraction(n, z, 1e-6) <= max_sliding_fraction():
+            begin_flow(n, z, CONVEX_FLOW_FACTORISATIONS, CONVEX_FLOW_FACTORISATIONS)
     elif state == AUGMENTED_DE_SAXCE:
-        if n.has_augmented and has_rigid_joints(n):
-            begin_augmented_interior_point(n, second_derivative_fraction())
-    elif state == LAST_PATH:
-        if has_rigid_joints(n) or n.is_at_rest:
-            begin_path(n)
-    elif state == LAST_FLOW:
-        if not n.is_at_rest:
-            begin_flow(n, n.best_z, LAST_FLOW_FACTORISATIONS, LAST_FLOW_PATIENCE)
+        if may_need_augmented_system(n):
+            begin_augmented_interior_point(n, augmented_derivative_fraction())
+    elif state == PATH_OR_FLOW:
+        begin_path_or_flow(n, n.is_at_rest)
+    elif state == FLOW_OR_PATH:
+        begin_path_or_flow(n, not n.is_at_rest)
     elif state == COULOMB_DAMPED_NEWTON:
         begin_damped_newton(n, n.best_z, COULOMB, start_alpha(), MAX_INNER_STEPS)
         push_damped_newton(n, UNLIMITED)
@@ -448,8 +380,6 @@ cdef inline void step_phase(newton_t* n) noexcept nogil:
         enter_next_convex_state(n)
     elif phase == PLAN_COULOMB:
         enter_next_coulomb_state(n)
-    elif phase == DE_SAXCE:
-        enter_next_de_saxce_state(n)
     elif phase == ACTIVE_SET:
         step_active_set(n)
     elif phase == INTERIOR_POINT:
@@ -473,8 +403,7 @@ cdef inline void start_newton_solve(newton_t* n, const double* lam) noexcept nog
     cdef int32_t i
     cdef bint has_cones = n.s.e.n < n.s.e.m
     n.stop = n.needs_check = n.proven = n.depth = 0
-    n.has_convex_start = n.mostly_slides = n.is_at_rest = 0
-    n.flow.has_run = 0
+    n.mostly_slides = n.is_at_rest = 0
     n.s.augmented = n.s.factorisations = 0
     for i in range(N_COUNTED):
         n.counts[i] = 0

@@ -26,15 +26,14 @@ from lavender_ext.newton.system cimport has_passed_after_part, multiply_system_m
 cdef enum:                      # phases
     PLAN_CONVEX = 0             # plan.pxd
     PLAN_COULOMB = 1
-    DE_SAXCE = 2
-    ACTIVE_SET = 3              # active_set.pxd
-    INTERIOR_POINT = 4          # interior_phases.pxd
-    INTERIOR_WITH_NEWTON = 5
-    AUGMENTED_NEWTON = 6
-    DAMPED_NEWTON = 7           # damped_newton.pxd
-    DAMPED_STRETCHES = 8
-    PATH = 9                    # path.pxd
-    FLOW = 10                   # flow.pxd
+    ACTIVE_SET = 2              # active_set.pxd
+    INTERIOR_POINT = 3          # interior_phases.pxd
+    INTERIOR_WITH_NEWTON = 4
+    AUGMENTED_NEWTON = 5
+    DAMPED_NEWTON = 6           # damped_newton.pxd
+    DAMPED_STRETCHES = 7
+    PATH = 8                    # path.pxd
+    FLOW = 9                    # flow.pxd
 
 cdef enum:                      # counters
     N_ACTIVE_SET = 0
@@ -50,7 +49,7 @@ cdef enum:                      # counters
 
 cdef enum:
     MAX_PHASE_DEPTH = 8         # Phases nest at most four deep.
-    N_VECTORS = 29              # vectors (m) of `bind_vectors`
+    N_VECTORS = 28              # vectors (m) of `bind_vectors`
     UNLIMITED = 2147483647      # limit of factorisations that no phase reaches
     MAX_INNER_STEPS = 20        # Newton steps of one proximal iteration; more rarely end it.
 
@@ -131,12 +130,6 @@ cdef struct stretches_t:        # a damped Newton phase that continues as long a
     int32_t stretches
 
 
-cdef struct de_saxce_t:
-    double derivative_fraction
-    double max_residual         # damped Newton follows only if the relative residual does not exceed this
-    int32_t stage
-
-
 cdef struct path_t:             # a path of smoothed problems
     double* z                   # the last point
     double l                    # log tau of the last point
@@ -179,7 +172,6 @@ cdef struct flow_t:             # implicit Euler steps of the proximal flow
     double trial_residual       # damped Newton is tried below this relative residual
     double lowest               # lowest residual, up to a factor of two
     int32_t inner_steps         # Newton steps of this Euler step
-    int32_t has_run             # Euler steps have run in this solve
     int32_t since               # factorisations at the last such progress
     int32_t patience            # the phase ends if so many factorisations do not halve the residual
     int32_t last                # factorisations at which the phase ends
@@ -198,9 +190,8 @@ cdef struct newton_t:           # bound to its workspace; it must not move
     int32_t is_cold             # the start is the zero impulse
     int32_t has_augmented       # the caller can factor the augmented system
     int32_t stage               # state of the plan (plan.pxd)
-    int32_t has_convex_start    # Coulomb's law: convex_z solves the convex law, or nearly so if many contacts slide
     int32_t is_at_rest          # Coulomb's law: few contacts of a large problem must slide
-    int32_t mostly_slides       # Coulomb's law: many contacts slide at convex_z
+    int32_t mostly_slides       # Coulomb's law: many contacts slide at the convex point
     int32_t keeps_matrix        # the caller starts again with the same A: a formed H stays
     int32_t has_matrix          # H is formed
     int32_t counts[N_COUNTED]
@@ -209,7 +200,6 @@ cdef struct newton_t:           # bound to its workspace; it must not move
     double best                 # relative residual of best_z
     double above_floor          # the part of the last judged residual that rounding does not explain
     double* best_z
-    double* convex_z
     double* direction
     best_t island_best          # the best impulse of each island
     double* lam                 # (rows)
@@ -233,7 +223,6 @@ cdef struct newton_t:           # bound to its workspace; it must not move
     augmented_newton_t augmented
     damped_newton_t damped
     stretches_t stretches
-    de_saxce_t de_saxce
     path_t path
     flow_t flow
 
@@ -272,14 +261,13 @@ cdef inline void bind_vectors(newton_t* n, int64_t m, arena_t* a) noexcept nogil
     """Take the vectors (m)."""
     cdef double** at[N_VECTORS]
     cdef int32_t i
-    at[0], at[1], at[2], at[3] = &n.best_z, &n.convex_z, &n.s.q, &n.direction
+    at[0], at[1], at[2], at[3] = &n.best_z, &n.s.t, &n.s.q, &n.direction
     at[4], at[5], at[6], at[7] = &n.f, &n.r, &n.da, &n.dz
     at[8], at[9], at[10], at[11] = &n.t1, &n.t2, &n.u, &n.psi
     at[12], at[13], at[14], at[15] = &n.c, &n.hz, &n.hdz, &n.trial
     at[16], at[17], at[18], at[19] = &n.slack, &n.ip.z, &n.ip.u1, &n.ip.u2
     at[20], at[21], at[22], at[23] = &n.ip.hz, &n.ip.unbounded_z, &n.active.z, &n.active.hz
     at[24], at[25], at[26], at[27] = &n.active.best_z, &n.progress.best_z, &n.augmented.z, &n.damped.z
-    at[28] = &n.s.t
     for i in range(N_VECTORS):
         at[i][0] = take_doubles(a, m)
 

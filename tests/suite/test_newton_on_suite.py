@@ -115,13 +115,6 @@ def test_euler_steps_pile_slides_solves_coulomb_and_shifted_cone_law():
     assert lv.residual(shifted, impulse).relative <= 1e-5
 
 
-def test_euler_steps_start_solves_cone_law_begins_there():
-    problem = suite.case(SLIDING_PILE).problem
-    convex = lv.solve(problem.relaxed("cone"), "newton", tol=1e-8).impulse
-    claim, impulse = run_newton_claim(problem, impulse=convex)
-    assert claim.status is Status.CONVERGED and lv.residual(problem, impulse).relative <= 1e-6
-
-
 def test_newton_from_the_convex_solution_solves_a_pyramid_of_which_most_contacts_slide():
     problem = suite.case("pyramidF(k=8, sliding=0.5)").problem
     convex = lv.solve(problem.relaxed("cone"), "newton", tol=1e-8).impulse
