@@ -47,7 +47,7 @@ NEWTON_MAX_STEPS, AUTO_MAX_STEPS = 1500.0, 1e6
 
 
 def make_limits(
-    sweeps: float, max_cost: float = DECISIONS.call_cost, steps: float = NEWTON_MAX_STEPS
+    sweeps: float, max_cost: float = DECISIONS.call_cost, steps: float = NEWTON_MAX_STEPS, lanes: bool = False
 ) -> Limits:
     """Return the limits of compiled calls over generalised velocities.
 
@@ -59,12 +59,16 @@ def make_limits(
         Limit of the cost.
     steps : float
         Limit of the number of Newton steps.
+    lanes : bool
+        Whether contacts of the kind that lanes of vectors solve are solved by their method.
     """
     sweep = RATES["tree"], RATES["sweep row"], RATES["sweep cone"], RATES["sweep velocities"], sweeps
     step = RATES["entry"], RATES["work"]["velocities"], DECISIONS.factorisations
     row_rates = RATES["velocity row"], RATES["velocity contact row"]
     rows = SMALL_ROWS, MAX_ROWS_ALWAYS_DENSE, DENSE_ROWS_PER_VELOCITY, VELOCITIES_OF_TWO_BODIES
-    return Limits(np.array([*step, *row_rates, *sweep, general.MAX_MATRIX_ENTRIES, max_cost, *rows, steps]))
+    return Limits(
+        np.array([*step, *row_rates, *sweep, general.MAX_MATRIX_ENTRIES, max_cost, *rows, steps, lanes])
+    )
 
 
 def get_small_call(problem: Problem) -> Any:
@@ -284,7 +288,7 @@ def describe_work(name: str, work: Mapping[str, int]) -> str:
     return name
 
 
-AUTO = SmallCall("auto", make_limits(DECISIONS.first_sweeps, steps=AUTO_MAX_STEPS), True, True)
+AUTO = SmallCall("auto", make_limits(DECISIONS.first_sweeps, steps=AUTO_MAX_STEPS, lanes=True), True, True)
 DIRECT = SmallCall("direct", None, True)
 NEWTON = SmallCall("newton", make_limits(inf), False)
 

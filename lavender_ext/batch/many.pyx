@@ -26,10 +26,14 @@ from lavender_ext.batch.task cimport (copy_small_judgement, compute_missing_deri
                                      solve_small_task, solve_task, task_t, task_workspaces_t)
 from lavender_ext.small.limits cimport estimate_newton_cost_terms, limits_t, max_newton_cost, newton_cost_t
 from lavender_ext.host cimport grow_workspace_to, free_workspace
+from lavender_ext.batch.lanes cimport (LANE_IS_PLAIN, LANE_RHS, LANE_START_ENERGY, LANE_START_SPEED, LANE_STEPS,
+                                       are_worlds_equal_in_size, bind_lanes, count_lanes, fit_lanes, is_lane_refined, judge_lanes,
+                                       lane_number, lanes_t, load_lanes, prepare_lanes, score_of_lane, solve_lanes)
 from lavender_ext.batch.world cimport (BAD, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, LATE, LEFT, MASS, MU, N_ARRAYS, PLACES, READY,
                                        AT_ROW, ROWS, SOFT, STARTED, TARGET, TRIED, VELOCITIES, VELOCITY, worker_scratch_t,
                                        convert_generalized_world, worlds_t)
-from lavender_ext.judge.measure cimport set_zero_impulse, make_judged, count_judge_scratch
+from lavender_ext.judge.measure cimport (count_judge_scratch, make_judged, relative_floor_of_score, relative_residual_of_score,
+                                         residual_above_floor, set_zero_impulse)
 from lavender_ext.judge.rounding cimport float32_floor_of_score, compute_squared_float32_rounding
 from lavender_ext.judge.tally cimport compute_rhs_energy_norm
 from lavender_ext.velocity_newton.soft cimport needs_no_proximal_terms
@@ -139,7 +143,7 @@ cdef void free_call_workspaces(call_workspaces_t* r) noexcept nogil:
 
 
 cdef class Limits:
-    """Cost limits, from the fields of a `limits_t` as an array (17,), and the workspaces of calls that have ended."""
+    """Cost limits, from the fields of a `limits_t` as an array (18,), and the workspaces of calls that have ended."""
     cdef limits_t at
     cdef call_workspaces_t kept
 
@@ -256,6 +260,8 @@ cdef struct worker_t:             # memory of one thread
     worker_scratch_t scratch
     task_workspaces_t small
     workspace_t by_island
+    workspace_t lanes
+    int64_t next, end               # taken worlds that are not processed
 
 
 cdef class Worlds:
@@ -284,6 +290,7 @@ cdef class Worlds:
     cdef worlds_t w
     cdef int64_t taken
     cdef bint cold
+    cdef public int width           # number of worlds that a worker takes at a time, to process them in lanes: 1, 2, 4 or 8
     cdef readonly object numbers, worst, counts, code, impulse, velocity
     cdef list references
     cdef double* lam
@@ -299,7 +306,7 @@ cdef class Worlds:
         cdef ndarray counts = np.zeros((n + 1, N_COUNTS), np.int32), code = np.zeros(n + 1, np.int8)
         self.impulse, self.velocity, self.cold, self.references = impulse, velocity, cold, [at]
         self.numbers, self.worst, self.counts, self.code = numbers, worst, counts, code
-        self.w.n = n
+        self.w.n, self.width = n, 1
         if n:
             self.w.at = &at[0, 0]
         self.lam, self.v = as_double_pointer(impulse, impulse.size), as_double_pointer(velocity, velocity.size)
@@ -321,6 +328,7 @@ cdef class Worlds:
         self.w.blocks, self.w.asymmetry = blocks.at, asymmetry
         self.w.blocks.law = law
         self.w.jac_row_stride, self.w.mass_row = strides
+        self.width = count_lanes() if pattern is None and fit_lanes(&self.w.blocks) else 1
         self.references += [blocks, pattern, *arrays]
         for i in range(N_ARRAYS):
             self.w.array[i] = NULL
@@ -387,6 +395,15 @@ cdef class Worlds:
         """Store the judge's results of world i, and its velocity v+ after the step if the worlds are given as arrays."""
         cdef const int64_t* at = self.w.at + i * PLACES
         cdef double* v
+        cdef int32_t k
+        self.store_judgement(i, j, j.slack_error[j.p.n_rows + j.score.worst] if j.score.worst >= 0 else 0.0)
+        if self.tasks == NULL:
+            v = self.v + at[VELOCITY]
+            for k in range(at[VELOCITIES]):
+                v[k] = scratch.free[k] + j.push[k]
+
+    cdef void store_judgement(self, int64_t i, const task_t* j, double push) noexcept nogil:
+        """Store the judge's results of world i; push: e of the worst row [N s]."""
         cdef int64_t n = self.w.n + 1
         cdef int32_t k
         self.number[RELATIVE * n + i], self.number[FLOOR * n + i] = j.relative, j.floor
@@ -396,11 +413,60 @@ cdef class Worlds:
         for k in range(3):
             self.number[(START_ENERGY + k) * n + i] = j.zero_residual[k]
         self.worst_at[i] = j.score.worst
-        self.number[PUSH * n + i] = fabs(j.slack_error[j.p.n_rows + j.score.worst]) if j.score.worst >= 0 else 0.0
-        if self.tasks == NULL:
+        self.number[PUSH * n + i] = fabs(push)
+
+    cdef void process_in_lanes(self, int64_t first, int64_t end, worker_t* h, double tol, bint judges) noexcept nogil:
+        """Judge or solve worlds [first, end) in lanes as `judge_world` and `solve_world` do.
+
+        The code of worlds that no lane covers or solves stays LEFT.
+        """
+        cdef lanes_t x
+        cdef task_t j
+        cdef const int64_t* at
+        cdef int32_t lane, k, width = self.width
+        cdef double* lam
+        cdef int64_t i, n = self.w.n + 1
+        cdef double* v
+        if end - first < 2 or not are_worlds_equal_in_size(&self.w, first, end):
+            return
+        at = self.w.at + first * PLACES
+        x.m, x.n, x.law, x.asymmetry = <int32_t>at[ROWS], <int32_t>at[VELOCITIES], self.w.blocks.law, self.w.asymmetry
+        if not grow_workspace_to(&h.lanes, 0, bind_lanes(&x, width, NULL)):
+            return
+        bind_lanes(&x, width, h.lanes.real)
+        load_lanes(&x, &self.w, self.lam, first, end, width)
+        prepare_lanes(&x, width)
+        x.tol = tol
+        if not judges:
+            solve_lanes(&x, width)
+        judge_lanes(&x, width)
+        for lane in range(<int32_t>(end - first)):
+            i, at = first + lane, self.w.at + (first + lane) * PLACES
+            if not lane_number(&x, LANE_IS_PLAIN, width, lane) > 0.0:
+                continue
+            j.score = score_of_lane(&x, width, lane)
+            j.zero_residual[0] = lane_number(&x, LANE_START_ENERGY, width, lane)
+            j.zero_residual[1], j.zero_residual[2] = lane_number(&x, LANE_START_SPEED, width, lane), 1.0
+            j.relative = relative_residual_of_score(&j.score, NULL, 0, j.zero_residual[0], j.zero_residual[1])
+            if is_lane_refined(&x, width, lane, tol, j.relative):
+                continue
+            j.floor = relative_floor_of_score(&j.score, j.zero_residual[0], j.zero_residual[1])
+            j.above_floor = residual_above_floor(&j.score, j.relative, j.floor)
+            if not judges:
+                if not (j.relative <= tol and j.floor <= tol):
+                    continue
+                lam = self.lam + at[AT_ROW]
+                for k in range(x.m):
+                    lam[k] = x.lam[k * width + lane]
+                k = <int32_t>lane_number(&x, LANE_STEPS, width, lane)
+                self.count[N_COUNTS * i] = self.count[N_COUNTS * i + 1] = k
+            self.store_judgement(i, &j, x.e[j.score.worst * width + lane] if j.score.worst >= 0 else 0.0)
+            if judges:
+                self.number[RHS_ENERGY * n + i] = lane_number(&x, LANE_RHS, width, lane)
             v = self.v + at[VELOCITY]
-            for k in range(at[VELOCITIES]):
-                v[k] = scratch.free[k] + j.push[k]
+            for k in range(x.n):
+                v[k] = x.free[k * width + lane] + x.push[k * width + lane]
+            self.code_at[i] = READY
 
     cdef int32_t store_empty_world(self, int64_t i, const worker_scratch_t* scratch) noexcept nogil:
         """Store the velocity v+ after the step of a world without rows, which is v*."""
@@ -512,6 +578,7 @@ cdef class Worker:
         free_workspace(&self.h.scratch.workspace)
         free_workspace(&self.h.scratch.tree)
         free_workspace(&self.h.by_island)
+        free_workspace(&self.h.lanes)
         free_workspace(&self.h.small.islands)
         free_workspace(&self.h.small.made)
         free_workspace(&self.h.small.formed)
@@ -543,17 +610,28 @@ cdef class Worker:
         cdef const small_rules_t* small_rules = &rules.at if rules is not None else NULL
         cdef int64_t i, n = w.w.n
         cdef int32_t code, n_done = 0
+        cdef bint uses_lanes = not narrow
         cdef deadline_t own                             # Other threads read the clock for themselves.
         cdef deadline_t* until = get_pointer(deadline)
         if until != NULL:
             own = until[0]
             until = &own
+        if not judges:
+            uses_lanes = at != NULL and at.lanes != 0.0 and w.cold
         with nogil:
             while not self.stop[0]:
-                i = lav_add(&w.taken, 1)
-                if i >= n:
-                    return DONE_ALL
-                if has_passed(until, reading_interval()):
+                if self.h.next == self.h.end:
+                    i = lav_add(&w.taken, w.width)
+                    if i >= n:
+                        return DONE_ALL
+                    self.h.next, self.h.end = i, min(i + w.width, n)
+                    if w.width > 1 and uses_lanes and not has_passed(until, 0.0):
+                        w.process_in_lanes(i, self.h.end, &self.h, tol, judges)
+                i = self.h.next
+                self.h.next += 1
+                if w.code_at[i] == READY:               # A lane has processed this world.
+                    code = READY
+                elif has_passed(until, reading_interval()):
                     code = w.judge_world(i, &self.h, tol, narrow)
                     if code == READY:
                         code = LATE

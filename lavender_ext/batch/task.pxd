@@ -32,6 +32,7 @@ from lavender_ext.small.call cimport (N_COUNTS, RESULT_IS_START, RESULT_SOLVED, 
 from lavender_ext.small.limits cimport (estimate_newton_cost_terms, limits_t, max_factorisation_work,
                                         max_newton_cost, newton_cost_t)
 from lavender_ext.small.workspace cimport fits_workspace, grow_workspace_to_arena
+from lavender_ext.batch.lanes cimport is_solved_in_one_lane, solve_in_one_lane
 from lavender_ext.batch.world cimport THIN_PADDING, LEFT, READY, STARTED, TRIED, compress_dense_rows
 from lavender_ext.velocity_newton.soft cimport needs_no_proximal_terms
 
@@ -185,6 +186,14 @@ cdef inline void solve_task(task_t* j, workspace_t* workspace, workspace_t* isla
     # residual of the zero impulse
     if not judge_zero_impulse_of_task(j, islands, workspace.real):
         return
+    if limits.lanes != 0.0 and j.cold and j.made.n_empty == 0 and is_solved_in_one_lane(&j.p, &j.g, j.zero_residual):
+        j.counts[0] = j.counts[1] = solve_in_one_lane(&j.p, &j.g, j.zero_residual, tol, workspace, j.lam)
+        if j.counts[0] >= 0 and grow_workspace_to(workspace, 0, judge_task_workspace_size(j)):
+            judge_task(j, tol, workspace.real)
+            j.solved = j.relative <= tol and j.floor <= tol
+        if j.solved:
+            return
+        j.counts[0] = j.counts[1] = 0
     v = make_judge_view(j)
     # cost limits, workspace
     soft = needs_no_proximal_terms(&j.p, &j.g)

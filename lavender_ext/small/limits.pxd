@@ -31,6 +31,7 @@ cdef struct limits_t:           # from `make_limits` of lavender/solvers/small.p
     double dense                # coulomb_rows and cone_rows apply only with fewer than this many rows per velocity,
     double columns              # and if no row has more than this many entries: velocities may then belong to bodies.
     double steps                # largest number of steps of all islands together
+    double lanes                # 1: contacts that lanes solve (batch/lanes.pxd) are solved so
 
 
 cdef inline double estimate_newton_step_cost(const blocks_t* p, const generalized_t* g, const limits_t* l,

@@ -1,0 +1,101 @@
+"""Worlds of contacts over a full M are processed in lanes of vectors, with the bits of single calls for every width."""
+
+import numpy as np
+import pytest
+
+import lavender as lv
+from lavender.batch.data import Batch
+
+NUMBERS = "relative", "energy", "velocity_error", "impulse_error", "roundoff_floor", "velocity_at_zero", "worst_row"
+SIZES = [(3, 6, 5), (12, 18, 21), (18, 9, 10), (30, 36, 9), (15, 1, 9)]
+
+
+def make_batch(contacts, nv, n, law, seed=0):
+    """Return worlds of 3 contacts rows and nv velocities; some have an empty row, an M with a zero, or no approach."""
+    rng = np.random.default_rng(seed)
+    m = 3 * contacts
+    jac = rng.standard_normal((n, m, nv)) * (rng.random((n, m, nv)) < 0.5)
+    half = rng.standard_normal((n, nv, nv))
+    mass = 0.1 * half @ half.transpose(0, 2, 1) + np.eye(nv)
+    target = rng.standard_normal((n, m)) * rng.choice([0.0, 1.0], (n, 1))
+    jac[0, :3] = 0.0
+    mass[1, nv - 1, 0] = mass[1, 0, nv - 1] = float(nv == 1)
+    target[2] = np.tile([-1e3, 0.0, 0.0], contacts)
+    jac[3, :, nv // 2 :] *= 1e-6
+    compliance, mu = rng.choice([0.0, 1e-3, 0.1], (n, m)), rng.choice([0.0, 0.3, 1.0], (n, contacts))
+    cones = lv.Cones.contacts(0.6, count=contacts)
+    free = rng.standard_normal((n, nv))
+    return lv.Batch(jac, mass, free, target=target, compliance=compliance, mu=mu, cones=cones, friction=law)
+
+
+@pytest.fixture(params=[1, 2, 4, 8])
+def width(request, monkeypatch):
+    """Let workers take worlds in groups of a width up to that of this processor."""
+    make = Batch.make_kernel_worlds
+
+    def make_worlds(*arguments):
+        worlds = make(*arguments)
+        if worlds.width < request.param:
+            pytest.skip("this processor has fewer lanes")
+        worlds.width = request.param
+        return worlds
+
+    monkeypatch.setattr(Batch, "make_kernel_worlds", make_worlds)
+    return request.param
+
+
+@pytest.mark.parametrize("law", ["coulomb", "cone"])
+@pytest.mark.parametrize("rows, nv, n", SIZES)
+def test_lanes_have_the_bits_of_single_calls(width, rows, nv, n, law):
+    batch = make_batch(rows // 3, nv, n, law)
+    many = lv.solve_many(batch)
+    impulses = many.impulse, np.abs(many.impulse) * 1e8, np.random.default_rng(1).standard_normal((n, rows))
+    judged = [(x, lv.residual_many(batch, x)) for x in impulses]
+    for i in range(n):
+        one = lv.solve(batch[i])
+        assert many.impulse[i].tobytes() == one.impulse.tobytes()
+        assert many.velocity[i].tobytes() == batch[i].velocity(one.impulse).tobytes()
+        assert (many.status[i], many.iterations[i]) == (one.status, one.iterations)
+        assert many.relative[i] == one.residual.relative
+        assert many.roundoff_floor[i] == one.residual.roundoff_floor
+        for x, found in judged:
+            single = lv.residual(batch[i], x[i])
+            for name, of_one in zip(
+                NUMBERS,
+                (
+                    single.relative,
+                    single.energy,
+                    single.velocity,
+                    None,
+                    single.roundoff_floor,
+                    single.velocity_at_zero,
+                    single.worst_row,
+                ),
+                strict=True,
+            ):
+                assert of_one is None or getattr(found, name)[i] == of_one, name
+
+
+def test_lanes_solve_most_worlds(width):
+    batch = make_batch(4, 18, 64, "cone", seed=3)
+    many = lv.solve_many(batch)
+    assert many.success[1:].all()  # No impulse moves the empty rows of world 0.
+    assert lv.residual_many(batch, many.impulse).relative[1:].max() <= 1e-6
+    assert np.median(many.iterations) <= 5  # Newton steps over velocities are twice as many.
+
+
+def test_invalid_world_in_a_lane_has_an_error_of_its_own(width):
+    rng = np.random.default_rng(0)
+    jac, mass, free = (
+        rng.standard_normal((16, 12, 18)),
+        np.tile(np.eye(18) + 0.1, (16, 1, 1)),
+        rng.standard_normal((16, 18)),
+    )
+    cones = lv.Cones.contacts(0.6, count=4)
+    valid = lv.solve_many(lv.Batch(jac, mass, free, cones=cones)).impulse
+    jac[5, 1, 1], mass[9, 0, 0] = np.nan, -1.0
+    many = lv.solve_many(lv.Batch(jac, mass, free, cones=cones), errors="status")
+    assert sorted(many.faults) == [5, 9]
+    assert np.isnan(many.impulse[[5, 9]]).all()
+    others = np.setdiff1d(np.arange(16), [5, 9])
+    assert many.impulse[others].tobytes() == valid[others].tobytes()
