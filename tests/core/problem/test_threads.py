@@ -1,6 +1,5 @@
 """Threads: a problem is shared freely, a prepared solver serves one of them at a time and says so."""
 
-import os
 import sys
 import sysconfig
 import threading
@@ -80,36 +79,6 @@ def test_derived_arrays_are_one_object_for_all_threads(often):
         problem = random_contact_problem(seed)
         for name in ("data", "csr", "csr_data", "jacobian"):
             assert len({id(x) for x in at_once(lambda p=problem, n=name: getattr(p, n))}) == 1
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="forks are of POSIX")
-def test_process_forked_during_a_solve_solves_the_same_problem():
-    script = """if True:
-        import os, signal, threading
-        import numpy as np
-        import lavender as lv
-        from lavender.problem import derived
-
-        problem = lv.Problem.contact(np.eye(6), [-1.0, 0.5, 0.0] * 2, 0.5)
-        held, leave = threading.Event(), threading.Event()
-
-        def work():
-            with problem.derived.cache.setdefault(derived._process, threading.RLock()):
-                held.set()
-                leave.wait(600)
-
-        thread = threading.Thread(target=work)
-        thread.start()
-        held.wait(600)
-        child = os.fork()
-        if not child:
-            signal.alarm(60)  # of a child that waits for ever
-            os._exit(not lv.prepare(problem, "pgs").solve(tol=1e-6).success)
-        status = os.waitpid(child, 0)[1]
-        leave.set()
-        thread.join()
-        assert status == 0, status"""
-    python("-W", "ignore::DeprecationWarning", "-c", script)
 
 
 def test_an_error_of_one_thread_stops_the_others():
