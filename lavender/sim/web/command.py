@@ -8,25 +8,21 @@ import click
 
 
 @click.group(invoke_without_command=True)
-@click.option(
-    "--port", type=click.IntRange(0, 65535), default=0, help="Port of the server; 0 selects a free one."
-)
-@click.option("--no-browser", is_flag=True, help="Only print the address of the page.")
 @click.pass_context
-def web(context: click.Context, port: int, no_browser: bool) -> None:
+def web(context: click.Context) -> None:
     """Open a page that runs the kernels in a browser.
 
     The kernels are compiled to WebAssembly. The commands build the module and the page.
     """
     if context.invoked_subcommand is None:
-        _serve_page(port, no_browser)
+        _serve_page()
 
 
 def _print_message(text: str) -> None:
     click.echo(text, err=True)
 
 
-def _serve_page(port: int, no_browser: bool) -> None:
+def _serve_page() -> None:
     """Write the page to a temporary folder and serve it until Ctrl-C."""
     import webbrowser
     from tempfile import TemporaryDirectory
@@ -35,11 +31,10 @@ def _serve_page(port: int, no_browser: bool) -> None:
 
     with TemporaryDirectory(prefix="lavender-web-") as folder:
         pages.write_page(Path(folder), _print_message)
-        with pages.create_file_server(Path(folder), port) as server:
+        with pages.create_file_server(Path(folder)) as server:
             address = f"http://127.0.0.1:{server.server_address[1]}/"
             click.echo(f"{address}   Ctrl-C ends")
-            if not no_browser:
-                webbrowser.open(address)
+            webbrowser.open(address)
             try:
                 server.serve_forever()
             except KeyboardInterrupt:

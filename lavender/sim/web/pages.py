@@ -123,10 +123,6 @@ class _Handler(SimpleHTTPRequestHandler):
         """Print nothing about single requests."""
 
 
-def create_file_server(folder: Path, port: int = 0) -> ThreadingHTTPServer:
-    """Create a server of `folder` on the loopback address without starting it; port 0 selects a free one."""
-    try:
-        return ThreadingHTTPServer(("127.0.0.1", port), partial(_Handler, directory=str(folder)))
-    except (OSError, OverflowError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"port {port} cannot be used ({reason}); give another") from None
+def create_file_server(folder: Path) -> ThreadingHTTPServer:
+    """Create a server of `folder` on a free port of the loopback address without starting it."""
+    return ThreadingHTTPServer(("127.0.0.1", 0), partial(_Handler, directory=str(folder)))
