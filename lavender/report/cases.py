@@ -340,9 +340,6 @@ def _make_item_of_file(path: Path) -> Item:
             raise InputError(
                 f"{path} holds the state before a recorded step; its problem is {path.parent.parent / path.name}"
             )
-        if path.exists() and not path.is_file():
-            # A pipe may never end.
-            raise InputError(f"{path} is not a file; a problem ({', '.join(SUFFIXES)}) is needed")
         if not path.exists() and (reason := _read_unrecorded_steps(path.parent).get(path)):
             raise InputError(
                 f"{path} was not written, as its step was not recorded ({reason}): choose another"
