@@ -18,7 +18,7 @@ from lavender.cli.options import (
     print_escaped,
     reject_options_without_effect,
 )
-from lavender.io.stored import check_figure_path, check_writable, resolve_destination
+from lavender.io.stored import check_figure_path, check_writable
 
 
 @click.command()
@@ -85,11 +85,6 @@ def run(
     files = {
         name: path for name, path in (("trace", trace), ("figure", plot), ("film", film)) if path is not None
     }
-    if len({resolve_destination(path) for path in files.values()}) < len(files):
-        raise InputError(
-            f"two of {', '.join(f'{name} {path}' for name, path in files.items())} name the same file; give each a "
-            "file of its own"
-        )
     for path in files.values():
         check_writable(path)
     if film is not None and film.suffix.lower() != ".gif":

@@ -42,9 +42,6 @@ MODEL_ARRAYS = (
     "body_", "jnt_", "dof_", "geom_", "eq_", "tendon_", "wrap_", "actuator_", "pair_", "flex_", "qpos",
 )  # fmt: skip
 APPEARANCE = ("rgba", "matid", "user", "group", "plugin")  # Arrays with these words do not.
-# [m, rad] Equality constraints that a start state violates by more than this are named.
-MAX_EQUALITY_ERROR = 0.05
-MAX_CHECKED_STATES = 32  # Equality constraints are checked in up to this many start states.
 
 
 def load_model(source: Any) -> tuple[Any, Any]:
@@ -221,7 +218,7 @@ def read_states(mj: Any, model: Any, source: Any) -> StartStates:
     except InputError as error:
         other = _describe_other_version(mj, arrays)
         raise InputError(f"{error}. {other}" if other else str(error)) from None
-    return dataclasses.replace(states, misfit=_describe_misfit(mj, model, arrays, states))
+    return dataclasses.replace(states, misfit=_describe_misfit(mj, model, arrays))
 
 
 def _describe_other_version(mj: Any, arrays: Mapping[str, Any]) -> str:
@@ -235,8 +232,8 @@ def _describe_other_version(mj: Any, arrays: Mapping[str, Any]) -> str:
     )
 
 
-def _describe_misfit(mj: Any, model: Any, arrays: Mapping[str, Any], states: StartStates) -> str:
-    """Return a sentence on states that belong to another model or violate equality constraints; else empty."""
+def _describe_misfit(mj: Any, model: Any, arrays: Mapping[str, Any]) -> str:
+    """Return a sentence on states that belong to another model; else empty."""
     advice = (
         "If the model was changed after loading, as environments and domain randomisation do, the errors are those of "
         "another problem: give the changed model as a mujoco.MjModel or as .mjb (mujoco.mj_saveModel)."
@@ -245,22 +242,7 @@ def _describe_misfit(mj: Any, model: Any, arrays: Mapping[str, Any], states: Sta
         return other
     if "model" in arrays and {*np.atleast_1d(arrays["model"]).tolist()} != {hash_model(model)}:
         return f"The start states are of a model with other bodies, geoms, joints or equalities. {advice}"
-    data, largest, name = mj.MjData(model), 0.0, ""
-    for state in states.select_evenly(MAX_CHECKED_STATES).vectors:
-        mj.mj_setState(model, data, state, mj.mjtState.mjSTATE_INTEGRATION)
-        try:
-            mj.mj_fwdPosition(model, data)
-        except mj.FatalError:
-            continue
-        is_equality = data.efc_type == mj.mjtConstraint.mjCNSTR_EQUALITY
-        errors = np.where(is_equality, np.abs(data.efc_pos), 0.0)
-        if errors.max(initial=0.0) > largest:
-            row = int(errors.argmax())
-            largest, which = float(errors[row]), int(data.efc_id[row])
-            name = mj.mj_id2name(model, mj.mjtObj.mjOBJ_EQUALITY, which) or str(which)
-    if largest <= MAX_EQUALITY_ERROR:
-        return ""
-    return f"The start states violate equality {name} by up to {largest:.2g} m or rad. {advice}"
+    return ""
 
 
 def check_array_names(source: str, names: Iterable[str], valid: Iterable[str]) -> None:

@@ -119,21 +119,6 @@ def test_audit_of_a_gymnasium_environment_counts_its_steps():
 
 # -- states that do not fit ----------------------------------------------------------------------------------
 
-WELDED = """<mujoco><worldbody><body name="hand" mocap="true" pos="0 0 1"><geom size=".01" contype="0" conaffinity="0"/>
-  </body><body name="arm" pos="0 0 1"><freejoint/><geom size=".05"/></body></worldbody>
-  <equality><weld name="grip" body1="hand" body2="arm"/></equality></mujoco>"""
-
-
-def test_read_states_that_violate_a_weld_names_it():
-    """As gymnasium's Fetch does, the weld is changed after loading, and the states belong to the changed weld."""
-    model = mj.MjModel.from_xml_string(WELDED)
-    qpos = model.qpos0.copy()
-    qpos[0] += 0.3
-    states = {"qpos": qpos[None], "qvel": np.zeros((1, model.nv))}
-    assert "violate equality grip by up to 0.3 m or rad" in read_states(mj, model, states).misfit
-    model.eq_data[0, 3] = 0.3  # The arm is 0.3 m in front of the hand.
-    assert read_states(mj, model, states).misfit == ""
-
 
 def test_read_states_of_a_model_with_other_options_accepts_them(boxes, tmp_path):
     audit(boxes(EARLY), worlds=2, steps=30, workers=1).write(tmp_path)

@@ -53,16 +53,6 @@ def test_run_film_writes_one_frame_for_each_40_ms_of_simulated_time(lavender, tm
         assert (film.n_frames, film.info["duration"]) == (13, 40)  # 60 steps are 0.5 s.
 
 
-def test_run_command_with_two_outputs_in_one_file_ends_with_2(lavender, tmp_path):
-    (tmp_path / "sub").mkdir()
-    plot, film = tmp_path / "x.gif", tmp_path / "sub/../x.gif"
-    code, out, err = lavender("run", "spinner", "--steps", "2", "--plot", plot, "--film", film)
-    assert (code, out) == (2, "") and "name the same file" in err
-    assert not plot.exists()
-    code, out, _ = lavender("run", "spinner", "--steps", "2", "--plot", tmp_path / "x")
-    assert not code and f"figure: {tmp_path / 'x.png'}" in out
-
-
 def test_ctrl_c_keeps_the_steps_until_then(lavender, monkeypatch, tmp_path):
     step = Simulation.step
 
