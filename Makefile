@@ -18,7 +18,7 @@ kernels:  ## build the changed modules of lavender_ext/
 test: kernels  ## run all tests
 	$(PYTHON) -m pytest -q -n auto --dist worksteal
 
-gates:  ## run linters, layers, language, the table of calls, contracts of changed solvers, sizes (under a minute)
+gates:  ## format, run linters, layers, language, the table of calls, contracts of changed solvers, sizes (under a minute)
 	.ci/gates
 
 quick: kernels  ## run all tests except slow ones, stop at the first failure
