@@ -67,7 +67,7 @@ from lavender.solvers.small import AUTO, describe_work
 from lavender.solving import steps as step_types
 from lavender.solving.compiled_call import choose_call_deadline, fits_in_time
 from lavender.solving.log import Recorder, SolveLog
-from lavender.solving.loop import Loop
+from lavender.solving.loop import EMPTY_CLAIM, Loop
 from lavender.solving.singular_programs import program_backends, run_program_backends
 from lavender.solving.stages import DecisionTree
 from lavender.solving.steps import Iterations, Step, Sweeps, estimate_cost, starts_relaxed
@@ -84,6 +84,7 @@ NEWTON_TIME, NEWTON_TIME_WITH_FRICTION, MIN_SWEEP_SHARE = 1.4, 2.0, 0.25
 # A factorising solver is assumed to take this multiple of the time that sweeps take per counted work: these and their
 # checks take 1.2 to 2.8 of it.
 PACE_MARGIN = 0.6
+UNCHECKED_SWEEPS = 32  # Checks would take as long as these sweeps.
 MIN_ITERATIONS_FOR_COMPILED_CALL = 200  # With fewer allowed, the compiled call is not made.
 # Under a time limit, `admm` follows sweeps if the time of this many sweeps remains.
 MIN_ADMM_SWEEPS = 500.0
@@ -224,6 +225,16 @@ class FirstSweeps:
         state = step_types.prepare_sweeps(solver, problem, deadline)
         self.loop = Loop(problem=problem, solver=solver, state=state, impulse=impulse, tol=tol)
 
+    def sweep_without_checks(self, max_iter: int) -> Claim:
+        """Run the first sweeps without checks, except of a start that the zero impulse may replace."""
+        loop = self.loop
+        claim = loop.run_chunks(1) if isnan(self.before) else EMPTY_CLAIM
+        if claim.status is Status.MAX_ITERATIONS:
+            loop.tol = 0.0
+            claim = loop.run_chunks(min(UNCHECKED_SWEEPS, max_iter))
+            loop.tol = self.tol
+        return claim
+
     @np.errstate(all="ignore")  # Results that overflow are judged.
     def run(self, max_iter: int) -> Claim | None:
         """Sweep; return the claim of the solve, or None if other solvers continue from the result."""
@@ -232,17 +243,16 @@ class FirstSweeps:
         loop.deadline, left = deadline, deadline.get_remaining_nanoseconds()
         if share < 1.0:
             loop.deadline = Deadline(1e-9 * share * left)
-        claim = loop.run_chunks(max_iter)
+        claim = self.sweep_without_checks(max_iter)
+        if claim.status is Status.MAX_ITERATIONS:
+            claim = loop.run_chunks(max_iter)
         if share < 1.0 and claim.status is Status.TIME_LIMIT:
             counted = loop.done * estimate_cost(self.name, problem).iteration
             pace = PACE_MARGIN * (left - deadline.get_remaining_nanoseconds()) / max(counted, 1.0)
             if not self.time.fits(max(pace, 1.0)):
                 share, loop.deadline = 1.0, deadline
                 claim = loop.run_chunks(max_iter)
-        if loop.state.watch.has_best:
-            loop._keep_best()
-        else:
-            loop.replace_by_best_impulse(self.start)
+        loop._keep_best()
         self.claim = claim
         judged = reuse_or_judge_impulse(problem, loop.impulse, loop.judged)
         if not judged.relative <= self.tol:  # Sweeps may raise the error.
