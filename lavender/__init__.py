@@ -21,7 +21,6 @@ Submodules and the engine are imported at their first use.
 import sys
 from typing import TYPE_CHECKING
 
-import lavender.base.check_build  # noqa: F401 - first: explains why kernels cannot be imported
 from lavender._version import __version__
 from lavender.base.errors import (
     CapabilityError,
