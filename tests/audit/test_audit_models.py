@@ -185,16 +185,6 @@ def test_audit_stopped_by_ctrl_c_has_the_complete_worlds(boxes, tmp_path, monkey
     assert "Stopped before the end" in found.page.write(tmp_path / "out").read_text()
 
 
-def test_audit_of_an_environment_without_mujoco_raises():
-    env = SimpleNamespace(reset=None, step=None, unwrapped=SimpleNamespace())
-    with pytest.raises(lv.InputError, match=r"no model and data of MuJoCo as env.unwrapped.model"):
-        audit(env)
-    with pytest.raises(lv.InputError, match="policy needs a gymnasium environment"):
-        audit("m.xml", policy=lambda observation: None)
-    with pytest.raises(lv.InputError, match="control has no effect with an environment"):
-        audit(Environment(), control="zero")
-
-
 @pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
 def test_audit_compares_the_next_velocities_with_the_predicted_ones(integrator, tmp_path):
     (tmp_path / "box.xml").write_text(
@@ -243,16 +233,3 @@ def test_audit_names_versions_settings_model_and_date():
     assert found["integrator"] == "Euler" and found["timestep"] == model.opt.timestep
     assert found["command"] is None or found["command"].startswith("lavender")
     assert found["date"].endswith("+00:00")
-
-
-def test_read_states_of_another_version_of_mujoco_names_the_versions():
-    model = mj.MjModel.from_xml_string(
-        "<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
-    )
-    arrays = {"qpos": np.array([model.qpos0]), "qvel": np.zeros((1, 6)), "model": np.array(["other"])}
-    assert "other bodies" in read_states(mj, model, arrays).misfit
-    arrays["mujoco"] = np.array(["3.8.1"])
-    misfit = read_states(mj, model, arrays).misfit
-    assert "MuJoCo 3.8.1" in misfit and mj.__version__ in misfit and "other bodies" not in misfit
-    with pytest.raises(lv.InputError, match=r"qvel.*MuJoCo 3\.8\.1"):
-        read_states(mj, model, arrays | {"qvel": np.zeros((1, 7))})

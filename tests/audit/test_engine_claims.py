@@ -130,25 +130,6 @@ def test_step_scene_of_newton_starts_from_stored_states(tmp_path):
     assert not noisy["body_qd"][0].any()
 
 
-def test_step_scene_of_a_wrong_scene_raises(tmp_path):
-    with pytest.raises(lv.UnknownName, match="kamin"):
-        step_scene("x", "kamin")
-    with pytest.raises(lv.InputError, match="does not exist"):
-        step_scene(tmp_path / "scene.py", "genesis")
-    (tmp_path / "scene.py").write_text("x = 1\n")
-    with pytest.raises(lv.InputError, match="no function build"):
-        step_scene(tmp_path / "scene.py", "kamino")
-    with pytest.raises(lv.InputError, match="a Python file"):
-        step_scene("boxes", "genesis")
-
-
-def test_audit_steps_of_other_sizes_or_none_raises():
-    with pytest.raises(lv.InputError, match="steps is empty"):
-        audit_steps([])
-    with pytest.raises(lv.InputError, match="2 worlds, the first one 1"):
-        audit_steps([step_of([0.0], [1]), step_of([0.0, 0.0], [1, 1])])
-
-
 def test_audit_of_steps_judged_in_pieces_equals_the_audit_of_one_piece(tmp_path):
     worlds, steps = 8, 6
     world, step = np.repeat(np.arange(worlds), steps), np.tile(np.arange(steps), worlds)

@@ -31,13 +31,3 @@ def test_problems_are_completed_by_cases_sets_and_files(command):
     assert [item.value for item in items if item.type == "plain"] == ["toy_stack"]
     assert [item.value for item in items if item.type == "file"] == ["toy"]
     assert "@hard" in {item.value for item in complete([command], "@h")}
-
-
-@pytest.mark.parametrize("line", ["audit m.xml --states", "slip m.xml --states", "tune m.xml --states",
-    "report --states", "record m.xml --states", "tune m.xml --controls", "audit m.xml --save-states worst",
-    "report --compare", "report --out", "solve x.npz --output", "record"])  # fmt: skip
-def test_options_and_arguments_that_take_files_complete_files(line):
-    items = complete(line.split(), "ke")
-    assert any(item.type in ("file", "dir") for item in items)
-    # bash forgets the names that precede a request for files.
-    assert items[0].type != "plain"

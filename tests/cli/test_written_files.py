@@ -3,13 +3,11 @@
 import contextlib
 import errno
 import os
-from ast import literal_eval
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
-from worked import python
 
 import lavender as lv
 from lavender import io, report
@@ -123,47 +121,3 @@ def test_folder_of_steps_is_continued_by_its_recording_alone(tmp_path):
     assert len(simulation.record(tmp_path, 2)) == 2  # the next two steps
     with pytest.raises(lv.InputError, match="holds 4 problem files"):
         lv.Simulation("stack").record(tmp_path, 2)
-
-
-COMMANDS = [
-    ("report", "stack(n=2)", "--solvers", "sequential_impulses", "--tolerances", "1e-3", "--budgets", "4",
-     "--repeats", "1", "--out", "report"),
-    ("run", "stack", "--steps", "3", "--record", "steps", "--trace", "t.csv", "--plot", "t.svg", "--film", "t.gif"),
-    ("solve", "stack(n=2)", "--output", "solution.npz"),
-    ("export", "c", "c"),
-    ("web", "page", "page"),
-]  # fmt: skip
-
-
-def test_every_command_writes_files_under_temporary_names_first(tmp_path):
-    """A reader, a full disk or a signal finds the old file or the new one; records are added to their file."""
-    pytest.importorskip("Cython", reason="the export translates the kernels (extra: test)")
-    script = """if True:
-        import os, sys
-        from lavender import cli
-        from lavender.sim.web import pages
-        pages.get_or_build_module = lambda say, name: b"a module"
-        here, opened = os.getcwd(), set()
-
-        def watch(event, given):
-            if event == "open" and isinstance(given[0], (str, os.PathLike)) and given[2] & (os.O_WRONLY | os.O_RDWR):
-                path = os.path.abspath(given[0])
-                temporary = os.path.isdir(path) or ".part" in os.path.basename(path)
-                if path.startswith(here) and not temporary:
-                    opened.add(os.path.relpath(path, here))
-
-        sys.addaudithook(watch)
-        for words in COMMANDS:
-            try:
-                cli.main(list(words))
-            except SystemExit as end:
-                assert not end.code, (words, end.code)
-        print("OPENED", sorted(opened))"""
-    done = python("-c", script.replace("COMMANDS", repr(COMMANDS)), cwd=tmp_path)
-    files = {p.relative_to(tmp_path).parts[0] for p in tmp_path.rglob("*") if p.is_file()}
-    assert files >= {"report", "steps", "t.csv", "t.gif", "c", "page"}
-    opened = literal_eval(done.stdout.splitlines()[-1].removeprefix("OPENED "))
-    assert opened == ["report/records.jsonl"]
-
-
-# -- records ------------------------------------------------------------------------------------------------------

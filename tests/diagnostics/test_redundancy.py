@@ -64,15 +64,6 @@ def test_redundancy_keeps_a_row_that_differs_by_more_than_tol(share):
     assert matrix.rank == (4 if share > 1e-6 else 3) and matrix.tol == 1e-6
 
 
-def test_redundancy_of_an_island_beyond_memory_raises():
-    """Two equal rows in an island of 20,000 rows: the basis would take 3 GiB."""
-    m = 20_000
-    jac = sp.csr_array(sp.diags_array([np.ones(m - 1), np.ones(m - 1)], offsets=[0, 1], shape=(m - 1, m)))
-    problem = lv.Problem.from_jacobian(sp.vstack([jac, jac[[0]]]), sp.eye_array(m), np.zeros(m), cones=lv.Cones.free(m))
-    with pytest.raises(lv.CapabilityError, match="too much memory"):
-        redundancy(problem)
-
-
 def test_redundancy_rank_of_a_sparse_island_is_that_of_its_eigenvalues():
     rng, m = np.random.default_rng(1), 300
     jac = sp.csr_array(sp.random_array((m, 240), density=4.0 / 240, rng=rng))

@@ -2,7 +2,6 @@
 
 import doctest
 import importlib
-import inspect
 import json
 import pkgutil
 import re
@@ -263,26 +262,6 @@ def test_pages_are_few_and_short():
     assert len(PAGES) - 1 <= MAX_PAGES  # without README.md
     written = [page for page in PAGES if page.name != "solvers.md"]
     assert sum(len(page.read_text(encoding="utf-8").split()) for page in written) <= MAX_WORDS
-
-
-def test_quickstart_has_the_defaults_of_solve():
-    page = (ROOT / "docs" / "quickstart.md").read_text(encoding="utf-8")
-    rows = dict(
-        re.findall(r"^\| `(\w+)`[^|]* \| ([^|]+) \|", page.partition("| argument | default |")[2], re.MULTILINE)
-    )
-    parameters = inspect.signature(lv.solve).parameters
-    assert list(rows) == ["solver", "tol", "max_iter", "impulse", "time_limit", "friction"]
-    assert rows["solver"] == f'`"{parameters["solver"].default}"`'
-    assert float(rows["tol"]) == parameters["tol"].default
-    for name in ("impulse", "time_limit"):
-        assert (rows[name], parameters[name].default) == ("none", None)
-    assert parameters["max_iter"].default is None  # the solver's own
-    counts = re.findall(r"(\d+) \w+ of `(\w+)`", rows["max_iter"])
-    assert len(counts) == 2
-    assert {name: int(count) for count, name in counts} == {
-        name: lv.registry.specs()[name].max_iter for _, name in counts
-    }
-    assert rows["friction"] == f'`"{inspect.signature(lv.Problem.from_jacobian).parameters["friction"].default}"`'
 
 
 def test_the_page_on_failures_has_every_status_and_every_error():

@@ -3,7 +3,6 @@
 import ast
 import importlib.metadata
 import importlib.util
-import os
 import re
 import shutil
 import subprocess
@@ -11,7 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from worked import python, syntax_of_package
+from worked import syntax_of_package
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -19,7 +18,6 @@ else:
     tomllib = pytest.importorskip("tomli")
 
 import lavender
-import lavender_ext
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 
@@ -27,62 +25,6 @@ ROOT = Path(__file__).resolve().parent.parent.parent
 def test_version_equals_the_installed_one_and_has_changes():
     assert lavender.__version__ == importlib.metadata.version("lavender-contact")
     assert f"## [{lavender.__version__}]" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
-
-
-def test_import_without_built_kernels_names_the_command(tmp_path):
-    # A fresh clone hides an installed lavender from whoever starts Python in it. Without site-packages (-S), since
-    # an editable installation finds its kernels even so.
-    # Other tests may be writing modules and byte code meanwhile.
-    rest = shutil.ignore_patterns("*.so", "*.pyd", "*.wasm", "*.part", "__pycache__")
-    for folder in (Path(lavender_ext.__file__).parent, Path(lavender.__file__).parent):
-        shutil.copytree(folder, tmp_path / folder.name, ignore=rest)
-    env = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    done = python("-S", "-c", "import lavender", status=1, cwd=tmp_path, env=env)
-    last = done.stderr.strip().splitlines()[-1]
-    assert last.startswith("ImportError: the kernels in ")
-    assert "pip install -e ." in last
-
-
-def test_texts_with_pip_install_name_this_distribution():
-    # `lavender` on PyPI is another project; ours is installed as lavender-contact.
-    offers = re.compile(r"pip install[^\n`&|;]*?[ '\"]lavender(?![\w-])|\blavender\[\w")
-    texts = [
-        path
-        for folder in ("lavender", "lavender_ext", "docs", "examples", "tests", "benchmarks", ".ci")
-        for path in (ROOT / folder).rglob("*")
-        if path.suffix in {".py", ".md", ".html", ".jinja", ".j2", ".toml", ".js", ".mjs", ".pyx", ".pxd"}
-        and path != Path(__file__).resolve()
-        and "generated" not in path.parts
-    ]
-    texts += [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "pyproject.toml", ROOT / ".ci" / "run"]
-    assert len(texts) > 100
-    found = [f"{path.relative_to(ROOT)}: {m[0]}" for path in texts for m in offers.finditer(path.read_text("utf-8"))]
-    assert found == []
-    assert offers.search("pip install lavender")
-    assert offers.search("pip install 'lavender[wasm]'")
-    assert not offers.search("pip install 'lavender-contact[wasm]'")
-
-
-def test_metadata_links_with_and_without_an_address_are_absolute_or_absent(tmp_path):
-    pytest.importorskip("Cython", reason="setup.py imports it (extra: test)")
-
-    def metadata(**env):
-        python("setup.py", "-q", "egg_info", "--egg-base", tmp_path, env={**os.environ, **env})
-        (info,) = tmp_path.glob("*/PKG-INFO")
-        head, _, description = info.read_text(encoding="utf-8").partition("\n\n")
-        return dict(re.findall(r"^Project-URL: (\w+), (.+)$", head, re.MULTILINE)), description
-
-    urls, description = metadata(LAVENDER_FILES_URL="")
-    assert urls == {}
-    assert description.strip() == (ROOT / "README.md").read_text(encoding="utf-8").strip()
-    urls, description = metadata(LAVENDER_FILES_URL="https://example.org/v1/")
-    assert urls.pop("Source") == "https://example.org/v1"
-    assert urls
-    for url in urls.values():
-        assert (ROOT / url.removeprefix("https://example.org/v1/")).is_file()
-    links = re.findall(r"\]\(([^)]+)\)", description)
-    assert "https://example.org/v1/docs/static/web.gif" in links
-    assert len(links) >= 6 and all(link.startswith("https://") for link in links)
 
 
 def test_citation_file_names_this_version_and_licence():

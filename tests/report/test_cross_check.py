@@ -124,18 +124,6 @@ def test_cross_check_with_a_refused_solver_lists_it_and_is_ok():
     assert not cross_check(problem, ["direct"]).ok  # nobody solved it
 
 
-def test_cross_check_of_unknown_names_raises():
-    problem = lv.Problem.lcp(*spd(3))
-    with pytest.raises(lv.UnknownName, match="osqp"):
-        cross_check(problem, ["osq"])
-    with pytest.raises(lv.UnknownName, match="osqp"):
-        cross_check(problem, ["pgs"], reference="osq")
-    with pytest.raises(lv.InputError, match="no solver 'direct' in this check"):
-        cross_check(problem, ["pgs"])["direct"]
-    with pytest.raises(lv.InputError, match="tol"):
-        cross_check(problem, ["pgs"], tol=-1.0)
-
-
 # -- the suite and the example ------------------------------------------------------------------------------
 
 # Backends with false claims on programs that they receive as written: ProxQP 0.8 reports SOLVED with an objective that

@@ -156,18 +156,6 @@ def test_run_solver_of_free_rows_is_replaced_by_its_bounded_variant():
     assert keys_of(both) == keys_of(report.run([stack(4)], ["pgs"], QUICK))
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"tolerances": (), "budgets": ()}, "nothing to run"), ({"repeats": 0}, "repeats is 0"),
-        ({"time_limit": 0.0}, "time_limit is 0"), ({"sequence_time_limit": 0.0}, "sequence_time_limit is 0"),
-    ],
-)  # fmt: skip
-def test_plan_invalid_value_is_rejected(change, message):
-    with pytest.raises(lv.InputError, match=message):
-        report.Plan(**change)
-
-
 def test_plan_duplicates_are_removed():
     plan = report.Plan(tolerances=(1e-3, 1e-9, 1e-3, 1e-6), budgets=(8, 4, 4), orders=("reverse",) * 2)
     assert (plan.tolerances, plan.budgets, plan.orders) == ((1e-3, 1e-6, 1e-9), (4, 8), ("reverse",))

@@ -387,8 +387,3 @@ def test_ctrl_c_in_any_substep_restores_the_state_before_the_step(caller, at):
     with pytest.raises(KeyboardInterrupt):
         sim.step()
     assert sim.steps == 3 and trajectory(sim, 4) == trajectory(twin, 4)
-
-
-# -- counts that overflow ------------------------------------------------------------------------------
-
-# -- numbers at the edge of float64 --------------------------------------------------------------------

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from hypothesis import given
-from random_problems import FORMS, arrays_of, as_matrix, random_contact_problem, random_lcp, seeds, touching
+from random_problems import FORMS, arrays_of, as_matrix, random_contact_problem, random_lcp, seeds
 from worked import python
 
 import lavender as lv
@@ -86,18 +86,6 @@ def test_problem_rows_have_names():
 
 
 # -- friction: defaults with a meaning ------------------------------------------------------------------------
-
-
-def test_from_rows_with_mu_alone_has_two_tangents_and_without_friction_rows_raises():
-    made = touching([[-1, 0], [0, 1]])
-    problem = lv.Problem.from_rows(made, mu=0.5)
-    assert (problem.m, problem.law) == (6, "coulomb")
-    mixed = lv.Problem.from_rows(made, mu=[0.0, 0.5])
-    assert mixed.cones.n_tangents.tolist() == [0, 2]
-    assert lv.Problem.from_rows(made).m == 2
-    assert lv.Problem.from_rows(made, mu=0.5, tangents=0, patch_radius=0.1).m == 4  # a spin row is a friction row
-    with pytest.raises(lv.InputError, match=r"contact 0 is 0, and mu 0\.5; mu > 0 needs a friction row"):
-        lv.Problem.from_rows(made, mu=0.5, tangents=0)
 
 
 def test_from_rows_with_a_scalar_mu_or_one_for_each_contact_is_the_same():

@@ -255,16 +255,6 @@ def test_solve_qp_with_a_singular_p_runs_a_backend_that_is_named():
     assert problem.row_name(2) == "variable 2" and problem.row_name(3) == "constraint 0"
 
 
-@pytest.mark.parametrize("name", [n for n in lv.available(law="lcp") if not lv.get(n).external])
-def test_solve_qp_with_a_singular_p_and_an_own_solver_raises(name):
-    if name == "auto":
-        return
-    with pytest.raises(lv.CapabilityError, match=r"P of this program is singular: use auto, or .*osqp"):
-        lv.solve(SINGULAR, name)
-    with pytest.raises(lv.CapabilityError, match="singular"):
-        lv.solve_many([SINGULAR], name)
-
-
 CONVEX = lv.Problem.from_qp(np.eye(2), np.zeros(2), lb=np.zeros(2))
 
 

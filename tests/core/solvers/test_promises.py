@@ -98,18 +98,6 @@ def test_velocity_tol_of_masses_times_1000_and_speeds_times_10_takes_the_same_sw
     assert own.iterations == lv.solve(lv.Problem.lcp(A / 1000.0, 10.0 * b), "pgs", velocity_tol=1e-3).iterations
 
 
-@pytest.mark.parametrize("tol", [0.0, 1e-9])
-def test_velocity_tol_together_with_tol_raises(tol):
-    problem = random_lcp(1)
-    for call in (
-        lambda **m: lv.solve(problem, **m),
-        lv.prepare(problem).solve,
-        lambda **m: lv.solve_many([problem], **m),
-    ):
-        with pytest.raises(lv.InputError, match=f"tol is {tol:g} and velocity_tol is 0.001"):
-            call(tol=tol, velocity_tol=1e-3)
-
-
 # -- islands -----------------------------------------------------------------------------------------------------------
 
 BALLS = 10  # Each is an island of its own: a contact with friction that slides.

@@ -19,23 +19,6 @@ def named(name, **more):
 # -- specs ------------------------------------------------------------------------------------------
 
 
-def test_solver_with_a_missing_factory_raises_an_error_that_names_it(register, tmp_path, monkeypatch):
-    for factory in ("no_such_module_1:Solver", "math:Solver"):
-        register(lv.SolverSpec("absent", factory, {"lcp"}, summary="of a test"), replace=True)
-        with pytest.raises(lv.errors.SolverUnavailable, match=f"'absent' cannot be imported from '{factory}'"):
-            lv.solve(TINY, "absent")
-    broken = tmp_path / "broken_module_1.py"
-    broken.write_text("raise RuntimeError('needs a licence')\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    register(lv.SolverSpec("absent", "broken_module_1:Solver", {"lcp"}, summary="of a test"), replace=True)
-    with pytest.raises(lv.errors.SolverUnavailable, match="RuntimeError: needs a licence"):
-        lv.solve(TINY, "absent")
-    half = type("Half", (), {"prepare": lambda self, problem: problem})
-    register(lv.SolverSpec("half", half, {"lcp"}, summary="of a test"))
-    with pytest.raises(lv.InputError, match="returned a Half without the methods run"):
-        lv.solve(TINY, "half")
-
-
 def test_claim_of_more_iterations_than_the_limit_is_a_numerical_error(plug_in):
     name = plug_in(lambda problem, impulse: lv.Claim(lv.Status.MAX_ITERATIONS, 6, {}))
     solution = lv.solve(TINY, name, max_iter=5)

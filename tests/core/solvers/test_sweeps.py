@@ -121,8 +121,3 @@ def test_the_order_of_a_sweep_is_in_the_solution_and_its_text(name):
         solution = lv.solve(problem, name, order=order, max_iter=3)
         assert solution.solver.order == words and f", order {words}" in str(solution)
     assert lv.solve(problem, name, max_iter=3).solver.order == "given"
-
-
-def test_solver_without_an_order_reports_none():
-    solution = lv.solve(lv.Problem.linear(np.eye(4), np.ones(4)), "direct")
-    assert solution.solver.order == "" and "order" not in str(solution)
