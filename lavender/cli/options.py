@@ -172,7 +172,7 @@ OPTIONS_WITHOUT_EFFECT: dict[str, tuple[str, tuple[str, ...]]] = {
     "is_list": ("with --list", ("all but", "listed")),
     "shows_records": ("if records are shown again, since nothing is solved",
                       ("all but", "files", "out", "compare", "time_budgets", "tables", "no_figures", "solvers",
-                       "quiet")),
+                       "figure_kinds", "columns", "quiet")),
     "is_campaign": ("with --workers, which measures no times and ends by iterations",
                     ("repeats", "time_limit", "sequence_time_limit", "time_budgets", "sequence")),
     "sweeps": ("with --sweeps, which measures fixed numbers of sweeps",

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from lavender.base.arrays import check_float
+from lavender.base.arrays import check_choice, check_float
 from lavender.base.errors import InputError
 from lavender.base.exits import EXIT_INTERRUPTED, EXIT_UNMET
 from lavender.cli.completion import complete_case_or_file
@@ -69,6 +69,11 @@ from lavender.io.stored import check_writable
 @click.option("--no-reuse", is_flag=True, help="Repeat runs that the folder already holds.")
 @click.option("--no-figures", is_flag=True,
               help="Write no figures; they take the largest part of the time of writing.")  # fmt: skip
+@click.option("--figure-kinds", type=ListType(str), default="pdf,svg,png", show_default=True,
+              help="Formats of the figures in OUT/figures.")  # fmt: skip
+@click.option("--columns", type=ListType(str), default=(), metavar="A,B,...",
+              help="Columns of OUT/tables/solvers.tex: solved, a tolerance such as 1e-6, ratio, slowest, accepted, "
+              "false; default: solved and all tolerances.")  # fmt: skip
 @quiet_option
 @click.option("--list", "listed", is_flag=True, help="List the cases of the built-in suite; measure nothing.")
 @click.pass_context
@@ -92,6 +97,8 @@ def report(
     if listed:
         _list_suite()
         return
+    from lavender.report.drawing import FILE_KINDS
+    from lavender.report.page import check_columns
     from lavender.report.store import read, select_solvers
     from lavender.report.text import format_count
 
@@ -100,6 +107,9 @@ def report(
             raise InputError(f"time budget {limit} is not positive; a positive number of seconds is needed")
     if options["max_velocity_error"] is not None:
         check_float("max_velocity_error", options["max_velocity_error"], above=0.0)
+    check_columns(options["columns"])
+    for kind in options["figure_kinds"]:
+        check_choice("figure-kinds", kind, FILE_KINDS)
     _reject_unused_options(context, files, options)
     check_writable(out, folder=True)
     used_folders: set[Path] = set()
@@ -131,7 +141,15 @@ def report(
         engines = read_engine_answers(files, measured.lines)
         limit = options["max_velocity_error"]
         limit = DEFAULT_ERROR_LIMIT if limit is None else limit
-        shown = Report(measured.lines, old, options["time_budgets"], engines, limit)
+        shown = Report(
+            measured.lines,
+            old,
+            options["time_budgets"],
+            engines,
+            limit,
+            options["figure_kinds"],
+            options["columns"],
+        )
         # Write the files before printing, as a closed pipe can end the command while it prints. After Ctrl-C, the page
         # has no figures, so that the prompt is back soon.
         try:

@@ -45,6 +45,13 @@ ERROR_COLORS = (
 )
 
 
+class FigureFolder(NamedTuple):
+    """A folder of figures, and the formats in which they are written there, of `FILE_KINDS`."""
+
+    path: Path
+    kinds: Sequence[str] = FILE_KINDS
+
+
 class Label(NamedTuple):
     """A text at the end of a line."""
 
@@ -72,7 +79,7 @@ def style_line(i: int) -> dict[str, Any]:
 
 def draw_figure(
     name: str, fill: Callable[..., str], size: tuple[float, float], margins: Mapping[str, float], *,
-    note: str = "", folder: Path | None = None, **subplots: Any,
+    note: str = "", folder: Path | FigureFolder | None = None, **subplots: Any,
 ) -> str:  # fmt: skip
     """Return a figure as HTML with an inline SVG; with `folder`, also write it there.
 
@@ -83,7 +90,7 @@ def draw_figure(
     size : (2,) inches
     margins : arguments of `Figure.subplots_adjust`
     note : caption
-    folder : Path, optional
+    folder : Path or FigureFolder, optional
     **subplots : arguments of `Figure.subplots`
     """
     require_packages("a figure", "matplotlib")
@@ -98,15 +105,16 @@ def draw_figure(
         figure.subplots_adjust(**margins)
         description = fill(*np.ravel(axes))
         files = {}
-        for kind in FILE_KINDS if folder else ("svg",):
+        target = FigureFolder(folder) if isinstance(folder, Path) else folder
+        for kind in dict.fromkeys(["svg", *(target.kinds if target else ())]):
             stream = io.BytesIO()
             color = "white" if kind == "png" else "none"
             metadata = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
             figure.savefig(stream, format=kind, dpi=220, metadata=metadata, facecolor=color)
             files[kind] = stream.getvalue()
-    if folder is not None:
-        for kind in FILE_KINDS:
-            write_bytes(make_folder(folder) / f"{make_file_name(name)}.{kind}", files[kind])
+    if target is not None:
+        for kind in target.kinds:
+            write_bytes(make_folder(target.path) / f"{make_file_name(name)}.{kind}", files[kind])
     caption = f"<figcaption>{escape(note)}</figcaption>" if note else ""
     svg = _adapt_svg(files["svg"].decode(), make_file_name(name), description)
     return f"<figure>{svg}{caption}</figure>"

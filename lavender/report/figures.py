@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,6 +11,7 @@ from lavender.report.drawing import (
     INK,
     ORANGE,
     QUIET,
+    FigureFolder,
     Label,
     draw_figure,
     fit_margins,
@@ -40,7 +40,7 @@ def select_drawn_solvers(ranking: Sequence[str]) -> list[str]:
     return [n for n in ranking if n in first or n in (*ALWAYS_DRAWN, ENGINE_NAME) or is_plug_in(n)]
 
 
-def draw_time_to_accuracy(report: Contents, names: Sequence[str], folder: Path | None) -> str:
+def draw_time_to_accuracy(report: Contents, names: Sequence[str], folder: FigureFolder | None) -> str:
     """Draw the mean time of each solver to each tolerance, with values at the ends of the lines."""
     tolerances = report.tolerances
     means = {t: rank_solvers(report, t, report.subject)["mean"] for t in tolerances}
@@ -80,7 +80,7 @@ def draw_time_to_accuracy(report: Contents, names: Sequence[str], folder: Path |
 def draw_profile(
     times: pd.DataFrame,
     names: Sequence[str],
-    folder: Path | None,
+    folder: FigureFolder | None,
     name: str = "profile",
     **style: Any,
 ) -> str:
@@ -122,7 +122,9 @@ def draw_profile(
     return draw_figure(name, fill, FIGURE_SIZE, fit_margins(names), note=note, folder=folder)
 
 
-def draw_error_against_time(report: Contents, case: str, names: Sequence[str], folder: Path | None) -> str:
+def draw_error_against_time(
+    report: Contents, case: str, names: Sequence[str], folder: FigureFolder | None
+) -> str:
     """Draw the error that each solver reached on one case by a time; an engine's own answer is a star.
 
     It is the velocity error in m/s, or the error of a quadratic program, whose limit is the tolerance to reach.

@@ -15,8 +15,8 @@ from markupsafe import Markup
 from lavender.base.errors import InputError
 from lavender.problem.derived import cached_property
 from lavender.report import figures, tables
-from lavender.report.drawing import FILE_KINDS
-from lavender.report.page import Page, fold_table, make_table
+from lavender.report.drawing import FigureFolder
+from lavender.report.page import PAPER_COLUMNS, Page, check_columns, fold_table, make_table
 from lavender.report.render import escape_markdown, format_markdown, print_table, write_files
 from lavender.report.runner import Event
 from lavender.report.sweeps import SweepStudy
@@ -355,7 +355,7 @@ class Report(Contents):
 
     # -- page ----------------------------------------------------------------------------------------------
 
-    def make_page(self, folder: Path | None = None, with_figures: bool = True) -> Page:
+    def make_page(self, folder: FigureFolder | None = None, with_figures: bool = True) -> Page:
         """Make the page; with `folder`, the figures are also written there."""
         n, solvers = len(self.frame["case"].unique()), len(self.frame["solver"].unique())
         limit = "" if self.is_campaign or not n else f" · limit {format_time(self.time_limit)} a solve"
@@ -390,7 +390,7 @@ class Report(Contents):
             mark=self.sweeps.mark if self.is_sweep_study else "", is_bad=self.is_sweep_study and self.sweeps.is_bad,
         )  # fmt: skip
 
-    def _make_blocks(self, folder: Path | None, with_figures: bool) -> list[Any]:
+    def _make_blocks(self, folder: FigureFolder | None, with_figures: bool) -> list[Any]:
         """Make the table of solvers, the matrix and the figures."""
         names = figures.select_drawn_solvers(list(map(str, self.ranking.index)))
         times = self.get_times(self.tolerance)
@@ -573,7 +573,7 @@ class Report(Contents):
         files = Markup(
             'For a paper: <a href="tables/solvers.tex">solvers.tex</a>, '
             '<a href="tables/lavender.bib">lavender.bib</a>, '
-            f"figures/ ({', '.join(FILE_KINDS)}); "
+            f"figures/ ({', '.join(self.figure_kinds)}); "
             f'data: <a href="records.csv">records.csv</a> (every run), {", ".join(links)}.'
         )
         if not run:
@@ -624,33 +624,49 @@ def write(
         files["tables/solvers.tex"] = lambda: make_latex_table(report)
         files["tables/lavender.bib"] = make_bibtex_entry(report)
     files["summary.md"] = lambda: summarise(report)
-    files["index.html"] = lambda: report.make_page(folder / "figures", figures).render()
+    drawn = FigureFolder(folder / "figures", report.figure_kinds)
+    files["index.html"] = lambda: report.make_page(drawn, figures).render()
     order = {name: i for i, name in enumerate(files)}
     write_files(folder, files, lambda name: watch(Event(order[name], len(files), name, "", phase="writing")))
     return folder / "index.html"
 
 
 def make_latex_table(report: Report) -> str:
-    """Return the table of solvers with the mean time to each tolerance for a paper; needs the package booktabs."""
+    """Return the table of solvers for a paper with the columns of the report; needs the package booktabs."""
     table = tables.tabulate_solvers(report)
-    times = {} if report.is_campaign else {
-        f"$10^{{{round(np.log10(x))}}}$": 1e3 * table[f"to {format_tol(x)} [s]"] for x in report.tolerances
+    times = {format_tol(x): f"to {format_tol(x)} [s]" for x in report.tolerances if not report.is_campaign}
+    middle = times.get(format_tol(report.tolerance), "")
+    known: dict[str, Any] = {
+        "solved": table["solved"].astype(str) + "/" + table["cases"].astype(str), "accepted": table["accepted"],
+        "false": table["false claims"],
+        **{f"{word}": 1e3 * table[head] for word, head in times.items()},
     }  # fmt: skip
-    paper = pd.DataFrame({"solved": table["solved"].astype(str) + "/" + table["cases"].astype(str), **times})
+    if times:
+        known |= {"ratio": table[middle] / table[middle].min(), "slowest": 1e3 * table["slowest [s]"]}
+    columns = [x if x in PAPER_COLUMNS else format_tol(float(x)) for x in report.columns] or [
+        "solved",
+        *times,
+    ]
+    check_columns(columns, list(known))
+    heads = {"false": "false claims", "ratio": r"$\times$ best", "slowest": "slowest [ms]"} | {
+        word: f"$10^{{{round(np.log10(float(word)))}}}$" for word in times
+    }
+    paper = pd.DataFrame({heads.get(name, name): known[name].to_numpy() for name in columns})
     paper.index = pd.Index(table["solver"].map(_escape_latex))
     paper.index.name = None
     paper = paper.where(~paper.isin([np.inf, -np.inf]))
+    numbers = [heads.get(name, name) for name in columns if name in (*times, "ratio", "slowest")]
     caption = f"Problems solved to a residual of {format_tol(report.tolerance)}"
-    if times:
+    if set(columns) & set(times):
         caption += ", and shifted geometric mean of the time [ms] to each residual"
     caption += (
         f" over {format_count(int(table['cases'].max()), 'problem')} (shift 10 µs; unsolved or not accepted at "
         f"{report.time_limit:g} s). lavender {_escape_latex(str(report.machine.get('lavender', '')))}, "
         f"{_escape_latex(str(report.machine.get('cpu', '')))}, one thread."
     )
-    style = paper.style.format(precision=3, na_rep="--", subset=list(times))
-    style = style.highlight_min(subset=list(times), props="textbf:--rwrap;") if times else style
-    return style.to_latex(hrules=True, column_format="l" + "r" * paper.shape[1], label="tab:solvers", position="t",
+    style = paper.style.format(precision=3, na_rep="--", subset=numbers)
+    style = style.highlight_min(subset=numbers, props="textbf:--rwrap;") if numbers else style
+    return style.to_latex(hrules=True, column_format="l" + "r" * len(columns), label="tab:solvers", position="t",
                           caption=caption)  # fmt: skip
 
 

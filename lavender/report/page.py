@@ -17,11 +17,12 @@ Every text but `Markup` is escaped.
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from lavender.base.errors import require_packages
+from lavender.base.errors import InputError, require_packages
 from lavender.report.render import format_cells, list_number_heads
 
 if TYPE_CHECKING:
@@ -31,6 +32,13 @@ if TYPE_CHECKING:
 DEFAULT_ERROR_LIMIT = (
     1e-3  # [m/s, rad/s on angular rows] Pages compare with this velocity error if none is given.
 )
+PAPER_COLUMNS = (
+    "solved",
+    "ratio",
+    "slowest",
+    "accepted",
+    "false",
+)  # Of the LaTeX table, which may have tolerances, too.
 MAX_ROWS = 500  # Largest number of rows of a table on a page; files have all rows.
 
 
@@ -64,6 +72,15 @@ class Page:
         ):  # fmt: skip
             text = text.replace("\u00a0", " ").replace("\u202f", "")  # Units do not break on a page only.
             console.print(text, style=style, highlight=False, markup=False, soft_wrap=text.startswith("    "))
+
+
+def check_columns(columns: Sequence[str], known: Sequence[str] = ()) -> None:
+    """Raise InputError unless columns of the LaTeX table are of `known`; without it, `PAPER_COLUMNS` or numbers."""
+    for name in columns:
+        is_tolerance = re.fullmatch(r"[0-9.]+(e-?[0-9]+)?", name) and not known
+        if not is_tolerance and name not in (known or PAPER_COLUMNS):
+            names = ", ".join(known or (*PAPER_COLUMNS, "a tolerance such as 1e-6"))
+            raise InputError(f"the table has no column {name!r}; columns are {names}")
 
 
 def make_table(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from lavender.report.drawing import (
     PAPER,
     QUIET,
     SERIES,
+    FigureFolder,
     Label,
     draw_error_strip,
     draw_figure,
@@ -157,14 +157,14 @@ class SweepStudy:
             return [*lines, " ".join(f"{text}." for text in ("; ".join(texts), same) if text)]
         return [*lines, f"{'; '.join(texts)}."] if texts else lines
 
-    def make_blocks(self, folder: Path | None, with_figures: bool) -> list[Any]:
+    def make_blocks(self, folder: FigureFolder | None, with_figures: bool) -> list[Any]:
         """Make the figures and the table of sweeps × solvers."""
         table = self._make_sweeps_table()
         if not with_figures:
             return [table]
         return [{"pair": [[Markup(self._draw_errors(folder))], [Markup(self._draw_steps(folder)), table]]}]
 
-    def _draw_errors(self, folder: Path | None) -> str:
+    def _draw_errors(self, folder: FigureFolder | None) -> str:
         """Draw the largest error against the number of sweeps, with the engine's own answers as a star."""
         low = SWEEPS_SHOWN_RATIO * self.limit
         colors = [BLUE, *SERIES[2:], INK, *[QUIET] * len(self.groups)]
@@ -231,7 +231,7 @@ class SweepStudy:
         note = " ".join([*notes, "(tables/sweeps.csv)"])
         return draw_figure("sweeps", fill, (4.9, 3.5), margins, note=note, folder=folder)
 
-    def _draw_steps(self, folder: Path | None) -> str:
+    def _draw_steps(self, folder: FigureFolder | None) -> str:
         """Draw the error of each step after each number of sweeps of the first solver, the engine's answers first."""
         runs = self.runs[(self.runs["solver"] == self.first) & (self.runs["start"] == self.start)]
         table = runs.pivot_table(index="max_iter", columns="case", values="velocity", sort=False).sort_index()

@@ -19,6 +19,7 @@ import numpy as np
 import pandas as pd
 
 from lavender import io
+from lavender.base.arrays import check_choice
 from lavender.base.deadline import format_seconds
 from lavender.base.errors import LavenderError
 from lavender.io.stored import ENGINE, SUFFIXES, read_whole_file
@@ -26,7 +27,8 @@ from lavender.judge.residuals import DEFAULT_THRESHOLD, at_floor
 from lavender.judge.solution import CONFIRMED, CONTRADICTED
 from lavender.problem.derived import cached_property
 from lavender.report import machine
-from lavender.report.page import DEFAULT_ERROR_LIMIT
+from lavender.report.drawing import FILE_KINDS
+from lavender.report.page import DEFAULT_ERROR_LIMIT, check_columns
 from lavender.report.store import (
     Row,
     describe_target,
@@ -279,6 +281,11 @@ class Contents:
         Answers of the engines that recorded the steps: `lavender.report.tables.read_engine_answers`.
     error_limit : float, m/s
         Velocity error with which sentences and figures compare; in rad/s on angular rows.
+    figure_kinds : sequence of str
+        Formats of the files of figures: pdf, svg, png.
+    columns : sequence of str
+        Columns of the table for a paper: solved, tolerances such as 1e-6, ratio, slowest, accepted, false; default:
+        solved and all tolerances.
     """
 
     lines: Frame
@@ -286,7 +293,14 @@ class Contents:
     times: Sequence[float] = ()
     engines: Frame = field(default_factory=_make_answers)
     error_limit: float = DEFAULT_ERROR_LIMIT
+    figure_kinds: Sequence[str] = FILE_KINDS
+    columns: Sequence[str] = ()
     _times: dict[float, Frame] = field(default_factory=dict, init=False)  # Results of `get_times`.
+
+    def __post_init__(self) -> None:
+        for kind in self.figure_kinds:
+            check_choice("figure_kinds", kind, FILE_KINDS)
+        check_columns(self.columns)
 
     @cached_property
     def runs(self) -> Frame:

@@ -267,3 +267,21 @@ def test_slip_over_time_counts_steps_with_contact_of_all_states():
     # The box turns by less than 1e-3 rad.
     assert now.later == pytest.approx(speeds[:, 1:][touches[:, 1:]].mean(), rel=1e-2)
     assert both.remedies_table.iloc[0].tolist()[3:] == [f"{n} of 50", f"{now.kept} of 2"]
+
+
+def test_slip_names_no_setting_twice():
+    options = 'noslip_iterations="20" tolerance="1e-12" iterations="10" impratio="2"'
+    model = block(0.2, option=options)
+    settings = [r.setting for r in explain_slip_of_states(model, steps=5).worst.remedies]
+    assert len(settings) == len(set(settings)) >= 4
+
+
+def test_slip_explanation_prints_the_digits_of_the_command(tmp_path):
+    from lavender.report.render import format_cells
+
+    result = explain_slip_of_states(block(0.2), steps=20)
+    explanation = result.explanations[0]
+    assert format_cells(explanation.table).to_string(index=False) in str(explanation)
+    page = result.page.write(tmp_path / "slip")
+    assert "slip-over-time" in page.read_text(encoding="utf-8")
+    assert mujoco.__version__ in (tmp_path / "slip" / "numbers.json").read_text(encoding="utf-8")

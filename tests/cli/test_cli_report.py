@@ -49,13 +49,17 @@ def test_report_leaves_out_a_named_file_that_is_broken_and_ends_with_1(lavender,
     assert code == 1 and "nothing was measured" in out and str(broken) in out
 
 
-def test_quiet_report_prints_the_path_of_the_page(lavender, path, tmp_path):
+def test_quiet_report_prints_the_path_of_the_page_and_writes_the_chosen_figures_and_columns(lavender, path, tmp_path):
     out = tmp_path / "out"
     words = ("report", path, "--solvers", "pgs,newton", "--tolerances", "1e-3,1e-6", "--repeats", 1, "--out", out)
-    code, shown, err = lavender(*words, "-q")
+    code, shown, err = lavender(*words, "-q", "--figure-kinds", "pdf,svg", "--columns", "1e-6,solved,slowest")
     assert (code, shown.strip(), err) == (0, str(out / "index.html"), "")
+    assert {p.suffix for p in (out / "figures").iterdir()} == {".pdf", ".svg"}
     table = (out / "tables" / "solvers.tex").read_text()
-    assert r" & solved & $10^{-3}$ & $10^{-6}$ \\" in table and r"\toprule" in table
+    assert r" & $10^{-6}$ & solved & slowest [ms] \\" in table and r"\toprule" in table
+    for options, sign in ((("--columns", "fastest"), "no column 'fastest'"), (("--figure-kinds", "bmp"), "bmp")):
+        code, shown, err = lavender(*words, *options)
+        assert (code, shown) == (2, "") and sign in err
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")

@@ -3,11 +3,13 @@
 import contextlib
 import errno
 import os
+import signal
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
+from worked import python
 
 import lavender as lv
 from lavender import io, report
@@ -121,3 +123,21 @@ def test_folder_of_steps_is_continued_by_its_recording_alone(tmp_path):
     assert len(simulation.record(tmp_path, 2)) == 2  # the next two steps
     with pytest.raises(lv.InputError, match="holds 4 problem files"):
         lv.Simulation("stack").record(tmp_path, 2)
+
+
+WRITE_AND_DIE = """if True:
+    import os, signal
+    from pathlib import Path
+    from lavender.io.stored import write_atomically
+
+    def write(part):
+        Path(part).write_bytes(b"half")
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    write_atomically("a.txt", write)"""
+
+
+def test_killed_writer_leaves_the_old_file(tmp_path):
+    (tmp_path / "a.txt").write_bytes(BEFORE)
+    python("-c", WRITE_AND_DIE, cwd=tmp_path, status=-signal.SIGKILL)
+    assert (tmp_path / "a.txt").read_bytes() == BEFORE

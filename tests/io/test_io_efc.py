@@ -229,3 +229,38 @@ def test_from_efc_of_coulomb_law_on_unsupported_contacts_raises():
     given["contacts"][3][:, 1] *= 2.0
     with pytest.raises(lv.CapabilityError, match="different coefficients of its tangents"):
         lv.io.from_efc(**given, friction="coulomb")
+
+
+def test_scratch_of_a_call_that_raised_makes_other_data(monkeypatch):
+    """MuJoCo may have left its stack as it was when it raised an error."""
+    model = mj.MjModel.from_xml_string(scene())
+    scratch, states = lv.io.MujocoScratch(model), states_of(model, 1)
+    lv.io.from_mujoco_many(model, states, scratch=scratch)
+    used = scratch.take_data()
+    scratch.keep_data(used)
+
+    def fail(model, data):
+        raise mj.FatalError("stack overflow")
+
+    monkeypatch.setattr(mj, "mj_forward", fail)
+    with pytest.raises(lv.InputError, match="state 0: MuJoCo raised an error, stack overflow"):
+        lv.io.from_mujoco_many(model, states, scratch=scratch)
+    assert scratch.take_data() is not used
+
+
+def test_from_mujoco_many_with_a_state_that_is_not_finite_reads_the_others():
+    model = mj.MjModel.from_xml_string(scene())
+    states = states_of(model, 5)
+    clean = lv.io.from_mujoco_many(model, states)
+    spoiled = states.copy()
+    spoiled[1, -1], spoiled[3, 0] = np.nan, np.inf
+    with pytest.raises(lv.InputError, match="states"):
+        lv.io.from_mujoco_many(model, spoiled)
+    batch, impulse = lv.io.from_mujoco_many(model, spoiled, errors="status")
+    with pytest.raises(lv.InputError, match="world 1: v_free"):
+        lv.solve_many(batch)
+    many = lv.solve_many(batch, errors="status")
+    found = lv.residual_many(batch, impulse, errors="status")
+    assert sorted(many.faults) == sorted(found.faults) == [1, 3]
+    for i in (0, 2, 4):
+        assert batch[i] == clean.batch[i]

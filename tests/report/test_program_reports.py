@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from calls import installed
+from worked import python
 
 import lavender as lv
 from lavender import report
@@ -128,3 +129,38 @@ def test_cross_check_names_programs_without_a_solution():
 
 
 # -- times -------------------------------------------------------------------------------------------------
+
+
+def test_timed_calls_import_nothing(tmp_path):
+    """Every installed solver, on a contact problem and on programs: also the first of its calls."""
+    lv.io.save(lv.Problem.from_qp(**control()), tmp_path / "definite.npz")
+    lv.io.save(lv.Problem.from_qp(**control(singular=True)), tmp_path / "singular.npz")
+    code = """if True:
+        import sys
+        from lavender import report
+        from lavender.report import case_kinds, timing
+        timed, late = [], []
+        def watch(real):
+            def call(problem, solver, **arguments):
+                before = set(sys.modules)
+                try:
+                    return real(problem, solver, **arguments)
+                finally:
+                    if timed[-1:] == ["now"]:
+                        late.extend((solver, name) for name in set(sys.modules) - before)
+            return call
+        def measure(real):
+            def time_call(*arguments, **keywords):
+                timed.append("now")
+                try:
+                    return real(*arguments, **keywords)
+                finally:
+                    timed[-1] = "done"
+            return time_call
+        case_kinds.solve, case_kinds.solve_qp = watch(case_kinds.solve), watch(case_kinds.solve_qp)
+        timing._time_call = measure(timing._time_call)
+        plan = report.Plan(tolerances=(1e-6,), budgets=(), repeats=2, time_limit=0.3)
+        report.run([*sys.argv[1:], "two_particles"], None, plan)
+        assert len(timed) > 30 and not late, late
+    """
+    python("-c", code, tmp_path / "definite.npz", tmp_path / "singular.npz")

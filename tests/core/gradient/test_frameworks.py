@@ -161,3 +161,15 @@ def test_vmap_of_jax_is_before_a_batch_inside():
 
     for function in (push, jax.grad(lambda J: push(J).sum())):
         assert np.allclose(jax.vmap(function)(many), np.stack([function(J) for J in many]), rtol=1e-9)
+
+
+def test_torch_layer_computes_only_required_gradients():
+    torch, solve = torch_and_solve()
+
+    def by_mu(*given):
+        *fixed, mu = map(torch.tensor, given)
+        mu.requires_grad_()
+        solve(*fixed, mu)[0][0].backward()
+        return float(mu.grad.sum())
+
+    twice(by_mu)

@@ -5,7 +5,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from random_problems import FORMS, as_matrix, random_contact_problem, touching
+from random_problems import FORMS, as_matrix, general, random_contact_problem, touching
 from scipy.optimize import linprog
 
 import lavender as lv
@@ -204,3 +204,33 @@ def test_auto_proves_that_opposed_contacts_contradict_in_any_island(law, mu, pla
         solution = lv.solve(problem)
         assert solution.status is lv.Status.INFEASIBLE and solution.claim_check == "confirmed", str(solution)
         assert set(np.flatnonzero(solution.certificate)) <= set(range(6 * place, 6 * place + 6))
+
+
+@pytest.mark.parametrize("name", lv.available(walking(0)))
+@pytest.mark.parametrize("form", ["matrix", "J and M"])
+def test_row_of_rounding_size_needs_no_impulse(form, name):
+    for seed in range(3):
+        dusty = walking(seed)
+        problem = as_matrix(dusty) if form == "matrix" else dusty
+        assert len(problem.metric.empty) and problem.b[0] > 0.0
+        solution = lv.solve(problem, name, tol=1e-6)
+        clean = lv.solve(problem.updated(b=np.where(np.arange(problem.m) == 0, 0.0, problem.b)), name, tol=1e-6)
+        assert solution.success == clean.success, str(solution)
+        assert solution.claim_check == "confirmed"
+        if form == "J and M" and name in OURS:  # nor to any tolerance
+            assert lv.solve(problem, name, tol=1e-20).status is not lv.Status.INFEASIBLE
+    real = walking(0, dust=1e-3)
+    assert lv.solve(as_matrix(real) if form == "matrix" else real, name).status is lv.Status.INFEASIBLE
+
+
+def test_empty_row_of_bodies_of_rounding_size_needs_no_impulse():
+    rows = random_contact_problem(3, tangents=0, spin=False).rows
+    jac = rows.jac.copy()
+    jac[0] = 0.0
+    for form in (lambda p: p, as_matrix, general):
+        for dust, status in ((1e-17, "CONVERGED"), (1e-2, "INFEASIBLE")):
+            target = np.zeros(len(jac) + rows.n_contacts)
+            given = lv.Rows(**{f: getattr(rows, f) for f in rows.__dataclass_fields__ if f != "jac"}, jac=jac)
+            target[0] = dust
+            problem = form(lv.Problem.from_rows(given, target=target, tangents=0))
+            assert lv.solve(problem).status.name == status

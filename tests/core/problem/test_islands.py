@@ -18,6 +18,7 @@ from random_problems import (
     random_generalized_problem,
     seeds,
     side_by_side,
+    touching,
     with_ground_as_body,
 )
 
@@ -299,3 +300,20 @@ def test_find_islands_ground_given_as_immovable_body_equals_ground_minus_one(see
         one, other = (lv.solve(p, name, tol=1e-8) for p in (both, given))
         assert one.status is other.status, name
         np.testing.assert_allclose(lv.residual(both, other.impulse).islands.relative, other.residual.islands.relative)
+
+
+def test_residual_rounding_of_moving_immovable_bodies_is_satisfied():
+    """b = 0.2 - (0.3 - 0.1) of two immovable bodies is rounding of its terms, so that no impulse is needed."""
+    problem = unmoved_row_beside(1e-3, "bodies", 1.0).updated(b=[1e-3, 2.8e-17])
+    solution = lv.solve(problem, tol=1e-6)
+    assert solution.success and solution.residual.relative < 1e-15
+
+
+def test_newton_block_between_two_immovable_bodies_is_an_island_of_its_own():
+    rows = touching([(0, 1), (1, 2)], inv_mass=[0.0, 0.0, 1.0], inv_inertia=[np.zeros((3, 3))] * 2 + [np.eye(3)])
+    problem = lv.Problem.from_rows(rows, target=[0.0, 0.0, 0.0, 1.0, 0.5, 0.0], mu=0.5)
+    assert find_islands(problem) == (2, pytest.approx([0, 1]))
+    for name in ("newton", "auto", "admm", "block_gauss_seidel"):
+        solution = lv.solve(problem, name, tol=1e-9)
+        assert solution.success, name
+        np.testing.assert_allclose(problem.velocity(solution.impulse)[2, :2], [0.5, 0.0], atol=1e-8)

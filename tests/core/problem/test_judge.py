@@ -224,3 +224,48 @@ def test_solve_at_rest_converges_without_iterations():
     assert residuals.is_solved_by_zero(lv.Problem.lcp(a, [0.0, 0.0], lower=1.0))
     assert not residuals.is_solved_by_zero(lv.Problem.lcp(a, [0.0, 5.0], lower=1.0))
     assert residuals.is_solved_by_zero(lv.Problem.lcp(np.zeros((0, 0)), []))
+
+
+@pytest.mark.parametrize("friction", ["coulomb", "cone"])
+@given(seed=seeds)
+def test_floor_bounds_the_rounded_slider_between_tangents_of_unlike_mass(friction, seed):
+    """It slides along the light one: A lambda says nothing of the impulse's own rounding, which d makes a velocity."""
+    rng = np.random.default_rng(seed)
+    normal, light, mu, b = rng.uniform(0.5, 2.0, 4).astype(np.longdouble)
+    d = np.diag([normal, 10.0 ** rng.uniform(0.0, 12.0), light]).astype(float)
+    push = 4.0 * mu * b * light / normal  # four times what the contact holds
+    x = b / normal if friction == "coulomb" else (b + mu * push) / (normal + mu * mu * light)
+    problem = lv.Problem.contact(d, np.array([b, 0.0, push], float), [float(mu)], friction=friction)
+    exact = np.array([x, 0.0, mu * x], float)
+    judged = lv.residual(problem, exact)
+    # A disk: both lambda_t and mu lambda_n are rounded. The projection on a cone rounds in five more operations.
+    assert judged.relative <= (2.0 if friction == "coulomb" else 7.0) * judged.roundoff_floor
+    if friction == "coulomb":  # a wide cone's nearest point follows the tangents
+        off = lv.residual(problem, exact * [1.0, 1.0, 1.0 + 2.0**-46])  # by 64 units of the last place
+        assert off.relative > 2.0 * off.roundoff_floor
+
+
+def test_certificate_of_a_sum_within_rounding_is_rejected():
+    """A^T y is (0, 0, -2^-53), which impulses of 3e7 N s meet to 1e-9; exact zeros are a proof at the same b.y."""
+    y, b = [1.0, 1.0, -1.0], np.array([1.0, 0.0, 1.0 - 3e-9])
+    for small, proves in ((2.0**-53, False), (0.0, True)):
+        a = np.array([[1.0, 0.0, 1.0], [0.0, 1.0, small], [1.0, 1.0, 1.0]])
+        for upper in (np.inf, 1e12):
+            problem = lv.Problem.lcp(a, b, lower=-np.inf, upper=[np.inf, np.inf, upper])
+            assert (check_certificate(problem, y) is None) is proves
+        met = np.array([1.0 - 3e-9 * 2.0**53, -3e-9, 3e-9 * 2.0**53])
+        if not proves:
+            assert lv.residual(problem, met).relative < 2e-9
+    for jac, proves in (([[1.0], [-1.0]], True), ([[1.0], [2.0**-30 - 1.0]], False)):
+        cones, target = lv.Cones.bounded([0.0, 0.0], [np.inf, np.inf]), [1.0, -1.0 + 1e-10]
+        opposed = lv.Problem.from_jacobian(jac, [[1.0]], [0.0], target=target, cones=cones)
+        assert (check_certificate(opposed, [1.0, 1.0]) is None) is proves
+
+
+def test_residual_with_huge_bounds_counts_the_step():
+    # w pushes into a bound on which lambda already sits: no error, however large the bound.
+    for bound in (1e6, 1e60):
+        problem = lv.Problem.lcp([[0.0, 0.0], [0.0, 1.0]], [1.0, 1.0], -bound, bound)
+        assert lv.residual(problem, [bound, 1.0]).relative == 0.0
+        assert lv.residual(problem, [-bound, 1.0]).relative > 0.1
+        assert lv.solve(problem, "pgs").impulse.tolist() == [bound, 1.0]

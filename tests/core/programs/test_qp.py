@@ -407,3 +407,56 @@ def test_program_without_variables_is_found_unless_a_row_contradicts_itself(solv
     is_solvable = min(h, default=0.0) >= 0.0 and not np.any(b)
     assert answer.x.shape == (0,) and answer.found == is_solvable
     assert answer.solution.status is (lv.Status.CONVERGED if is_solvable else lv.Status.INFEASIBLE)
+
+
+PLACEHOLDERS = [1e4, 1e7, 1e9, 1e12, 1e15, 1e17, 9e19]
+
+
+@pytest.mark.parametrize("name", lv.available(lv.Problem.from_qp(np.eye(2), np.zeros(2), lb=np.zeros(2))))
+@pytest.mark.parametrize("tol", [1e-6, 1e-9])
+def test_solve_qp_with_placeholder_bounds_fulfils_its_equation(name, tol):
+    """(x - 2)^2 + (y - 1)^2 with x + y = 1 is least at (1, 0); (2, 1) was found, or x off by 1.7."""
+    for far in PLACEHOLDERS:
+        problem = lv.Problem.from_qp(
+            2.0 * np.eye(2), [-4.0, -2.0], A=[[1.0, 1.0]], b=[1.0], ub=[far, far], lb=[-far, -far]
+        )
+        answer = lv.solve_qp(problem, name, tol=tol)
+        if answer.found:
+            np.testing.assert_allclose(answer.x, [1.0, 0.0], atol=10.0 * tol)
+        # quadprog needs a definite A; rounding of a bound of 1e9 is 1e-7.
+        if name != "quadprog" and far <= (1e12 if lv.get(name).external else 1e7):
+            assert answer.found, str(answer)
+
+
+def test_solve_qp_error_ignores_the_multiplier_of_a_far_row():
+    """The gap of 1e-4 of a multiplier of 1e-10 at a bound of 1e6 is a residual, and the point is a solution."""
+    problem = lv.Problem.from_qp(2.0 * np.eye(2), [-4.0, -2.0], A=[[1.0, 1.0]], b=[1.0], ub=[1e6, 1e6])
+    impulse = lv.solve_qp(problem, "newton", tol=1e-12).impulse.copy()
+    impulse[-1] = 1e-10
+    answer = problem.qp.solution(impulse, 1e-9)
+    assert answer.duality_gap == pytest.approx(1e-4, rel=1e-3)
+    assert answer.found and answer.error <= 1e-10
+
+
+def test_solve_qp_violation_of_cancelling_terms_is_relative_to_their_sum():
+    """A second difference of 1e7 - 2e7 + 1e7 is violated by 0.5, which is 2.5e-8 of the sum of its terms."""
+    difference = 1000.0 * np.array([[1.0, -2.0, 1.0]])
+    problem = lv.Problem.from_qp(
+        np.zeros((3, 3)), [1.0, -2.0, 0.0], G=-difference, h=[1.0], A=[[0, 0, 1.0], [1.0, 0, 0]], b=[5e3, 5e3]
+    )
+    answer = lv.solve_qp(problem)
+    np.testing.assert_allclose(answer.x, 5e3, rtol=1e-6)
+    impulse = answer.impulse.copy()
+    impulse[1] += 2.5e-4  # a violation of 0.5
+    off = problem.qp.solution(impulse, 1e-8)
+    assert off.primal_residual == pytest.approx(0.5, rel=1e-3)
+    assert answer.found and not off.found
+    multipliers = problem.qp.select_row_multipliers(impulse)
+    assert problem.qp.judge(off.x, multipliers)[2] == pytest.approx(2.5e-8, rel=1e-3)
+
+
+def test_solve_qp_error_adds_gaps_of_opposite_signs():
+    problem = lv.Problem.from_qp(np.zeros((2, 2)), [1.0, 1.0], lb=[1.0, 1.0])
+    exact = lv.solve_qp(problem, tol=1e-12).impulse
+    off = problem.qp.solution(exact + np.array([1e-3, -1e-3, 0.0, 0.0]), 1e-6)
+    assert off.duality_gap <= 1e-9 and off.error >= 0.9e-3

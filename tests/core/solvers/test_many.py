@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import lavender as lv
+from lavender.problem.cones import project_impulse
 
 DISKS = lv.Cones.contacts(0.5, count=4)
 
@@ -334,3 +335,28 @@ def test_solve_many_of_a_list_begins_at_its_impulses():
         lv.residual_many(given, None)
     with pytest.raises(lv.InputError, match="problems is 3; a sequence of Problems, or a Batch"):
         lv.solve_many(3)
+
+
+@pytest.mark.parametrize("listed", [False, True])
+def test_solve_many_with_a_start_that_is_not_finite_fails_in_its_world_only(listed):
+    batch = lv.Batch(*worlds(6), cones=DISKS)
+    clean = lv.solve_many(batch, tol=1e-8)
+    start = clean.impulse.copy()
+    start[2, 5], start[4] = np.nan, np.inf
+    given, starts = (list(batch), {"impulses": start}) if listed else (batch, {"impulse": start})
+    with pytest.raises(lv.InputError, match=r"world 2: impulse \[N s\] is nan at row 5"):
+        lv.solve_many(given, tol=1e-8, **starts)
+    many = lv.solve_many(given, tol=1e-8, errors="status", **starts)
+    impulse, velocity = many.impulse.reshape(6, -1), many.velocity.reshape(6, -1)
+    assert sorted(many.faults) == [2, 4] and not many.success[[2, 4]].any()
+    assert np.isnan(impulse[[2, 4]]).all() and np.isnan(velocity[[2, 4]]).all()
+    for i in (0, 1, 3, 5):
+        # Each start is a solution; its friction exceeded its bound by at most 4e-12 of it, and is projected on it.
+        np.testing.assert_allclose(impulse[i], project_impulse(DISKS, start[i]), rtol=1e-15)
+        np.testing.assert_allclose(impulse[i], start[i], rtol=1e-11)
+        assert many.iterations[i] == 0
+    again, inside = start.copy(), [0, 1, 3, 5]
+    again[inside] = impulse[inside].reshape(again[inside].shape)
+    starts = {"impulses" if listed else "impulse": again}
+    again = lv.solve_many(given, tol=1e-8, errors="status", **starts).impulse.reshape(6, -1)
+    assert again[inside].tobytes() == impulse[inside].tobytes()

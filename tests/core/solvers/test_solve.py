@@ -11,6 +11,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from stacks import stack
 
 import lavender as lv
 from lavender.batch import residuals as loop
@@ -116,3 +117,17 @@ def test_problems_that_differ_in_b_share_memory_of_the_operator_and_free_each_ot
         seen.append(weakref.ref(prepared.problem))
     gc.collect()
     assert [ref() is not None for ref in seen] == [False] * 4 + [True]
+
+
+@pytest.mark.parametrize("arguments", [{}, {"max_iter": 50}, {"time_limit": 5.0}, {"velocity_tol": 1e-6}])
+@pytest.mark.parametrize("name", ["auto", "pgs", "newton"])
+def test_text_of_a_solution_names_its_start(name, arguments):
+    problem = stack(6)
+    stored = problem.updated(guess=0.5 * lv.solve(problem, "direct").impulse)
+    given = np.full(6, 0.25)
+    for solve in (lv.solve, lambda p, name, **more: lv.prepare(p, name).solve(**more)):
+        assert ", from " not in str(solve(problem, name, **arguments))
+        assert "from problem.guess," in str(solve(stored, name, **arguments))
+        assert "from the given impulses," in str(solve(stored, name, impulse=given, **arguments))
+    starts = [solution.start for solution in lv.solve_many([problem, stored], name, impulses=[given, None], tol=1e-6)]
+    assert starts == ["the given impulses", "problem.guess"]
