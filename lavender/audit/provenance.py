@@ -22,21 +22,10 @@ N_HASH_DIGITS = 12
 
 
 def describe_provenance(model: Any, name: str, engine: str = "mujoco") -> dict[str, Any]:
-    """Return the provenance of numbers, as numbers.json holds it.
+    """Return the provenance of numbers, as numbers.json holds it; `model` is None for scenes of other engines.
 
-    Parameters
-    ----------
-    model : mujoco.MjModel or None
-        None for scenes of other engines.
-    name : str
-        Name of the model or scene.
-    engine : str
-
-    Returns
-    -------
-    dict
-        engine, engine_version, lavender, mujoco, integrator, solver, cone, timestep [s], model, model_hash (of the
-        arrays and options of the model), date (UTC) and command; None if there is no such entry.
+    engine, engine_version, lavender, mujoco, integrator, solver, cone, timestep [s], model, model_hash (of the arrays
+    and options of the model), date (UTC) and command; None if there is no such entry.
     """
     entries: dict[str, Any] = {
         "engine": engine, "engine_version": _get_version(PACKAGES.get(engine, engine)), "lavender": __version__,

@@ -14,20 +14,10 @@ from lavender.base.errors import InputError
 
 
 def find_converter(like: Any) -> Callable[[np.ndarray], Any] | None:
-    """Return the function that converts NumPy arrays to the library of `like`.
+    """Return the function that copies NumPy arrays to the library of the array `like`, for results.
 
     For PyTorch, JAX, CuPy and Warp, also to its device and floating precision; other libraries with DLPack get neither.
-
-    Parameters
-    ----------
-    like : array or None
-        An array of the caller's library. If it has a floating dtype, arrays of floats are rounded to it.
-
-    Returns
-    -------
-    callable or None
-        Function that copies a NumPy array to the library of `like`. None if `like` is None or a NumPy array, because
-        results are then returned as NumPy arrays.
+    None if `like` is None or a NumPy array.
     """
     if like is None or isinstance(like, np.ndarray):
         return None

@@ -217,13 +217,6 @@ def resolve_index(i: Any, n: int, thing: str = "world") -> int | list[int]:
     -------
     int or list of int
         The nonnegative position for an integer, else the list of positions.
-
-    Raises
-    ------
-    IndexError
-        An integer is out of range.
-    InputError
-        The index has another type.
     """
     if isinstance(i, slice):
         return list(range(*i.indices(n)))

@@ -159,14 +159,8 @@ class WorldResults:
     ) -> None:
         """Process all worlds, and store the errors of invalid ones in `faults`.
 
-        Parameters
-        ----------
-        process_until_deferred : callable
-            Processes the next world in the compiled loop, or returns its index if a single call must process it.
-        process_single : callable
-            Processes a world by a single call.
-        threads : int
-        errors : {"raise", "status"}
+        `process_until_deferred` processes the next world in the compiled loop, or returns its index if a single call
+        (`process_single`) must process it.
         """
 
         def try_single(i: int, stop: bytearray) -> None:

@@ -71,20 +71,7 @@ def generate_name_functions(header: str) -> str:
 
 
 def amalgamate(root: Path, cache: Path | None = None) -> str:
-    """Return lavender.c.
-
-    Parameters
-    ----------
-    root : Path
-        Folder that contains lavender_ext with its sources.
-    cache : Path, optional
-        Folder of translations of an ordinary build.
-
-    Raises
-    ------
-    ExtractionError
-        The kernels cannot be translated, or need Python.
-    """
+    """Return lavender.c from `root`, which contains lavender_ext; `cache` has translations of an ordinary build."""
     front = "".join(path.read_text(encoding="utf-8") for path in FRONT)
     front += generate_name_functions(HEADER.read_text(encoding="utf-8"))
     version = runpy.run_path(str(HERE.parent / "_version.py"))["__version__"]

@@ -54,15 +54,7 @@ def start_process(backend: Backend) -> None:
 def run_isolated(
     backend: Backend, program: ScaledProgram, start: Start, limit: Limits, settings: dict[str, Any]
 ) -> Answer:
-    """Run the backend in another process, which is killed at the time limit.
-
-    Raises
-    ------
-    InputError
-        The backend has no such setting, or a setting cannot be pickled.
-    BackendFailed
-        The backend raised an exception, or its process died.
-    """
+    """Run the backend in another process, which is killed at the time limit."""
     timeout = limit.time_limit
     if timeout is not None and backend.stoppable:
         timeout = max(STOPPABLE_LIMIT_RATIO * timeout, timeout + MIN_STOPPABLE_TIME)

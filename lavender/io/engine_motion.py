@@ -58,15 +58,7 @@ class EngineMotion:
     momentum: FloatArray | None = None
 
     def judge(self, problem: Problem, forces: Residual) -> Residual:
-        """Return the residual of the forces or of the acceleration, by `moved_by`.
-
-        Parameters
-        ----------
-        problem : Problem
-            In generalised coordinates.
-        forces : Residual
-            Residual of the impulses.
-        """
+        """Return the residual of the forces (`forces`) or of the acceleration, by `moved_by`."""
         general = problem.generalized
         if general is None or not (np.isfinite(self.impulse).all() and np.isfinite(self.change).all()):
             return forces

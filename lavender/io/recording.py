@@ -204,12 +204,9 @@ def iterate_steps(
 def _solve_step(
     mj: Any, model: Any, data: Any, name: str, precision: str, threshold: float
 ) -> tuple[Problem, FloatArray, dict[str, Any]] | None:
-    """Solve the constraints of the present state with MuJoCo without advancing time; return None without constraints.
+    """Solve the constraints of the present state with MuJoCo without advancing time.
 
-    Returns
-    -------
-    (Problem, (m,) N s, dict) or None
-        The problem, MuJoCo's impulse, and the record of both.
+    Return the problem, MuJoCo's impulse (m,) [N s], and the record of both; None without constraints.
     """
     # The same solve from the same warm start, without noslip, has the iterations of the solver alone.
     noslip, iterations = int(model.opt.noslip_iterations), None

@@ -192,19 +192,7 @@ def without_sleep(mj: Any, model: Any) -> Any:
 
 
 def read_states(mj: Any, model: Any, source: Any) -> StartStates:
-    """Read start states.
-
-    Parameters
-    ----------
-    mj : module
-        MuJoCo.
-    model : mujoco.MjModel
-    source : path of an .npz, "keyframes", mapping of arrays, array (n, size), or StartStates
-
-    Returns
-    -------
-    StartStates
-    """
+    """Read start states: path of an .npz, "keyframes", mapping of arrays, array (n, size), or StartStates."""
     if isinstance(source, StartStates):
         return source
     if isinstance(source, str) and source == KEYFRAMES:

@@ -241,15 +241,7 @@ def as_path(path: str | os.PathLike[str]) -> Path:
 
 
 def read_first_bytes(path: str | os.PathLike[str], count: int = 8, role: str = "") -> bytes:
-    """Return the first `count` bytes of a file, or all bytes if `count` is -1.
-
-    Parameters
-    ----------
-    path : path
-    count : int
-    role : str
-        Name of the file's role for error messages.
-    """
+    """Return the first `count` bytes of a file, or all bytes if `count` is -1; messages name it by its `role`."""
     path = as_path(path)
     try:
         with open(path, "rb") as stream:

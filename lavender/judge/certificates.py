@@ -116,23 +116,9 @@ def prove_infeasibility(
 ) -> Proof:
     """Check whether y (m,) proves that no impulse meets `tol`, and bound the impulse of every solution.
 
-    If y fails only by a solver's rounding, y is polished: replaced by the nearest direction on the same rows with
-    A^T y = 0, unless the deadline has passed. The last result is stored with the problem, because a solver and the
-    check of its claim make the same call; after the deadline, only a proof is stored.
-
-    Parameters
-    ----------
-    problem : Problem
-    y : (m,)
-        Direction in impulse space; its scale does not matter.
-    tol : float, -
-        Relative residual that no impulse may meet.
-    deadline : Deadline, optional
-        Time after which y is not polished.
-
-    Returns
-    -------
-    Proof
+    The scale of y does not matter. If y fails only by a solver's rounding, y is polished: replaced by the nearest
+    direction on the same rows with A^T y = 0, unless the deadline has passed. The last result is stored with the
+    problem, because a solver and the check of its claim make the same call; after the deadline, only a proof is stored.
     """
     y = np.array(y, float)
     y.setflags(write=False)

@@ -421,10 +421,7 @@ def _mark_matrix_read_only(matrix: sp.csr_array) -> sp.csr_array:
 def has_shifted_cholesky(a: Any) -> bool:
     """Return whether A + SEMIDEFINITE_SHIFT I has a Cholesky factor, for a sparse symmetric A of unit diagonal.
 
-    Raises
-    ------
-    TooLarge
-        The factor would have 2^31 entries or more.
+    TooLarge: the factor would have 2^31 entries or more.
     """
     n = a.shape[0]
     if n <= 400:
@@ -440,15 +437,8 @@ def has_shifted_cholesky(a: Any) -> bool:
 def analyse_matrix_for_factorisation(a: Any) -> tuple[LinearSystem, FloatArray]:
     """Analyse a sparse symmetric matrix with a full diagonal for a supernodal factorisation L L^T.
 
-    Returns
-    -------
-    system, values
-        The analysed system, and the entries that its `factor` needs.
-
-    Raises
-    ------
-    TooLarge
-        The factor would have 2^31 entries or more.
+    Return the analysed system, and the entries that its `factor` needs. TooLarge: the factor would have 2^31 entries or
+    more.
     """
     a = sp.csr_array(0.5 * (a + a.T))  # Make the pattern, and entries that differ by rounding, symmetric.
     a.sort_indices()

@@ -104,12 +104,7 @@ def count_runnable_processes() -> float | None:
 def make_busy_warning(loads: Iterable[float | None], cores: int, consequence: str = "", own: int = 1) -> str:
     """Return a warning if other processes used the processors, else an empty text.
 
-    Parameters
-    ----------
-    loads : numbers of runnable processes during a measurement, None if unknown
-    cores : number of processors
-    consequence : sentence on the results
-    own : number of processes of the measurement itself
+    `loads` are the numbers of runnable processes during a measurement (None if unknown), `own` of them its own.
     """
     known = [load for load in loads if load is not None]
     # The mean load may exceed the number of cores by 0.5, since the system's own processes run, too.

@@ -127,18 +127,8 @@ def write_files(
 ) -> Path:
     """Write each entry of `files` to its path in a folder: texts as they are, a frame as .csv, other data as .json.
 
-    A file is replaced only when the new one is complete.
-
-    Parameters
-    ----------
-    folder : path
-    files : {path in the folder: text, DataFrame, JSON data, or function that returns one of these}
-    begin : function that is called with each path before its file is written
-
-    Returns
-    -------
-    Path
-        The folder.
+    An entry may be a function that returns one of these. `begin` is called with each path before its file is written.
+    A file is replaced only when the new one is complete. Return the folder.
     """
     from lavender.io.stored import make_folder, write_text
 

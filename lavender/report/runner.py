@@ -521,20 +521,9 @@ def measure_in_worker(
 ) -> tuple[int, list[Row]]:  # fmt: skip
     """Measure a pair of case and solver in a worker, on one thread as pairs run in parallel.
 
-    Parameters
-    ----------
-    number : int
-    name : name of the case
-    source : a name or path that the worker resolves itself, or the problem
-    solver : str
-    described, known : stored description of the case, or None, and stored rows of the pair
-    this : row of the machine
-    plan : Plan
-    local : solvers that are registered only in the parent
-
-    Returns
-    -------
-    number, and the rows of the pair
+    `source` is a name or path that the worker resolves itself, or the problem; `described` and `known` are stored rows
+    of the case and of the pair, `this` the row of the machine; the solvers `local` are registered only in the parent.
+    Return `number`, and the rows of the pair.
     """
     global _last_case
     with _register_solvers(local), limit_to_one_thread(solver):

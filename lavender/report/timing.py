@@ -202,23 +202,10 @@ def _stabilise_timing(solver: str) -> Iterator[None]:
 
 
 def measure_task(problem: Problem, task: Task, impulse: Any = None) -> tuple[Row, FloatArray | None]:
-    """Make one measurement. An exception of the solver becomes a row of status ERROR.
+    """Make one measurement; return its row and the final impulses (m,) [N s] or None.
 
-    Parameters
-    ----------
-    problem : Problem
-    task : Task
-    impulse : (m,) N s, optional
-        Start, for `start="carried"`. "cold" starts from Pi(0), "warm" from the problem's guess.
-
-    Returns
-    -------
-    Row, and the final impulses (m,) [N s] or None
-
-    Raises
-    ------
-    KeyboardInterrupt
-        Ctrl-C was pressed; nothing is recorded.
+    An exception of the solver becomes a row of status ERROR. `impulse` is the start for `start="carried"`; "cold"
+    starts from Pi(0), "warm" from the problem's guess.
     """
     times: list[float] = []
     calibration_times: list[float] = []

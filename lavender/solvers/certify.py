@@ -195,10 +195,7 @@ def _has_simple_bounds(problem: Problem) -> bool:
 def find_certificate_by_linear_program(problem: Problem, deadline: Deadline) -> FloatArray | None:
     """Compute a direction y (m,) by a linear program; the caller checks it.
 
-    Returns
-    -------
-    (m,) or None
-        None if a row has a bound other than 0 below, a number is not finite, or the program has no solution.
+    None if a row has a bound other than 0 below, a number is not finite, or the program has no solution.
     """
     if not _has_simple_bounds(problem):
         return None

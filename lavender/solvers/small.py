@@ -49,18 +49,9 @@ NEWTON_MAX_STEPS, AUTO_MAX_STEPS = 1500.0, 1e6
 def make_limits(
     sweeps: float, max_cost: float = DECISIONS.call_cost, steps: float = NEWTON_MAX_STEPS, lanes: bool = False
 ) -> Limits:
-    """Return the limits of compiled calls over generalised velocities.
+    """Return the limits of compiled calls over generalised velocities: number of sweeps, cost [ns], Newton steps.
 
-    Parameters
-    ----------
-    sweeps : float
-        Limit of the cost, as a number of sweeps.
-    max_cost : float, ns
-        Limit of the cost.
-    steps : float
-        Limit of the number of Newton steps.
-    lanes : bool
-        Whether contacts of the kind that lanes of vectors solve are solved by their method.
+    `lanes`: contacts of the kind that lanes of vectors solve are solved by their method.
     """
     sweep = RATES["tree"], RATES["sweep row"], RATES["sweep cone"], RATES["sweep velocities"], sweeps
     step = RATES["entry"], RATES["work"]["velocities"], DECISIONS.factorisations
@@ -149,21 +140,10 @@ class SmallCall:
     def solve_and_judge(
         self, problem: Problem, impulse: FloatArray | None, tol: float, deadline: Deadline | None = None
     ) -> tuple[Any, Any]:
-        """Solve from an impulse (m,) [N s] or from the zero impulse.
+        """Solve from an impulse (m,) [N s] or from the zero impulse; at `deadline`, end with the iterate so far.
 
-        Parameters
-        ----------
-        problem : Problem
-        impulse : (m,) N s, optional
-        tol : float, -
-        deadline : Deadline, optional
-            Time at which the call ends with the iterate so far.
-
-        Returns
-        -------
-        tuple
-            (judged result, work counts). The result is None if the call did not converge; the counts are () if no call
-            was made.
+        Return (judged result, work counts). The result is None if the call did not converge; the counts are () if no
+        call was made.
         """
         view = problem.derived.view
         if not tol > 0.0 or not (view.n_rows if view is not None else len(problem.b)):

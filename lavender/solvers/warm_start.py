@@ -33,10 +33,7 @@ def warm_start(
 ) -> tuple[int, int, int]:
     """Solve `impulse` (m,) [N s] to tol in place if the first phase can; otherwise leave it unchanged.
 
-    Returns
-    -------
-    tuple of int
-        Code (a key of `MESSAGES`), sweeps, factorisations.
+    Return (key of `MESSAGES`, sweeps, factorisations).
     """
     if problem.rows is None or problem.friction != "coulomb" or tol <= 0.0 or budget < 1:
         return UNDECIDED_RESULT

@@ -545,15 +545,7 @@ def check_arguments(
     callback: Callback | None = None,
     failed_call: tuple[int, ...] | None = None,
 ) -> SolveArguments:
-    """Check the arguments of a solve; a `max_iter` of None becomes the default of the spec.
-
-    Raises
-    ------
-    InputError
-        `tol`, `max_iter`, `history` or `callback` is not valid.
-    CapabilityError
-        The solver does not support `history` or `callback`.
-    """
+    """Check the arguments of a solve; a `max_iter` of None becomes the default of the spec."""
     if type(tol) is not float or not 0.0 <= tol <= 1.0:
         tol = check_float("tol", tol, low=0.0)
     if max_iter is None:

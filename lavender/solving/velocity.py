@@ -36,15 +36,9 @@ def check_velocity_tolerance(velocity_tol: float, tol: float) -> float:
 
 
 def relative_tolerance(problem: Problem, velocity_tol: float, tol: float) -> float:
-    """Return the relative residual (1) that guarantees a velocity error.
+    """Return the relative residual (1) that guarantees a velocity error [m/s, rad/s] of every row.
 
-    Parameters
-    ----------
-    problem : Problem
-    velocity_tol : float, m/s
-        Largest accepted velocity error of a row (rad/s on angular rows).
-    tol : float
-        Relative residual of the same call, which must be the default.
+    `tol`, of the same call, must be the default.
     """
     velocity_tol = check_velocity_tolerance(velocity_tol, tol)
     reference = residual(problem, problem.start()).velocity_at_zero if problem.m else 0.0

@@ -25,13 +25,7 @@ RESIDUAL_PARTS = ("joint", "normal", "disk", "spin", "rolling")
 def build_problem(state: State, bodies: Sequence[str], joints: Sequence[str], name: str) -> Problem:
     """Return the velocity problem of a substep after `kernel.prepare_substep()` has built its rows; arrays are copied.
 
-    Parameters
-    ----------
-    state : State
-    bodies, joints : sequence of str
-        Names of bodies and joints, from which the names of blocks are made.
-    name : str
-        Name of the problem.
+    The names of blocks are made from those of `bodies` and `joints`.
     """
     a = state.a
     kj, mj = int(state.size[SIZE["joints"]]), int(state.size[SIZE["joint_rows"]])

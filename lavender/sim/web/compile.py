@@ -148,11 +148,6 @@ def build(
     Returns
     -------
     Built
-
-    Raises
-    ------
-    BuildFailed
-        There is no compiler; the kernels need Python, an import or static data; the module is too large.
     """
     reason = explain_missing_requirement()
     if reason:

@@ -380,11 +380,6 @@ def extract_c(translations: Iterable[tuple[str, str]], front: str = "", roots: I
     Returns
     -------
     str
-
-    Raises
-    ------
-    ExtractionError
-        A core function does not exist, or a needed declaration uses Python.
     """
     kept_names = frozenset(roots)
     items = []
@@ -492,11 +487,6 @@ def translate_modules_to_c(
         Folder for new translations.
     cache : Path, optional
         Folder of translations of an ordinary build. A translation that is newer than all its sources is used.
-
-    Raises
-    ------
-    ExtractionError
-        Cython fails.
     """
     directives = runpy.run_path(str(root / "lavender_ext" / "build_options.py"))["directives"]()
     options = [f"-X{name}={value}" for name, value in directives.items()]

@@ -36,14 +36,7 @@ def build_module(out: Path, name: str = "lavender") -> wasm.Built:
 
 
 def get_or_build_module(say: Callable[[str], Any] = lambda text: None, name: str = "lavender") -> bytes:
-    """Return a module of the present kernels: the one in the package, or a new one, which is stored there if possible.
-
-    Parameters
-    ----------
-    say : callable
-        Called with a message before a build.
-    name : {"lavender", "newton"}
-    """
+    """Return a module of the present kernels: the one in the package, or a new one, stored there if possible."""
     shipped = SHIPPED / f"{name}.wasm"
 
     def make() -> bytes:

@@ -31,11 +31,8 @@ PRESETS_PATH = Path(__file__).resolve().parent / "page" / "presets.json"
 def describe_layout() -> dict[str, Any]:
     """Return the arrays and the numbered entries of this build of the kernels.
 
-    Returns
-    -------
-    dict
-        arrays: buffer -> names in order; size, head, setting, joint, joint_kinds: name -> index or number; orders:
-        name -> number.
+    arrays: buffer -> names in order; size, head, setting, joint, joint_kinds: name -> index or number; orders: name ->
+    number.
     """
     return {
         "arrays": {buffer: tuple(names) for buffer, names in SHAPES.items()},

@@ -33,10 +33,7 @@ _WORK_KINDS = ("factorisations", "Coulomb rounds", "line evaluations")
 def prepare_islands(problem: Problem, work: float = inf) -> Driver | None:
     """Prepare the islands and their workspace.
 
-    Returns
-    -------
-    Driver or None
-        None if N of an island is too large, or if its factor needs more than `work` multiply-adds.
+    None if N of an island is too large, or if its factor needs more than `work` multiply-adds.
     """
     get_zero_impulse_reference(problem)
     kernel = Driver(problem.metric, MAX_MATRIX_ENTRIES, work)

@@ -126,17 +126,9 @@ class MatrixSystem(System):
 def make_system(
     problem: Problem, form: str, like: System | None = None, bodies: Bodies | None = None
 ) -> System:
-    """Build the Newton system of a problem.
+    """Build the Newton system of a problem over its bodies (`form` "velocity") or the rows of A ("impulse").
 
-    Parameters
-    ----------
-    problem : Problem
-    form : {"velocity", "impulse"}
-        Over the bodies, or over the rows of A.
-    like : System, optional
-        System of a problem of the same structure, whose layout may be reused.
-    bodies : Bodies, optional
-        Default: `find_bodies`.
+    The layout of `like`, a system of a problem of the same structure, may be reused.
     """
     if problem.metric.reference_energy < 0.0:
         get_zero_impulse_reference(problem)
