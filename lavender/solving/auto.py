@@ -227,8 +227,9 @@ class FirstSweeps:
 
     def sweep_without_checks(self, max_iter: int) -> Claim:
         """Run the first sweeps without checks, except of a start that the zero impulse may replace."""
-        loop = self.loop
-        claim = loop.run_chunks(1) if isnan(self.before) else EMPTY_CLAIM
+        loop, claim = self.loop, EMPTY_CLAIM
+        if isnan(self.before):
+            claim, self.before = loop.run_chunks(1), loop.state.watch.best[0]
         if claim.status is Status.MAX_ITERATIONS:
             loop.tol = 0.0
             claim = loop.run_chunks(min(UNCHECKED_SWEEPS, max_iter))
@@ -255,13 +256,9 @@ class FirstSweeps:
         loop._keep_best()
         self.claim = claim
         judged = reuse_or_judge_impulse(problem, loop.impulse, loop.judged)
-        if not judged.relative <= self.tol:  # Sweeps may raise the error.
-            if isnan(self.before):
-                first = judge_impulse(problem, choose_start(problem, self.start, self.tol))
-                self.before = float(first.relative)
-            if not judged.relative <= self.before:
-                loop.impulse[:] = choose_start(problem, self.start, self.tol)
-                judged = judge_impulse(problem, loop.impulse.copy())
+        if not judged.relative <= max(self.tol, self.before):  # Sweeps may raise the error.
+            loop.impulse[:] = choose_start(problem, self.start, self.tol)
+            judged = judge_impulse(problem, loop.impulse.copy())
         is_over = claim.status in (Status.MAX_ITERATIONS, Status.TIME_LIMIT) and share == 1.0
         if not is_over and claim.status is not Status.CONVERGED:
             return None

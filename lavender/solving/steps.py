@@ -76,9 +76,11 @@ def starts_relaxed(problem: Problem) -> bool:
 
 
 def prepare_sweeps(solver: Any, problem: Problem, deadline: Deadline) -> Any:
-    """Prepare sweeps, over the given form if too little time remains to form A."""
-    too_late = not deadline.fits(get_loose_limit(problem)) and not deadline.fits(
-        FORMATION_COST_RATIO * estimate_formation_cost(problem)
+    """Prepare sweeps, over the given form if they may form A and too little time remains for it."""
+    may_form = problem.generalized is not None or problem.law == "lcp"
+    too_late = may_form and not (
+        deadline.fits(get_loose_limit(problem))
+        or deadline.fits(FORMATION_COST_RATIO * estimate_formation_cost(problem))
     )
     return build_state_in_given_form(solver, problem) if too_late else solver.prepare(problem)
 
