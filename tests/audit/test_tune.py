@@ -163,6 +163,37 @@ def test_tune_with_an_error_limit_meets_it_on_held_back_worlds(boxes, monkeypatc
     assert "held back: not measured" not in "".join(found.lines)
 
 
+def test_settings_that_are_judged_in_part_do_not_change_the_choice(boxes, monkeypatch):
+    """The times of a step follow from the options here, so that both runs choose from equal times."""
+    keep_values(monkeypatch, mujoco_settings, "MUJOCO", {1e-4, 1e-6, 1e-12, 1, 3, 6, 25}, {"Newton", "CG", "PGS"})
+    run, judge, n_runs = Stage.run_stretches, Stage.judge_setting, []
+
+    def take_time_of_options(self, model, states=None):
+        n_runs.append(states is None)
+        times, ends = run(self, model, states)
+        cost = model.opt.iterations - np.log10(max(model.opt.tolerance, 1e-16)) + 20 * model.opt.solver
+        return np.full(len(times), 1e-6 * cost), ends
+
+    monkeypatch.setattr(Stage, "run_stretches", take_time_of_options)
+    path, found = boxes('solver="CG" iterations="8" tolerance="1e-5"'), []
+    for limit in (None, 1e-4):
+        same = {"worlds": 4, "steps": 80, "repeats": 2, "max_velocity_error": limit}
+        part = tune(path, **same)
+        n_part = n_runs.count(True)
+        with monkeypatch.context() as whole:
+            whole.setattr(Stage, "judge_setting", lambda self, setting, _=None: judge(self, setting))
+            all_steps = tune(path, **same)
+        assert n_part < n_runs.count(True) - n_part
+        n_runs.clear()
+        assert len(part.measured[0].error) == len(all_steps.measured[0].error) == 160
+        assert min(len(m.error) for m in part.measured) == 40
+        for name in ("faster", "closer", "limit_choice"):
+            one, other = getattr(part, name), getattr(all_steps, name)
+            found.append(one)
+            assert (one is None) == (other is None) and (one is None or one.setting == other.setting)
+    assert any(m is not None and m.setting.options for m in found)
+
+
 def test_tune_measures_the_default_options_of_mujoco(boxes, monkeypatch):
     fewer(monkeypatch)
     path = boxes('solver="CG" iterations="4" ls_iterations="8" tolerance="1e-3"')
@@ -230,7 +261,7 @@ def test_tune_leaves_out_a_setting_that_ends_mujoco_in_an_error(boxes, monkeypat
     monkeypatch.setattr(Stage, "run_stretches", dies)
     found = tune(boxes(), worlds=2, steps=10, repeats=1)
     assert not any(dict(m.setting.options).get("iterations") == 25 for m in found.measured)
-    monkeypatch.setattr(Stage, "judge_setting", lambda self, setting: measured(np.inf, np.inf))
+    monkeypatch.setattr(Stage, "judge_setting", lambda self, *given: measured(np.inf, np.inf))
     with pytest.raises(lv.InputError, match="diverge"):
         tune(boxes(), worlds=2, steps=10, repeats=1)
 
@@ -239,7 +270,7 @@ def test_tune_resumed_after_ctrl_c_reuses_judged_settings(boxes, monkeypatch, tm
     fewer(monkeypatch)
     path, judged, judge_setting = boxes(EARLY), [], Stage.judge_setting
     monkeypatch.setattr(
-        Stage, "judge_setting", lambda self, setting: judged.append(setting) or judge_setting(self, setting)
+        Stage, "judge_setting", lambda self, *given: judged.append(given[0]) or judge_setting(self, *given)
     )
 
     def stop(event):

@@ -35,7 +35,9 @@ from lavender.report import machine
 from lavender.report.runner import Event
 
 # Only the first round times a setting that takes more than this multiple of the present setting's time.
-MAX_TIME_RATIO = 2.0
+MAX_TIME_RATIO = 1.25
+# The errors of every fourth stretch come first: they exclude most settings that are not accurate enough.
+MIN_PARTS = 4
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
@@ -159,44 +161,54 @@ class Stage:
         """Return the name of MuJoCo's solver with a setting."""
         return str(get_option_value(self.mj, setting.apply_to(self.mj, self.model), "solver"))
 
-    def judge_setting(self, setting: MujocoSetting) -> Measured:
-        """Judge a setting without timing it; its errors are infinite if a world diverges."""
+    def judge_setting(self, setting: MujocoSetting, limit: float = np.inf) -> Measured:
+        """Judge a setting without timing it; its errors are infinite if a world diverges.
+
+        After a part of the stretches with an error above `limit` [m/s], the others are not judged.
+        """
         mj, model = self.mj, setting.apply_to(self.mj, self.model)
         result = make_unmeasured(setting, str(get_option_value(mj, model, "solver")))
-        states = np.empty((self.controls.shape[0] * self.controls.shape[1], self.starts.shape[1]))
+        n, horizon, _ = self.controls.shape
+        states = np.empty((n * horizon, self.starts.shape[1]))
         judge = copy.copy(model)
         judge.opt.noslip_iterations = 0
-        errors: list[FloatArray] = []
-        rows: list[Any] = []
-        contacts: list[Any] = []
+        error, rows, contacts = np.zeros(len(states)), *np.zeros((2, len(states)), int)
+        n_parts = max(MIN_PARTS, -(-len(states) // MAX_PROBLEMS_IN_MEMORY))
+        part_of_steps = np.repeat(np.arange(n) % n_parts, horizon)
+        judged = np.zeros(len(states), bool)
         try:
             ends = self.run_stretches(model, states)[1]
-            for i in range(0, len(states), MAX_PROBLEMS_IN_MEMORY):
-                some = states[i : i + MAX_PROBLEMS_IN_MEMORY]
-                batch, impulse = from_mujoco_many(judge, some, errors="status")
-                errors.append(residual_many(batch, impulse, errors="status").velocity_error)
-                rows.append(batch.row_counts)
-                contacts.append(batch.contact_counts)
+            for part in range(n_parts):
+                some = part_of_steps == part
+                batch, impulse = from_mujoco_many(judge, states[some], errors="status")
+                found = residual_many(batch, impulse, errors="status").velocity_error
+                error[some] = np.nan_to_num(found, nan=np.inf)
+                rows[some], contacts[some] = batch.row_counts, batch.contact_counts
+                judged |= some
+                if error[some].max(initial=0.0) > limit:
+                    break
         except (mj.FatalError, InputError):  # A step or a forward pass failed.
             return result
         distance = np.linalg.norm(ends - self.ends, axis=2).max(axis=1)
         if np.isnan(distance).any():
             return result
-        sizes: dict[str, Any] = {"rows": np.concatenate(rows), "contacts": np.concatenate(contacts)}
-        error = np.nan_to_num(np.concatenate(errors), nan=np.inf)
-        return replace(result, error=error, motion=distance, **sizes)
+        sizes: dict[str, Any] = {"rows": rows[judged], "contacts": contacts[judged]}
+        return replace(result, error=error[judged], motion=distance, **sizes)
 
     def time_settings(self, settings: list[Measured], repeats: int, progress: Progress) -> None:
         """Time the steps of all settings, which alternate in `repeats` rounds; the first is the present setting.
 
-        A setting with which a world diverges is not timed.
+        A setting with which a world diverges is not timed, and one that cannot be chosen is timed once: it is slower
+        than `MAX_TIME_RATIO`, or its errors exceeded the limit of `judge_setting`.
         """
         settings = [m for m in settings if np.isfinite(m.error).all()]
         models = [m.setting.apply_to(self.mj, self.model) for m in settings]
         for round_index in range(repeats):
             for m, model in zip(settings, models, strict=True):
                 # Compare medians over the steps, so that an interrupted step does not exclude a setting.
-                if round_index and np.median(m.times) > MAX_TIME_RATIO * np.median(settings[0].times):
+                is_out = len(m.error) < len(settings[0].error)
+                is_slow = np.median(m.times) > MAX_TIME_RATIO * np.median(settings[0].times)
+                if np.isfinite(m.times).all() and (is_out or is_slow):
                     continue
                 text = f"round {round_index + 1} of {repeats}, {m.setting.name}"
                 progress.begin_measurement("timing", text)

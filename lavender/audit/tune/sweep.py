@@ -108,7 +108,7 @@ def tune(
     from_mujoco_many(runs.model, np.zeros((0, runs.model.nq + runs.model.nv)))
     can_touch = can_any_geoms_collide(runs.mj, runs.model)
     key = hash_parameters(replace(runs, name=""), Judging("float64", threshold), spread)
-    judged = JudgedSettings(folder, reuse, f"{key}, {worlds} worlds, horizon {horizon}")
+    judged = JudgedSettings(folder, reuse, f"{key}, {worlds} worlds, horizon {horizon}, {error_limit}")
     with count_engine_warnings(runs.mj):  # Settings with which worlds diverge are left out.
         return _run_tuning(runs, spread, horizon, repeats, threshold, can_touch, error_limit, judged, watch)
 
@@ -140,8 +140,8 @@ class JudgedSettings:
         """Sentence on the number of reused results; empty if there are none."""
         return f"The errors of {self.n_reused} settings are reused (--no-reuse)." * bool(self.n_reused)
 
-    def judge(self, stage: Stage, half: int, setting: MujocoSetting) -> Measured:
-        """Return the judged result of a setting on a stage of even (0) or odd (1) worlds."""
+    def judge(self, stage: Stage, half: int, setting: MujocoSetting, limit: float) -> Measured:
+        """Return the result of `Stage.judge_setting` on a stage of even (0) or odd (1) worlds."""
         options = hashlib.sha256(json.dumps(setting.options).encode()).hexdigest()[:16]
         names = {name: f"{options}_{half}_{name}" for name in ("error", "motion", "rows", "contacts")}
         solver = stage.get_solver(setting)
@@ -149,7 +149,7 @@ class JudgedSettings:
             self.n_reused += 1
             result = make_unmeasured(setting, solver)
             return replace(result, **{name: self.arrays[key] for name, key in names.items()})
-        result = stage.judge_setting(setting)
+        result = stage.judge_setting(setting, limit)
         self.arrays |= {key: np.asarray(getattr(result, name)) for name, key in names.items()}
         if self.path is not None:
             self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -184,11 +184,13 @@ def _run_tuning(
         )  # fmt: skip
 
     def judge(stage: Stage, settings: list[MujocoSetting]) -> list[Measured]:
-        """Return the judged results of settings on a stage."""
-        results = []
+        """Return the judged results of settings on a stage: in part, of settings too inaccurate to be chosen."""
+        results, limit = [], np.inf
+        if measured and stage is not held_back:
+            limit = max(float(measured[0].error.max()), threshold, error_limit or 0.0)
         for setting in settings:
             progress.begin_measurement("judging", setting.name)
-            results.append(judged.judge(stage, int(stage is held_back), setting))
+            results.append(judged.judge(stage, int(stage is held_back), setting, limit))
         return results
 
     def measure_early(stage: Stage, judged: Measured) -> None:
