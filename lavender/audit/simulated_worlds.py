@@ -480,6 +480,7 @@ class WarpWorlds:
         # A world has at least one row for each contact.
         self.contacts = max(MIN_WARP_ROWS, self.rows)
         self.device_model = mjw.put_model(model)
+        self.is_rk4 = int(model.opt.integrator) == int(mj.mjtIntegrator.mjINT_RK4)
         if hasattr(self.device_model.opt, "warn_overflow"):
             # Do not print a line for each solve that uses up its iterations, or for rows that this class counts.
             self.device_model.opt.warn_overflow = 0
@@ -497,10 +498,14 @@ class WarpWorlds:
         """Return copies of some arrays of the state."""
         return {name: getattr(self.data, name).numpy().copy() for name in names}
 
-    def _forward(self) -> int:
-        """Run the forward pass, with more memory if rows or contacts did not fit; return the number of contacts."""
+    def _step(self, state: dict[str, Any]) -> int:
+        """Step, with more memory if rows or contacts did not fit; return the number of contacts.
+
+        With RK4 run the first of the four passes only: the step leaves the mean of their accelerations.
+        """
         while True:
-            self.mjw.forward(self.device_model, self.data)
+            # A `forward` before the step would change it: rows of welds contain velocities of the last pass.
+            (self.mjw.forward if self.is_rk4 else self.mjw.step)(self.device_model, self.data)
             # The engine counts the rows and contacts that it has no memory for, too.
             needed, contacts = int(self.data.nefc.numpy().max()), int(self.data.nacon.numpy()[0])
             fits_contacts = contacts <= self.n * self.contacts
@@ -508,7 +513,6 @@ class WarpWorlds:
                 excess = np.maximum(self.data.nefc.numpy() - self.rows, 0).sum()
                 self.n_dropped = int(excess) + max(contacts - self.n * self.contacts, 0)
                 return min(contacts, self.n * self.contacts)
-            state = self.read_state((*START_FIELDS, "ctrl", "time"))
             self.rows = max(self.rows, 2 * needed)
             self.contacts = max(self.contacts, 2 * -(-contacts // self.n))
             self._allocate(state)
@@ -516,8 +520,9 @@ class WarpWorlds:
     def __call__(self, ctrl: Any) -> Any:
         """Step all worlds with these controls; return states, constraint rows, mass matrices and contacts."""
         self.data.ctrl.assign(ctrl)
-        state = self.read_state(STEP_FIELDS)
-        k = self._forward()
+        before = self.read_state((*START_FIELDS, "ctrl", "time"))
+        k = self._step(before)
+        state = {name: before[name] for name in STEP_FIELDS}
         data, rows = self.data, self.rows
         e, c = data.efc, data.contact
         efc = {name: getattr(e, name).numpy()[:, :rows].copy() for name in
@@ -530,7 +535,8 @@ class WarpWorlds:
         extra = self.read_state((*ACCELERATION_FIELDS, "nefc"))
         extra["nefc"] = np.minimum(extra["nefc"], rows)
         step_data = state, efc, data.M.numpy().copy(), (world_of, address, dim, friction, geom)
-        self.mjw.step(self.device_model, data)
+        if self.is_rk4:
+            self.mjw.step(self.device_model, data)
         return *step_data, extra
 
 

@@ -125,8 +125,8 @@ def from_efc(
         usable, whatever its forces are: all impulses of this world are NaN.
     moved_by : {"acceleration", "forces"}
         Quantity that the engine's integrator uses, if qacc is given. MJX moves bodies by forces with `implicitfast`,
-        and with Euler and damped joints. An acceleration is judged by the distance of its velocities from the exact
-        solution.
+        and with Euler unless eulerdamp is disabled; MuJoCo Warp by qacc always. An acceleration is judged by the
+        distance of its velocities from the exact solution.
     friction : {"cone", "coulomb"}, default "cone"
         Law of elliptic contacts: "cone" is MuJoCo's convex relaxation. Engines that solve the Signorini condition with
         Coulomb's law need "coulomb"; their contacts have three rows and one coefficient for both tangents.

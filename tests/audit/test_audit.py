@@ -1,6 +1,8 @@
 """Every step of many worlds judged: MuJoCo's own answers, which stopped before convergence, and the worst states."""
 
 import io
+import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ import lavender as lv
 from lavender.audit import audit as module
 from lavender.audit.audit import audit
 from lavender.audit.pieces import AUDIT_VERDICTS
-from lavender.audit.simulated_worlds import Frame
+from lavender.audit.simulated_worlds import Frame, Runs, iterate_frames
 from lavender.io.efc import from_efc
 
 
@@ -308,3 +310,29 @@ def test_audit_of_an_engine_whose_acceleration_is_not_finite_does_not_judge_its_
     assert [(d.step, d.is_outside) for d in found.divergences] == [(3, False)]
     assert "; 1 step not judged." in words_of(found)
     assert "--engine mujoco" in words_of(found)
+
+
+HANGING = """<mujoco><option iterations="2" cone="elliptic" jacobian="dense"><flag eulerdamp="{}"/></option>
+<worldbody><geom type="plane" size="5 5 1"/>
+<body name="a" pos="0 0 .099"><freejoint/><geom size=".1"/></body>
+<body pos=".5 0 .15"><joint damping="{}" armature=".01"/><geom type="capsule" fromto="0 0 0 .2 0 -.1" size=".04"/>
+<body name="b" pos=".2 0 -.1"><joint frictionloss=".3"/><geom type="capsule" fromto="0 0 0 .2 0 0" size=".04"/></body>
+</body></worldbody><equality><weld body1="a" body2="b" torquescale=".3"/></equality></mujoco>"""
+
+
+@pytest.mark.parametrize("engine", ["mjx", "mujoco_warp"])
+@pytest.mark.parametrize(("eulerdamp", "damping"), [("disable", 0.3), ("enable", 0.0)])
+def test_next_velocity_of_an_engine_follows_from_its_judged_answer(engine, eulerdamp, damping):
+    """Two iterations leave forces and acceleration apart by 0.1 of the velocity, in a weld that moves."""
+    pytest.importorskip({"mjx": "mujoco.mjx", "mujoco_warp": "mujoco_warp"}[engine])
+    runs = Runs.of_model(mj.MjModel.from_xml_string(HANGING.format(eulerdamp, damping)), 2, 5)
+    frames = list(iterate_frames(engine, replace(runs, spread=0.3)))
+    for now, after in itertools.pairwise(frames):
+        for i in range(2):
+            problem, motion = now.batch[i], now.batch.engine_motions.get(i)
+            if motion is None:
+                predicted = problem.velocity(now.impulse[i][: problem.m])
+            else:
+                predicted = problem.generalized.v_free + motion.change
+            # Rounding of float32, to which the matrix of MJX adds its condition.
+            np.testing.assert_allclose(after.state["qvel"][i], predicted, atol=2e-5)
