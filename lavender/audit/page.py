@@ -127,7 +127,7 @@ def make_audit_page(audit: Any, folder: Path | None) -> Page:
     source = f"lavender audit · {model} · {audit.engine} · {runs.worlds} worlds × {runs.steps} steps"
     code = []
     if counts.above and audit.engine == "mujoco" and not audit.divergences:
-        states = "lavender-audit/states.npz" if folder is None else folder.parent / "states.npz"
+        states = audit.folder / "states.npz"
         code = [f"lavender tune {model} --max-velocity-error {counts.limit:g} --states {states}"]
     starts = f"seed {runs.seed}, start velocities ± {runs.spread:g} m/s"
     footer = [

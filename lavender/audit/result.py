@@ -119,6 +119,7 @@ class Audit:
     prediction: Prediction = field(default_factory=Prediction)
     against: Audit | None = None
     provenance: dict[str, Any] = field(default_factory=dict)
+    folder: Path = Path("lavender-audit")  # To which `write` wrote.
 
     @classmethod
     def with_size(cls, runs: Runs, engine: str, *, has_claims: bool = False, **more: Any) -> Audit:
@@ -426,7 +427,7 @@ class Audit:
         `states.npz` holds the states before the worst steps, one row each, by the engine's names; for MuJoCo
         `state` is their mjSTATE_INTEGRATION.
         """
-        folder = Path(folder)
+        folder = self.folder = Path(folder)
         worst = prepare_step_folder(folder / "worst", replace=True)
         for i, w in enumerate(self.worst, 1):
             write_npz(w.problem, worst / f"worst_{i}.npz", impulse=w.impulse)

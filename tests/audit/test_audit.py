@@ -56,8 +56,11 @@ def test_audit_of_two_worlds_equals_the_judge_on_each_step(boxes, options):
 
 def test_audit_worst_states_give_the_same_impulses_in_mujoco(boxes, tmp_path):
     path = boxes(EARLY)
-    found = audit(path, worlds=3, steps=25, workers=1)
+    found = audit(path, worlds=3, steps=25, workers=1, max_velocity_error=1e-9)
     found.write(tmp_path / "out")
+    short = Console(file=io.StringIO(), width=1000)
+    found.page.print_short(short)
+    assert f"--states {tmp_path / 'out' / 'states.npz'}" in short.file.getvalue()
     made = mj.MjModel.from_xml_path(str(path))
     states = np.load(tmp_path / "out" / "states.npz")
     speeds = np.where(found.is_unconverged, found.numbers[0], 0.0)
