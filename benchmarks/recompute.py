@@ -5,8 +5,8 @@
 The worlds are simulated again by plain MuJoCo. With J, M, R and aref of a forward pass, A = J M^-1 J^T + diag(R),
 lambda = dt f, w = dt (J a + R f - aref) and d the diagonal of A, the error of a step is the largest sqrt(nu d) |e| of a
 block with e = lambda - projection(lambda - w / d) (docs/residual.md). If qacc moves the bodies, it is the largest
-dt |J (qacc - exact qacc)|, with MuJoCo's Newton at tolerance 0 (rows of welds with torquescale 1). Slips are computed with MuJoCo's Jacobians of the
-bodies at the contact's point. Compared are
+dt |J (qacc - exact qacc)|, with MuJoCo's Newton at tolerance 0 (rows of welds with torquescale 1). Slips are computed
+with MuJoCo's Jacobians of the bodies at the contact's point. Compared are
 
     audit    error, rows and contacts of every step, quantiles, counts of the headline and the worst steps
     tune     error of every step of every setting, its 99 % quantile and maximum, and the motion
