@@ -348,7 +348,11 @@ def explain_slip(
     def slip(changed: Problem, impulse: FloatArray) -> tuple[FloatArray, ...]:
         return compute_slip(measured, blocks, changed.velocity(impulse).ravel(), surface)
 
-    variants = [SlipVariant("engine", slip(problem, answer), residual(problem, answer).relative)]
+    motion = problem.__dict__.get("engine_motion")
+    is_moved = motion is not None and motion.moved_by == "acceleration" and np.array_equal(motion.impulse, answer)
+    velocity = own_free + motion.change if is_moved else problem.velocity(answer)
+    own_slip = compute_slip(measured, blocks, velocity.ravel(), surface)
+    variants = [SlipVariant("engine", own_slip, residual(problem, answer).relative)]
 
     def solve_and_add_variant(
         name: str, changed: Problem, start: FloatArray | None, note: str = ""
@@ -361,8 +365,8 @@ def explain_slip(
         failed = "" if solution.residual.relative <= max(tol, solution.residual.roundoff_floor) else (
             f"not solved: {solution.status.name}"
         )  # fmt: skip
-        velocity = slip(changed, solution.impulse)
-        variants.append(SlipVariant(name, velocity, solution.residual.relative, failed))
+        own = slip(changed, solution.impulse)
+        variants.append(SlipVariant(name, own, solution.residual.relative, failed))
         return solution.impulse
 
     start = solve_and_add_variant("solved", problem, answer)

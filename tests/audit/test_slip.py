@@ -75,6 +75,26 @@ def test_slip_with_one_iteration_is_unfinished_solving():
     assert dominant(explain_slip_of_states(model, state[None]).explanations[0]) == "unfinished solving"
 
 
+def test_slip_of_an_unfinished_acceleration_is_the_speed_of_the_corners_after_the_step():
+    """CG leaves forces behind the acceleration, and only the acceleration moves the box."""
+    model = block(0.3, option='cone="elliptic" solver="CG" iterations="2"')
+    data = mujoco.MjData(model)
+    state = np.empty(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION))
+    for _ in range(20):
+        mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
+        mujoco.mj_step(model, data)
+    by_forces = mujoco.MjData(model)
+    mujoco.mj_setState(model, by_forces, state, mujoco.mjtState.mjSTATE_INTEGRATION)
+    mujoco.mj_forward(model, by_forces)
+    explanation = explain_slip_of_states(model, state[None]).explanations[0]
+    moved, by_forces = (
+        [np.linalg.norm(v[:2] + np.cross(v[3:], by_forces.contact.pos[k] - by_forces.xpos[1])[:2]) for k in range(4)]
+        for v in (data.qvel, lv.io.from_mujoco(model, by_forces).velocity(lv.io.mujoco.impulse(model, by_forces)))
+    )
+    np.testing.assert_allclose(np.sort(explanation.variants[0].speeds), np.sort(moved), rtol=1e-4)
+    assert np.abs(np.sort(by_forces) - np.sort(moved)).max() > 1e-3 * max(moved)
+
+
 def slide(velocity, cones, friction="coulomb", compliance=None):
     """Build a step of a particle of 1 kg on the ground that falls with 1 m/s and slides with `velocity` (2,) [m/s]."""
     jac = np.eye(3)[[2, 0, 1]]
