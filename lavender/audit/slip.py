@@ -349,10 +349,9 @@ def explain_slip(
         return compute_slip(measured, blocks, changed.velocity(impulse).ravel(), surface)
 
     motion = problem.__dict__.get("engine_motion")
-    is_moved = (
-        motion is not None and motion.moved_by == "acceleration" and np.array_equal(motion.impulse, answer)
-    )
-    velocity = own_free + motion.change if is_moved else problem.velocity(answer)
+    velocity = problem.velocity(answer)
+    if motion is not None and motion.moved_by == "acceleration" and np.array_equal(motion.impulse, answer):
+        velocity = own_free + motion.change
     own_slip = compute_slip(measured, blocks, velocity.ravel(), surface)
     variants = [SlipVariant("engine", own_slip, residual(problem, answer).relative)]
 
