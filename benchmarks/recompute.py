@@ -29,7 +29,7 @@ import numpy as np
 from lavender.audit.audit import MAX_PROBLEMS_IN_MEMORY, audit
 from lavender.audit.slip_states import explain_slip_of_states
 from lavender.audit.tune import tune
-from lavender.audit.tune.mujoco_settings import CONVERGED_OPTIONS, MIN_PARTS
+from lavender.audit.tune.mujoco_settings import CONVERGED_OPTIONS, MIN_JUDGED_PARTS
 from lavender.io.start_states import load_model, read_states
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -263,7 +263,7 @@ def recompute_tune(source: Any, model: Any, worlds: int, steps: int, states: Any
         for m in results:
             errors, ends = run(m.setting.options, stretches)
             # Every fourth stretch comes first, and a setting that is not accurate enough is judged on a part.
-            n_parts = max(MIN_PARTS, -(-len(errors) // MAX_PROBLEMS_IN_MEMORY))
+            n_parts = max(MIN_JUDGED_PARTS, -(-len(errors) // MAX_PROBLEMS_IN_MEMORY))
             part = np.repeat(np.arange(len(stretches)) % n_parts, stretches.shape[1])
             errors = next(e for k in range(n_parts) if len(e := errors[part <= k]) == len(m.error))
             motion = np.linalg.norm(ends - converged, axis=2).max(axis=1)

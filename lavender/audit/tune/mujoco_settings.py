@@ -37,7 +37,7 @@ from lavender.report.runner import Event
 # Only the first round times a setting that takes more than this multiple of the present setting's time.
 MAX_TIME_RATIO = 1.25
 # The errors of every fourth stretch come first: they exclude most settings that are not accurate enough.
-MIN_PARTS = 4
+MIN_JUDGED_PARTS = 4
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
@@ -173,7 +173,7 @@ class Stage:
         judge = copy.copy(model)
         judge.opt.noslip_iterations = 0
         error, rows, contacts = np.zeros(len(states)), *np.zeros((2, len(states)), int)
-        n_parts = max(MIN_PARTS, -(-len(states) // MAX_PROBLEMS_IN_MEMORY))
+        n_parts = max(MIN_JUDGED_PARTS, -(-len(states) // MAX_PROBLEMS_IN_MEMORY))
         part_of_steps = np.repeat(np.arange(n) % n_parts, horizon)
         judged = np.zeros(len(states), bool)
         try:
