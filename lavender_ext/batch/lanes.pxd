@@ -47,12 +47,16 @@ cdef extern from *:
     \
     /* Interleave n numbers from each of N arrays, of float if `narrow`. */ \
     ISA static void interleave_##N(const void* const* from, int narrow, long long n, double* to) { \
-        if (narrow) \
-            for (long long i = 0; i < n; i++) \
-                for (int l = 0; l < N; l++) to[N * i + l] = ((const float*)from[l])[i]; \
-        else \
-            for (long long i = 0; i < n; i++) \
-                for (int l = 0; l < N; l++) to[N * i + l] = ((const double*)from[l])[i]; \
+        const float* single[N]; \
+        const double* wide[N]; \
+        for (int l = 0; l < N; l++) { \
+            single[l] = from[l]; \
+            wide[l] = from[l]; \
+        } \
+        for (long long i = 0; narrow && i < n; i++) \
+            for (int l = 0; l < N; l++) to[N * i + l] = single[l][i]; \
+        for (long long i = 0; !narrow && i < n; i++) \
+            for (int l = 0; l < N; l++) to[N * i + l] = wide[l][i]; \
     } \
     \
     /* The judge's errors e (m) of impulses with slack w, and sum d e^2, the largest nu d e^2 and its row (judge/tally.pxd). */ \
@@ -402,14 +406,15 @@ cdef extern from *:
         } \
     } \
     \
-    /* Solve from the zero impulse to `tol`: block sweeps, then Newton steps; sweeps replace a step that gains nothing. */ \
+    /* Solve from the zero impulse to `tol`: block sweeps, then Newton steps. Sweeps replace a step that gains nothing; a lane \
+     * with MISSES such steps ends. */ \
     ISA static void solve_##N(const lavender_lanes_t* x) { \
-        enum { FIRST_SWEEPS = 6, MORE_SWEEPS = 12, ROUNDS = 16 }; \
+        enum { FIRST_SWEEPS = 6, MORE_SWEEPS = 12, ROUNDS = 10, MISSES = 2 }; \
         const int m = x->m, n = x->n; \
         const V *y = (const V*)x->y, *soft = (const V*)x->soft, *mu = (const V*)x->mu, zero = {0.0}, one = zero + 1.0; \
         V *a = (V*)x->a, *lam = (V*)x->lam, *step = (V*)x->step, *change = (V*)x->change, *kept = (V*)x->kept; \
         V* out = (V*)x->out; \
-        V now, steps = zero; \
+        V now, steps = zero, misses = zero; \
         I on = (I)(out[LANE_IS_PLAIN] > 0.0); \
         for (int r = 0; r < m; r++) { \
             for (int j = 0; j <= r - r % 3; j += 3) { \
@@ -454,6 +459,9 @@ cdef extern from *:
             next = measure_##N(x); \
             steps += pick_##N(on, one, zero); \
             worse = on & ((I)(next >= 0.81 * now) | (I)(next != next)); \
+            misses += pick_##N(worse, one, zero); \
+            on &= (I)(misses < (double)MISSES); \
+            worse = worse & on; \
             if (any_##N(worse)) { \
                 for (int r = 0; r < m; r++) lam[r] = pick_##N(worse, kept[r], lam[r]); \
                 sweep_##N(x, MORE_SWEEPS, worse); \
@@ -547,7 +555,7 @@ cdef extern from *:
 
 
 cdef enum:
-    MAX_LANE_ROWS = 48
+    MAX_LANE_ROWS = 48              # to judge; to solve at most as many as velocities
     MAX_LANE_VELOCITIES = 40
     MAX_LANES = 8
 
@@ -655,9 +663,12 @@ cdef inline bint is_lane_refined(const lanes_t* x, int32_t width, int32_t lane, 
 
 
 cdef inline bint is_solved_in_one_lane(const blocks_t* p, const generalized_t* g, const double* zero_residual) noexcept nogil:
-    """Return whether a problem is of the kind that lanes solve: contacts of three rows, one island, M without zeros."""
+    """Return whether a problem is of the kind that lanes solve: contacts of three rows, one island, M without zeros.
+
+    More rows than velocities are left out: A is then singular, and other methods take less time.
+    """
     cdef int32_t i, n = g.n
-    if (not (0 < p.n_rows <= MAX_LANE_ROWS and 0 < n <= MAX_LANE_VELOCITIES and p.islands == NULL and zero_residual[2] == 1.0)
+    if (not (0 < p.n_rows <= min(n, MAX_LANE_ROWS) and n <= MAX_LANE_VELOCITIES and p.islands == NULL and zero_residual[2] == 1.0)
             or g.mptr[n] != n * (n + 1) // 2 or not fit_lanes(p)):
         return False
     for i in range(g.mptr[n]):

@@ -109,6 +109,7 @@ cdef int set_task_start(task_t* j, start, double* lam, double* slack_error) exce
     cdef const double[::1] values
     j.lam, j.slack_error = lam, slack_error
     j.solved, j.is_late, j.cold, j.deadline, j.by_island = False, False, start is None, NULL, NULL
+    j.failed_in_lanes = False
     if not j.cold:
         values = start
         if values.shape[0] != j.p.n_rows:
@@ -262,6 +263,7 @@ cdef struct worker_t:             # memory of one thread
     workspace_t by_island
     workspace_t lanes
     int64_t next, end               # taken worlds that are not processed
+    int32_t failed                  # bit k: lanes have not solved world end - k
 
 
 cdef class Worlds:
@@ -425,9 +427,10 @@ cdef class Worlds:
         cdef const int64_t* at
         cdef int32_t lane, k, width = self.width
         cdef double* lam
+        cdef bint solves = not judges and self.w.at[first * PLACES + ROWS] <= self.w.at[first * PLACES + VELOCITIES]
         cdef int64_t i, n = self.w.n + 1
         cdef double* v
-        if end - first < 2 or not are_worlds_equal_in_size(&self.w, first, end):
+        if end - first < 2 or not (judges or solves) or not are_worlds_equal_in_size(&self.w, first, end):
             return
         at = self.w.at + first * PLACES
         x.m, x.n, x.law, x.asymmetry = <int32_t>at[ROWS], <int32_t>at[VELOCITIES], self.w.blocks.law, self.w.asymmetry
@@ -437,7 +440,7 @@ cdef class Worlds:
         load_lanes(&x, &self.w, self.lam, first, end, width)
         prepare_lanes(&x, width)
         x.tol = tol
-        if not judges:
+        if solves:
             solve_lanes(&x, width)
         judge_lanes(&x, width)
         for lane in range(<int32_t>(end - first)):
@@ -454,6 +457,7 @@ cdef class Worlds:
             j.above_floor = residual_above_floor(&j.score, j.relative, j.floor)
             if not judges:
                 if not (j.relative <= tol and j.floor <= tol):
+                    h.failed |= 1 << (end - i)
                     continue
                 lam = self.lam + at[AT_ROW]
                 for k in range(x.m):
@@ -488,6 +492,7 @@ cdef class Worlds:
         if j.p.n_rows == 0:
             return self.store_empty_world(i, &h.scratch)
         had_derived, j.deadline = j.has_derived, deadline
+        j.failed_in_lanes = h.failed >> (h.end - i) & 1
         if j.general:
             solve_task(&j, &h.workspace, &h.small.islands, limits, tol)
             if not had_derived:
@@ -624,7 +629,7 @@ cdef class Worker:
                     i = lav_add(&w.taken, w.width)
                     if i >= n:
                         return DONE_ALL
-                    self.h.next, self.h.end = i, min(i + w.width, n)
+                    self.h.next, self.h.end, self.h.failed = i, min(i + w.width, n), 0
                     if w.width > 1 and uses_lanes and not has_passed(until, 0.0):
                         w.process_in_lanes(i, self.h.end, &self.h, tol, judges)
                 i = self.h.next

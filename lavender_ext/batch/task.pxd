@@ -55,6 +55,7 @@ cdef struct task_t:
     double zero_residual[3]     # E0, V0, relative residual of the zero impulse; E0 < 0: not known
     islands_t islands           # target of p.islands, if this call computed the islands
     double* by_island           # NULL, or the array (islands, 2) that `score_t.by_island` points to
+    bint failed_in_lanes        # lanes have not solved the task: a lane alone has the same result
     int32_t cold                # 1: start from the zero impulse, 0: from lam
     deadline_t* deadline        # time at which the present iterate is the result, or NULL
     bint solved
@@ -186,7 +187,8 @@ cdef inline void solve_task(task_t* j, workspace_t* workspace, workspace_t* isla
     # residual of the zero impulse
     if not judge_zero_impulse_of_task(j, islands, workspace.real):
         return
-    if limits.lanes != 0.0 and j.cold and j.made.n_empty == 0 and is_solved_in_one_lane(&j.p, &j.g, j.zero_residual):
+    if limits.lanes != 0.0 and j.cold and not j.failed_in_lanes and j.made.n_empty == 0 \
+            and is_solved_in_one_lane(&j.p, &j.g, j.zero_residual):
         j.counts[0] = j.counts[1] = solve_in_one_lane(&j.p, &j.g, j.zero_residual, tol, workspace, j.lam)
         if j.counts[0] >= 0 and grow_workspace_to(workspace, 0, judge_task_workspace_size(j)):
             judge_task(j, tol, workspace.real)
