@@ -202,8 +202,8 @@ class RelaxedNewton(Step):
                 self.state, self.impulse, count, RELAXED_TOLERANCE * log.tol, log.time_left, n - done
             )
             done, work, count = done + claim.iterations, sum_work_counts((work, claim.work)), 1
-            self.store_iterate_in_log()
             if claim.status is not Status.MAX_ITERATIONS or system is None:
+                self.store_iterate_in_log()
                 break
             system.solve.write_interior_impulse(trial)
             log.judge_and_store_best(trial)
