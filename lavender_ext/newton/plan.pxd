@@ -13,8 +13,9 @@
                                               that there is no solution
     Coulomb's       START_DAMPED_NEWTON       proximal damped Newton from the start               DE_SAXCE
                     DE_SAXCE                  De Saxce's interior point                           DE_SAXCE_END
-                    DE_SAXCE_END              damped Newton from its best point, unless that is   FIRST_FLOW
+                    DE_SAXCE_END              damped Newton from its best point, unless that is   DE_SAXCE_SECOND_END
                                               far from a solution
+                    DE_SAXCE_SECOND_END       the same with a smaller weight from the best point  FIRST_FLOW
                     FIRST_FLOW                Euler steps, if this point is near a solution       CONVEX_POINT
                     CONVEX_POINT              interior point of the convex law, judged under      CONVEX_FLOW
                                               Coulomb's law; ends if many contacts slide
@@ -44,6 +45,7 @@ tol is 1e-6 unless the line names another one.
     CONVEX_DAMPED_NEWTON      lcpgen_psd-300, proof that it has no solution
     START_DAMPED_NEWTON       engine/balls_step_0030: 4.6
     DE_SAXCE                  cards 3000 0.1 0: 20
+    DE_SAXCE_SECOND_END       cards 3000 0.2 0, seed 183: 10
     FIRST_FLOW                cards 900 0.1 0: 5.0
     CONVEX_POINT              pile 3000 0.5 0
     CONVEX_FLOW               granularF(n=4, sliding=2, seed=10): 9
@@ -94,14 +96,15 @@ cdef enum:                      # states of PLAN_COULOMB
     START_DAMPED_NEWTON = 0
     DE_SAXCE = 1
     DE_SAXCE_END = 2
-    FIRST_FLOW = 3
-    CONVEX_POINT = 4
-    CONVEX_FLOW = 5
-    AUGMENTED_DE_SAXCE = 6
-    PATH_OR_FLOW = 7
-    FLOW_OR_PATH = 8
-    COULOMB_DAMPED_NEWTON = 9
-    COULOMB_END = 10
+    DE_SAXCE_SECOND_END = 3
+    FIRST_FLOW = 4
+    CONVEX_POINT = 5
+    CONVEX_FLOW = 6
+    AUGMENTED_DE_SAXCE = 7
+    PATH_OR_FLOW = 8
+    FLOW_OR_PATH = 9
+    COULOMB_DAMPED_NEWTON = 10
+    COULOMB_END = 11
 
 cdef enum:
     POINT_REFINEMENTS = 3       # Refinements of an interior point's first z with the factor of its weighted system.
@@ -116,6 +119,7 @@ cdef enum:
     START_FACTORISATIONS = 8    # First stretch of damped Newton; a start near a solution gains within it.
     END_INNER_STEPS = 10
     END_FACTORISATIONS = 15     # Factorisations of the damped Newton phase after De Saxce's interior point.
+    SECOND_END_FACTORISATIONS = 12  # Factorisations and inner steps of the second damped Newton phase after it.
     MAX_AUGMENTED_ROWS = 10000  # With more rows, one factorisation of the augmented system may exceed 0.2 s.
 
 
@@ -348,6 +352,10 @@ cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
         if n.progress.lowest <= far_from_end():
             begin_damped_newton(n, n.progress.best_z, COULOMB, min(n.progress.lowest, 1e-3), END_INNER_STEPS)
             begin_damped_newton_stretches(n, END_FACTORISATIONS, 0.0)
+    elif state == DE_SAXCE_SECOND_END:
+        if n.progress.lowest <= far_from_end():
+            begin_damped_newton(n, n.best_z, COULOMB, min(n.best, 1e-7), SECOND_END_FACTORISATIONS)
+            begin_damped_newton_stretches(n, SECOND_END_FACTORISATIONS, 0.0)
     elif state == FIRST_FLOW:
         if n.s.e.m >= MIN_FLOW_ROWS and n.best < max_flow_residual():
             begin_flow(n, n.best_z, FIRST_FLOW_FACTORISATIONS, FLOW_PATIENCE)
