@@ -72,7 +72,11 @@ def make_genesis(model, **changes):
     """Return a built scene of three environments: "arm", "convex" or "pyramids"; `record_genesis.py` recorded them."""
     made = load("genesis_1.4.5.npz", model, changes)
     made.is_built, made.sim.coupler = True, LegacyCoupler()
-    made.sim.rigid_solver._options = SimpleNamespace(noslip_iterations=0)
+    solver = made.sim.rigid_solver
+    solver._options = SimpleNamespace(noslip_iterations=0)
+    solver.rigid_config.enable_mujoco_compatibility = False
+    # The default integrator, whose matrix has the damping, uses the solver's acceleration.
+    solver.dyn_state.dofs.acc = solver.constraint_solver.constraint_state.qacc
     return made
 
 

@@ -23,7 +23,7 @@ PATHS = (
     f"{STATE}.qacc",
     f"{STATE}.improved",
     f"{SOLVER}.collider.collider_state.n_contacts",
-    *(f"{SOLVER}.dyn_state.dofs.{name}" for name in ("vel", "acc_smooth", "qf_smooth")),
+    *(f"{SOLVER}.dyn_state.dofs.{name}" for name in ("vel", "acc", "acc_smooth", "qf_smooth")),
     f"{SOLVER}.rigid_info.mass_mat",
 )
 CONFIG = (

@@ -11,8 +11,9 @@ or elliptic, and elliptic contacts are solved by one of two laws:
     contact_resolution = convex       MuJoCo's relaxation: the law "cone"
     contact_resolution = signorini    Coulomb's law over softened rows: the law "coulomb"
 
-The velocity before the step is computed as the velocity after it minus dt qacc. If a step has several substeps, only
-the last substep can be converted.
+The velocity before the step is computed as the velocity after it minus dt times the acceleration of the integrator.
+This is not qacc with Euler or implicitfast and joint damping D: it solves (M + dt D) a = M qacc, or, in
+MuJoCo compatibility mode, the balance of forces. If a step has several substeps, only the last one can be converted.
 """
 
 from __future__ import annotations
@@ -121,7 +122,12 @@ def _convert_solver_arrays(scene: Any, solver: Any) -> EngineStep:
     )
     dofs, dt = solver.dyn_state.dofs, float(solver.substep_dt)
     jac = np.ascontiguousarray(np.moveaxis(_copy_to_host(constraints.jac, m), 2, 0))
-    velocity = _copy_to_host(dofs.vel).T.astype(float) - dt * _copy_to_host(constraints.qacc).T
+    velocity = _copy_to_host(dofs.vel).T.astype(float) - dt * _copy_to_host(dofs.acc).T
+    moved_by = "acceleration"
+    if config.enable_mujoco_compatibility:
+        from genesis import integrator
+
+        moved_by = "forces" if config.integrator != integrator.approximate_implicitfast else moved_by
     result = from_efc(
         efc_J=jac,
         efc_D=_copy_to_host(constraints.efc_D, m).T,
@@ -137,6 +143,7 @@ def _convert_solver_arrays(scene: Any, solver: Any) -> EngineStep:
         efc_force=_copy_to_host(constraints.efc_force, m).T,
         qfrc_smooth=_copy_to_host(dofs.qf_smooth).T,
         qacc=_copy_to_host(constraints.qacc).T,
+        moved_by=moved_by,
         friction="coulomb" if config.enable_signorini_contact else "cone",
     )
     converged = ~_copy_to_host(constraints.improved).astype(bool)

@@ -1,10 +1,11 @@
 """`from_genesis` on recorded arrays, against arithmetic in the engine's terms; test_readers.py asks the rest."""
 
+import sys
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from recorded_engines import make_genesis, replace_genesis
+from recorded_engines import Recorded, make_genesis, replace_genesis
 
 import lavender as lv
 
@@ -45,6 +46,29 @@ def test_problem_has_the_engines_rows_and_law(model):
         if model != "convex":  # With torsion, rows are scaled by their coefficients.
             np.testing.assert_allclose(problem.dense(), matrix, rtol=1e-6, atol=1e-6 * np.abs(matrix).max())
             np.testing.assert_allclose(problem.b, b, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(("integrator", "is_compatible", "moved_by"), [
+    ("approximate_implicitfast", True, "acceleration"), ("Euler", False, "acceleration"), ("Euler", True, "forces"),
+])  # fmt: skip
+def test_from_genesis_takes_the_velocity_before_from_the_acceleration_of_the_integrator(
+    integrator, is_compatible, moved_by
+):
+    """Recorded with the default integrator; genesis-world 1.4.5 with Euler and damping: 5e-3 m/s beside qacc."""
+    scene = make_genesis("arm")
+    names = SimpleNamespace(approximate_implicitfast=1, Euler=0)
+    sys.modules["genesis"].integrator = names
+    solver = scene.sim.rigid_solver
+    solver.rigid_config.integrator = getattr(names, integrator)
+    solver.rigid_config.enable_mujoco_compatibility = is_compatible
+    acc, vel, smooth = (array_of(scene, f"dyn_state.dofs.{name}") for name in ("acc", "vel", "acc_smooth"))
+    solver.dyn_state.dofs.acc = Recorded(0.5 * acc)
+    step, dt = lv.io.from_genesis(scene), solver.substep_dt
+    for i in range(len(step.batch)):
+        expected = vel[:, i] - 0.5 * dt * acc[:, i] + dt * smooth[:, i]
+        np.testing.assert_allclose(step.batch[i].generalized.v_free, expected, rtol=1e-5, atol=1e-6)
+        motion = step.batch.engine_motions.get(i)
+        assert (motion.moved_by if motion is not None else "forces") == moved_by
 
 
 class Plane:
