@@ -307,7 +307,7 @@ def test_from_mujoco_keeps_only_constant_arrays_of_a_model_and_releases_it():
         lv.io.from_mujoco(model, data)
         whole = getattr(model, name)
         kept, whole[-1] = int(whole[-1]), 1000
-        with pytest.raises(lv.InputError, match="dof_bodyid and body_parentid are no tree"):
+        with pytest.raises(lv.InputError, match="dof_bodyid and body_parentid do not describe a tree"):
             lv.io.from_mujoco(model, data)
         whole[-1] = kept
     alive = weakref.ref(model)
