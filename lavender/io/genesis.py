@@ -127,7 +127,12 @@ def _convert_solver_arrays(scene: Any, solver: Any) -> EngineStep:
     if config.enable_mujoco_compatibility:
         from genesis import integrator
 
-        moved_by = "forces" if config.integrator != integrator.approximate_implicitfast else moved_by
+        moved_by = "forces" if config.integrator == integrator.implicitfast else moved_by
+        if config.integrator == integrator.Euler and _copy_to_host(solver.dyn_info.dofs.damping).any():
+            raise CapabilityError(
+                "enable_mujoco_compatibility with Euler moves trees with damping by forces and others by "
+                "accelerations, which is not supported: change one of both"
+            )
     result = from_efc(
         efc_J=jac,
         efc_D=_copy_to_host(constraints.efc_D, m).T,

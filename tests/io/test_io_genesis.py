@@ -49,18 +49,20 @@ def test_problem_has_the_engines_rows_and_law(model):
 
 
 @pytest.mark.parametrize(("integrator", "is_compatible", "moved_by"), [
-    ("approximate_implicitfast", True, "acceleration"), ("Euler", False, "acceleration"), ("Euler", True, "forces"),
+    ("approximate_implicitfast", True, "acceleration"), ("Euler", False, "acceleration"),
+    ("Euler", True, "acceleration"), ("implicitfast", True, "forces"),
 ])  # fmt: skip
 def test_from_genesis_takes_the_velocity_before_from_the_acceleration_of_the_integrator(
     integrator, is_compatible, moved_by
 ):
     """Recorded with the default integrator; genesis-world 1.4.5 with Euler and damping: 5e-3 m/s beside qacc."""
     scene = make_genesis("arm")
-    names = SimpleNamespace(approximate_implicitfast=1, Euler=0)
+    names = SimpleNamespace(approximate_implicitfast=1, Euler=0, implicitfast=2)
     sys.modules["genesis"].integrator = names
     solver = scene.sim.rigid_solver
     solver.rigid_config.integrator = getattr(names, integrator)
     solver.rigid_config.enable_mujoco_compatibility = is_compatible
+    solver.dyn_info = SimpleNamespace(dofs=SimpleNamespace(damping=Recorded(np.zeros(3))))
     acc, vel, smooth = (array_of(scene, f"dyn_state.dofs.{name}") for name in ("acc", "vel", "acc_smooth"))
     solver.dyn_state.dofs.acc = Recorded(0.5 * acc)
     step, dt = lv.io.from_genesis(scene), solver.substep_dt
@@ -69,6 +71,10 @@ def test_from_genesis_takes_the_velocity_before_from_the_acceleration_of_the_int
         np.testing.assert_allclose(step.batch[i].generalized.v_free, expected, rtol=1e-5, atol=1e-6)
         motion = step.batch.engine_motions.get(i)
         assert (motion.moved_by if motion is not None else "forces") == moved_by
+    if is_compatible and integrator == "Euler":  # Only trees with damping are moved by forces.
+        solver.dyn_info.dofs.damping = Recorded(np.array([0.0, 0.3]))
+        with pytest.raises(lv.CapabilityError, match="enable_mujoco_compatibility with Euler"):
+            lv.io.from_genesis(scene)
 
 
 class Plane:
