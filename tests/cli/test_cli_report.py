@@ -109,6 +109,8 @@ def test_a_recorded_scene_is_reported_as_a_sequence(lavender, tmp_path):
     assert len(list(folder.glob("*.npz"))) == 3  # none of the four is left
     assert lavender("run", "no such scene")[0] == 2
     assert lavender("report", "--sequence")[0] == 2
+    code, _, err = lavender("report", "two_particles", "--solvers", "pgs", "newton")
+    assert (code, "--solvers pgs,newton" in err) == (2, True)
     assert lavender("report", "--sequence", folder, "--compare", "nowhere")[0] == 2
 
 
