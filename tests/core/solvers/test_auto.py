@@ -56,6 +56,14 @@ def test_auto_admm_from_relaxation_solves_pyramid_with_slip():
     assert work["newton on the relaxation"]["factorisations"] <= 24 and "newton" not in work
 
 
+def test_auto_leaves_the_relaxation_of_a_sliding_pyramid_before_it_is_solved():
+    problem = lv.suite.case("pyramidF(k=10, sliding=2)").problem
+    solution, relaxed = lv.solve(problem), lv.solve(problem.relaxed("cone"), "newton")
+    assert solution.success
+    assert [stage.solver for stage in solution.stages] == ["newton on the relaxation", "newton"]
+    assert solution.stages[0].work["factorisations"] < relaxed.work["factorisations"]
+
+
 def test_auto_turn_of_newton_that_halves_the_residual_continues():
     problem = lv.suite.case("granularF(n=6, sliding=2, seed=4)").problem
     solution = lv.solve(problem, "auto", tol=1e-6)
