@@ -183,10 +183,3 @@ def test_chapter_failure_has_a_command_that_shows_it():
 def test_chapter_comparison_detects_a_wrong_number(number, shown):
     with pytest.raises(AssertionError, match="is printed"):
         check([number], "", "at most {} N s", f"first line\nat  most {shown} N s")
-
-
-@pytest.mark.parametrize("command", sorted(CLAIMS))
-def test_chapter_numbers_equal_those_of_the_command(command):
-    assert f"`{command}`" in PAGE
-    for numbers, tolerance, line in CLAIMS[command]:
-        check(numbers, tolerance, line, printed(command))
