@@ -26,7 +26,7 @@ CONTACT_NUMBER = re.compile(r"^(contact|limit) \d+\b ?")
 
 
 class Judging(NamedTuple):
-    """How steps are judged and which are kept."""
+    """Options of an audit: they decide how it judges steps and which steps it keeps."""
 
     precision: str  # {"float64", "float32"}
     threshold: float  # [m/s]

@@ -25,7 +25,7 @@ def describe_provenance(model: Any, name: str, engine: str = "mujoco") -> dict[s
     """Return the provenance of numbers, as numbers.json holds it; `model` is None for scenes of other engines.
 
     engine, engine_version, lavender, mujoco, integrator, solver, cone, timestep [s], model, model_hash (of the arrays
-    and options of the model), date (UTC) and command; None if there is no such entry.
+    and options of the model), date (UTC) and command; an entry that the run does not have is None.
     """
     entries: dict[str, Any] = {
         "engine": engine, "engine_version": _get_version(PACKAGES.get(engine, engine)), "lavender": __version__,

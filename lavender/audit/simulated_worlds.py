@@ -230,7 +230,7 @@ class Divergence(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """All worlds before one step: problems, the engine's answers, and the state to restart from."""
+    """Problems of all worlds before one step, the engine's answers, and the state from which the worlds restart."""
 
     batch: Batch
     impulse: FloatArray  # [N s]

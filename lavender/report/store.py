@@ -30,7 +30,9 @@ if TYPE_CHECKING:
 
 Row: TypeAlias = dict[str, Any]  # Content of one line.
 KINDS = ("machine", "case", "run", "skip")
-ERROR = "ERROR"  # Status of a run after an exception of its solver, in addition to those of a solve.
+ERROR = (
+    "ERROR"  # A run whose solver raised an exception has this status; other runs have a status of `Status`.
+)
 #: Columns that are equal in two lines about the same measurement; the later line counts.
 KEY = ("run", "case", "sha", "solver", "start", "mode", "tol", "max_iter", "time_limit", "order")
 #: Columns of runs with their defaults, which are the values of a run without an answer and determine the types.

@@ -104,8 +104,8 @@ cdef extern from *:
         *worst = at; \
     } \
     \
-    /* Check the data; M = L^T D L, Y = J L^-1 D^-1/2, d, b, and the errors of the zero impulse. LANE_IS_PLAIN receives 1 in lanes \
-     * in which all of this is defined, M is full, and the zero impulse is no solution. */ \
+    /* Check the data; M = L^T D L, Y = J L^-1 D^-1/2, d, b, and the errors of the zero impulse. LANE_IS_PLAIN receives 1 if \
+     * no number is out of range, M has no zero entry, and the zero impulse does not solve the world. */ \
     ISA static void prepare_##N(const lavender_lanes_t* x) { \
         const int m = x->m, n = x->n; \
         V *l = (V*)x->mass, *y = (V*)x->y, *d = (V*)x->d, *b = (V*)x->b, *inverse = (V*)x->inverse, *root = (V*)x->root; \
@@ -575,7 +575,7 @@ cdef inline bint fit_lanes(const blocks_t* p) noexcept nogil:
 
 
 cdef inline bint are_worlds_equal_in_size(const worlds_t* w, int64_t first, int64_t end) noexcept nogil:
-    """Return whether worlds [first, end) have the same sizes, within those of lanes."""
+    """Return whether worlds [first, end) have equal sizes, and lanes can hold that many rows and velocities."""
     cdef const int64_t* at = w.at + first * PLACES
     cdef int64_t i
     if not (0 < at[ROWS] <= MAX_LANE_ROWS and 0 < at[VELOCITIES] <= MAX_LANE_VELOCITIES and at[ROWS] == 3 * at[BLOCKS]):

@@ -444,12 +444,3 @@ def test_c_library_dump_is_the_problem_to_the_last_bit(library, folder, compiler
     missing = str(tmp_path / "no" / "such").encode()
     assert c.dump(solver.at, ct.byref(problem), missing) == -20
     assert c.dump(solver.at, None, missing) == c.dump(solver.at, ct.byref(problem), None) == -1
-
-
-def test_c_library_velocities_are_those_of_the_package(library):
-    given = self_test_problem()
-    solver = library.open(library.problem(given), library.options("sequential_impulses"))
-    solver.run(30, 0.0)
-    out = np.zeros(18)
-    assert library.c.lav_velocity(solver.at, out.ctypes.data, 18) == 0
-    np.testing.assert_allclose(out.reshape(3, 6), given.velocity(solver.impulse()), rtol=0.0, atol=1e-14)

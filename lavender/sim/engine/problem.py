@@ -25,7 +25,7 @@ RESIDUAL_PARTS = ("joint", "normal", "disk", "spin", "rolling")
 def build_problem(state: State, bodies: Sequence[str], joints: Sequence[str], name: str) -> Problem:
     """Return the velocity problem of a substep after `kernel.prepare_substep()` has built its rows; arrays are copied.
 
-    The names of blocks are made from those of `bodies` and `joints`.
+    The name of a block contains names of `bodies` and `joints`.
     """
     a = state.a
     kj, mj = int(state.size[SIZE["joints"]]), int(state.size[SIZE["joint_rows"]])
