@@ -68,7 +68,7 @@ TIMED_STEPS = 20  # Steps of world 0 that are timed if the number of worlds is g
 MIN_DURATION_OF_WORKERS = 2.0
 MAX_CONTACT_STATES = 1000  # Up to about this many states before steps with contact are kept.
 # The states before a world diverges by less than this number of steps are not kept as states with contact: their speeds
-# belong to the divergence.
+# belong to the divergence, and `slip` simulates settings for 25 steps.
 DIVERGENCE_MARGIN = 25
 
 

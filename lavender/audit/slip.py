@@ -25,6 +25,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,7 +36,7 @@ from lavender.base.errors import InputError
 from lavender.judge.residuals import residual
 from lavender.problem import Problem
 from lavender.problem.data import check_problem
-from lavender.report.text import format_size
+from lavender.report.text import NONE, format_size, format_sizes
 from lavender.solving.solve import solve
 
 if TYPE_CHECKING:
@@ -48,6 +50,8 @@ CAUSES = {
 # [m/s] Slip below this speed is not explained. It is far below the speeds at which objects slip out of a gripper, and
 # above the velocity error of solutions to a relative residual of 1e-9.
 MIN_EXPLAINED_SLIP = 1e-6
+REMEDY_STEPS = 25  # Settings are compared by their mean slip in this number of further steps.
+MAX_REMAINING_SLIP = 0.9  # A setting helps if at most this fraction of the slip remains.
 # A contact slid already before the step if it then had at least this fraction of its speed after the step.
 MIN_EARLIER_FRACTION = 0.5
 UNDEFINED_LAW = "Coulomb's law is not defined for its round cones"
@@ -71,6 +75,43 @@ class SlipVariant:
         return np.array([np.linalg.norm(v) for v in self.velocity])
 
 
+@dataclass(frozen=True)
+class Remedy:
+    """Slip of the fastest contact with a setting of MuJoCo, simulated from several states.
+
+    Steps in which the geoms do not touch have no slip and do not count.
+    """
+
+    # Text for the model's file; the first remedy of an explanation is the model without a change.
+    setting: str
+    slip: float  # [m/s] Mean speed of the contact's points in the explained step, simulated with the setting.
+    # [m/s] The same, as a mean of the steps with contact among the next `REMEDY_STEPS` steps of all states; nan if
+    # there is none, or if a run diverges.
+    later: float
+    # First step in which MuJoCo restarted one of the runs because it diverged; 0 is the explained step, -1 means that
+    # no run diverged.
+    diverged_step: int = -1
+    touching: float = 0.0  # Fraction of these steps with contact.
+    kept: int = 0  # Number of states in which the geoms touch in the last of these steps.
+    # [m/s] (1 + REMEDY_STEPS,) tuple: mean speed in each step, from the explained one on; nan without contact.
+    speeds: tuple[float, ...] = ()
+
+    @classmethod
+    def of_runs(cls, setting: str, speeds: FloatArray, diverged_step: int) -> Remedy:
+        """Average the speeds (states, 1 + REMEDY_STEPS) [m/s] of the runs with a setting."""
+
+        def compute_mean(values: FloatArray) -> float:
+            finite = values[np.isfinite(values)]
+            return float(finite.mean()) if len(finite) else np.nan
+
+        touches = np.isfinite(speeds[:, 1:])
+        later = np.nan if diverged_step >= 0 else compute_mean(speeds[:, 1:])
+        return cls(
+            setting, compute_mean(speeds[:, 0]), later, diverged_step, float(touches.mean()), int(touches[:, -1].sum()),
+            tuple(map(compute_mean, speeds.T)),
+        )  # fmt: skip
+
+
 @dataclass(frozen=True, eq=False)
 class SlipExplanation:
     """Slip of contacts in each variant of one step; `str()` gives the table and the sentences.
@@ -85,6 +126,10 @@ class SlipExplanation:
         Sliding speed before the step, if it is known.
     friction_use : (contacts,), optional
         Friction force of the engine's answer divided by mu times the normal force, if it is known.
+    remedies : tuple of Remedy
+        Settings that were simulated, if the model is known and this is its state with the fastest contact.
+    n_states : int
+        Number of states from which the settings were simulated.
     state : int
         Index of the state among the given ones.
     """
@@ -93,6 +138,8 @@ class SlipExplanation:
     variants: tuple[SlipVariant, ...]
     speeds_before: FloatArray | None = None
     friction_use: FloatArray | None = None
+    remedies: tuple[Remedy, ...] = ()
+    n_states: int = 0
     state: int = 0
 
     def __str__(self) -> str:
@@ -131,6 +178,57 @@ class SlipExplanation:
         return tabulate_slip(self.slips).drop(columns="points")
 
     @property
+    def remedies_table(self) -> pd.DataFrame:
+        """Slip of the fastest contact with each setting [m/s], in the explained step and later, as texts."""
+        import pandas as pd
+
+        slips, means = (format_sizes([getattr(r, name) for r in self.remedies]) for name in ("slip", "later"))
+        for i, remedy in enumerate(self.remedies):
+            if remedy.diverged_step >= 0:
+                means[i] = f"diverges in step {remedy.diverged_step}"
+        texts = [[text.replace(NONE, "no contact") for text in column] for column in (slips, means)]
+        settings = [r.setting for r in self.remedies]
+        heads = ["setting", "slip [m/s]", f"mean of the next {REMEDY_STEPS} steps [m/s]"]
+        columns = dict(zip(heads, [settings, *texts], strict=True))
+        n = self.n_states * REMEDY_STEPS
+        columns["steps with contact"] = [f"{r.touching * n:.0f} of {n}" for r in self.remedies]
+        columns["states that keep contact"] = [f"{r.kept} of {self.n_states}" for r in self.remedies]
+        return pd.DataFrame(columns)
+
+    def draw_slip(self, folder: Path) -> str:
+        """Draw the slip of the fastest contact over time, as it is and with the settings that change it."""
+        from lavender.report.drawing import Label, draw_figure, fit_margins, label_ends, style_line
+
+        def shorten(setting: str) -> str:
+            return setting.removeprefix("<option ").removesuffix("/>").replace('"', "")
+
+        def fill(axes: Any) -> str:
+            labels: list[Label] = []
+            drawn: set[bytes] = set()
+            for remedy in self.remedies:
+                finite = np.array(remedy.speeds)[np.isfinite(remedy.speeds)]
+                if (
+                    len(finite) and finite.tobytes() not in drawn
+                ):  # Settings without an effect have the same line.
+                    style = style_line(len(drawn)) | {"marker": ""}
+                    drawn.add(finite.tobytes())
+                    axes.plot(remedy.speeds, **style)
+                    weight = "normal" if labels else "bold"
+                    labels.append(Label(finite[-1], shorten(remedy.setting), style["color"], weight))
+            axes.set_xlim(0, REMEDY_STEPS)
+            axes.set_ylim(bottom=0.0)
+            axes.set_xlabel("step")
+            axes.set_ylabel("slip [m/s]")
+            label_ends(axes, labels)
+            return "Slip over time. " + "; ".join(
+                f"{label.text}: {label.y:.2g} m/s at the end" for label in labels
+            )
+
+        note = f"Means over {self.n_states} states. Steps without contact are gaps."
+        margins = fit_margins([shorten(remedy.setting) for remedy in self.remedies])
+        return draw_figure("slip-over-time", fill, (4.9, 3.3), margins, note=note, folder=folder)
+
+    @property
     def sentences(self) -> list[str]:
         """Sentences about the contact with the largest slip: its cause and its state."""
         if not self.contacts:
@@ -161,6 +259,38 @@ class SlipExplanation:
             lines.append(f"In the engine's answer its friction force is {share}.")
         noted = [v for v in self.variants if v.note.startswith(("not", UNDEFINED_LAW))]
         return lines + [f"Variant {v.name!r}: {v.note}." for v in noted]
+
+    @property
+    def advice(self) -> list[str]:
+        """Lines about the settings that helped when they were simulated, best first; or that none did."""
+        if not self.remedies:
+            return []
+        now = self.remedies[0]
+        if now.diverged_step >= 0:
+            step = f"step {now.diverged_step} after the state"
+            cause = f"as it is, the simulation diverges in {step}, and MuJoCo restarts it"
+            return [f"No setting is recommended: {cause}. Find the cause first (lavender audit)."]
+        is_later = not np.isnan(now.later)
+        get_slip = attrgetter("later" if is_later else "slip")
+        before = get_slip(now)
+        time = f"in the next {REMEDY_STEPS} steps" if is_later else "in the same step"
+        if not before > MIN_EXPLAINED_SLIP:
+            mean, limit = f"{format_size(before)} m/s as it is", f"{MIN_EXPLAINED_SLIP:g} m/s"
+            return [f"No setting is needed: the mean slip {time} is {mean}; up to {limit} count as no slip."]
+        stable = [r for r in self.remedies[1:] if r.diverged_step < 0]
+        helpful = [r for r in stable if get_slip(r) <= MAX_REMAINING_SLIP * before]
+        if not helpful:
+            return [f"None of these settings reduces the slip {time} by more than 10 %."]
+        head = f"Settings that help (mean slip {time}, {format_size(before)} m/s as it is):"
+        helpful.sort(key=get_slip)
+        lost = {
+            r.setting: f"; {r.kept} of {self.n_states} states keep contact, and {now.kept} as it is"
+            for r in helpful if r.kept < now.kept
+        }  # fmt: skip
+        return [
+            head,
+            *(f"  {r.setting}: {format_size(get_slip(r))} m/s{lost.get(r.setting, '')}" for r in helpful),
+        ]
 
 
 def explain_slip(

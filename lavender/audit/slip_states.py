@@ -1,9 +1,9 @@
-"""Explain the slip of contacts at states of a MuJoCo model."""
+"""Explain the slip of contacts at states of a MuJoCo model, and simulate settings that can reduce it."""
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,15 +12,19 @@ import numpy as np
 
 from lavender.audit.page import ResultPage
 from lavender.audit.provenance import describe_provenance, format_provenance
+from lavender.audit.settings import MujocoSetting, get_option_value
 from lavender.audit.simulated_worlds import count_engine_warnings, has_diverged
 from lavender.audit.slip import (
     CAUSES,
     MIN_EXPLAINED_SLIP,
+    REMEDY_STEPS,
+    Remedy,
     SlipExplanation,
     average_slip,
     compute_slip,
     explain_slip,
     find_surface_velocity,
+    get_geoms,
     tabulate_slip,
 )
 from lavender.base.arrays import FloatArray
@@ -36,20 +40,17 @@ from lavender.report.text import format_count, format_speed
 if TYPE_CHECKING:
     import pandas as pd
 
-#: {cause of a slip: attributes of MuJoCo that reduce it}, after its documentation on slip in contacts.
-MUJOCO_ADVICE = {
-    "unfinished solving": "more iterations, a smaller tolerance",
-    "shape of the cone": 'cone="elliptic"',
-    "softness of friction": "a larger impratio, noslip_iterations, a shorter solref",
-    "sliding at the friction limit": "a larger friction, or a larger normal force",
-}
+MAX_REMEDY_STATES = 8  # Settings are simulated from up to this many states, those with the largest slip.
+FRICTION_FACTOR = 2.0  # The friction coefficient is multiplied by this in one of the settings.
 
 
 @dataclass(frozen=True, eq=False)
 class SlipOfStates:
     """Slip of contacts at several states of a model."""
 
-    explanations: tuple[SlipExplanation, ...]  # One for each state that has a contact with friction.
+    # One for each state that has a contact with friction. The one with the fastest contact has `remedies`: settings of
+    # MuJoCo, each simulated from up to 8 states, those in which this contact slides fastest.
+    explanations: tuple[SlipExplanation, ...]
     n_states: int  # Number of states.
     # Indices of the states that are left out, because MuJoCo restarts the simulation in a step up to the explained one:
     # its numbers are not finite, or above 1e10.
@@ -60,7 +61,7 @@ class SlipOfStates:
     @property
     def worst(self) -> SlipExplanation:
         """The explanation with the fastest contact; there must be at least one explanation."""
-        return max(self.explanations, key=lambda e: e.variants[0].speeds.max())
+        return max(self.explanations, key=lambda e: _find_fastest(e)[0])
 
     @property
     def table(self) -> pd.DataFrame:
@@ -82,26 +83,20 @@ class SlipOfStates:
         ]
 
     @property
-    def sentences(self) -> list[str]:
-        """Sentences about the fastest contact, and MuJoCo's attributes that reduce its slip."""
-        slips = self.worst.slips
-        attributes = MUJOCO_ADVICE.get(slips["cause"][slips["speed"].idxmax()])
-        return [*self.worst.sentences, *([f"MuJoCo's remedies: {attributes}."] if attributes else [])]
-
-    @property
     def page(self) -> ResultPage:
-        """Page with the slip of each pair of geoms."""
+        """Page with the slip of each pair of geoms, the settings simulated, and the slip over time."""
+        worst = self.worst
+        remedies = [r.__dict__ | {"speeds": list(r.speeds)} for r in worst.remedies]
         numbers = {
-            "states": self.n_states, "explained": len(self.explanations), "state": self.worst.state,
-            "slip": self.table.to_dict("records"), "provenance": self.provenance,
+            "states": self.n_states, "explained": len(self.explanations), "state": worst.state,
+            "slip": self.table.to_dict("records"), "remedies": remedies, "provenance": self.provenance,
         }  # fmt: skip
-        return ResultPage(
-            self.make_page, numbers, [self.table], provenance=format_provenance(self.provenance)
-        )
+        tables = [self.table, worst.remedies_table] if remedies else [self.table]
+        return ResultPage(self.make_page, numbers, tables, provenance=format_provenance(self.provenance))
 
     def make_page(self, folder: Path | None) -> Page:
-        """Make the page: the fastest contact with its cause, and the shares of the causes."""
-        slips = self.worst.slips
+        """Make the page: the fastest contact with its cause, shares of the causes, slip over time, settings."""
+        worst, slips = self.worst, self.worst.slips
         first = slips.loc[slips["speed"].idxmax()]
         verdict = f"No contact slips faster than {format_speed(MIN_EXPLAINED_SLIP)}."
         if first["cause"] != "no slip":
@@ -127,13 +122,21 @@ class SlipOfStates:
                 for (cause, x), color in zip(parts.items(), colors, strict=True)
             ]
             alt = ", ".join(f"{cause} {format_speed(x)}" for cause, x in parts.items())
-            causes = [make_table(rows, title="Causes of this slip", classes="full"), {"bar": bar, "alt": alt}]
-            blocks = [{"pair": [causes, [tabulate_frame(self.table, title="Slip of each pair of geoms")]]}]
+            title = "Causes of this slip"
+            causes = [make_table(rows, title=title, classes="full"), {"bar": bar, "alt": alt}]
+            drawn = [Markup(worst.draw_slip(folder))] if worst.remedies else []
+            blocks = [{"pair": [drawn or causes, causes if drawn else []]}]
+            blocks.append(tabulate_frame(self.table, title="Slip of each pair of geoms"))
+            if worst.remedies:
+                blocks.append(tabulate_frame(worst.remedies_table, title="Settings simulated"))
         n = len(self.explanations)
         source = (
             f"lavender slip · {self.provenance.get('model', '')} · {format_count(n, 'state')} with contact"
         )
-        sentences, footer = [" ".join(self.sentences)], ["Files: numbers.json."]
+        head, *settings = worst.advice or [""]
+        advice = f"{head} {'; '.join(map(str.strip, settings))}." if settings else head
+        sentences = [" ".join(worst.sentences), *filter(None, [advice])]
+        footer = ["Files: numbers.json, figures/ (PDF, SVG, PNG)."]
         return Page(
             "lavender slip", source, verdict, sentences, warnings=self.notes, blocks=blocks, footer=footer
         )
@@ -174,6 +177,7 @@ def explain_slip_of_states(
     misfit = "" if starts is None else starts.misfit
     explanations: list[SlipExplanation] = []
     diverged: list[int] = []
+    explained = []  # State vector of each explanation.
     with count_engine_warnings(mj):
         for i, vector in enumerate(vectors):
             if watch is not None:
@@ -185,6 +189,11 @@ def explain_slip_of_states(
             explanation = _explain_state(mj, model, data, entries)
             if explanation is not None:
                 explanations.append(replace(explanation, state=i))
+                own = np.empty(mj.mj_stateSize(model, mj.mjtState.mjSTATE_INTEGRATION))
+                mj.mj_getState(model, data, own, mj.mjtState.mjSTATE_INTEGRATION)
+                explained.append(own)
+        if explanations:
+            _simulate_remedies(mj, model, explanations, explained, watch)
     found = describe_provenance(model, name_model(model))
     return SlipOfStates(tuple(explanations), len(vectors), tuple(diverged), misfit, found)
 
@@ -202,9 +211,12 @@ def _advance(mj: Any, model: Any, vector: FloatArray | None, steps: int) -> Any:
         mj.mj_forward(model, data)
     except mj.FatalError:
         return None
-    # MuJoCo will restart the simulation in the step of this forward pass if a number is larger.
-    is_bounded = all(np.abs(x).max(initial=0.0) <= mj.mjMAXVAL for x in (data.qpos, data.qvel, data.qacc))
-    return data if is_bounded else None
+    return None if _is_diverging(mj, data) else data
+
+
+def _is_diverging(mj: Any, data: Any) -> bool:
+    """Return whether MuJoCo will restart the simulation in the step of this forward pass."""
+    return not all(np.abs(x).max(initial=0.0) <= mj.mjMAXVAL for x in (data.qpos, data.qvel, data.qacc))
 
 
 def _explain_state(mj: Any, model: Any, data: Any, entries: list[str]) -> SlipExplanation | None:
@@ -225,6 +237,47 @@ def _explain_state(mj: Any, model: Any, data: Any, entries: list[str]) -> SlipEx
     use = [_compute_friction_use(mj, model, data, name) for name in explanation.contacts]
     speeds = np.array([np.linalg.norm(v) for v in slips])
     return replace(explanation, speeds_before=speeds, friction_use=np.array(use))
+
+
+def _simulate_remedies(
+    mj: Any, model: Any, explanations: list[SlipExplanation], starts: list[FloatArray], watch: Any
+) -> None:
+    """Simulate settings from the states in which the fastest contact slides fastest, and add their results."""
+    fastest = max(range(len(explanations)), key=lambda k: _find_fastest(explanations[k])[0])
+    speed, pair = _find_fastest(explanations[fastest])
+    i = int(np.argmax(explanations[fastest].variants[0].speeds))
+    use = explanations[fastest].friction_use
+    if not speed > MIN_EXPLAINED_SLIP or (use is not None and np.isnan(use[i])):
+        return  # No setting changes the slip of a contact without normal force.
+    sliding = [
+        (speed, k)
+        for k, e in enumerate(explanations)
+        for contact, speed in average_slip([e])[["contact", "speed"]].itertuples(index=False)
+        if contact == pair
+    ]
+    chosen = [starts[k] for _, k in sorted(sliding, reverse=True)[:MAX_REMEDY_STATES]]
+    settings = list(_change_settings(mj, model, pair))
+    remedies: list[Remedy] = []
+    for k, (text, changed) in enumerate(settings):
+        if watch is not None:
+            states = format_count(len(chosen), "state")
+            watch(Event(k, len(settings), states, "", phase="simulating settings"))
+        results = [_simulate_slip(mj, changed, state, pair) for state in chosen]
+        steps = [step for _, step in results]
+        if k == 0 and min(steps) < 0:
+            # Compare settings only from the states from which the present setting does not diverge.
+            chosen = [state for state, step in zip(chosen, steps, strict=True) if step < 0]
+            results = [result for result in results if result[1] < 0]
+            steps = [-1]
+        step = min((step for step in steps if step >= 0), default=-1)
+        remedies.append(Remedy.of_runs(text, np.array([speeds for speeds, _ in results]), step))
+    explanations[fastest] = replace(explanations[fastest], remedies=tuple(remedies), n_states=len(chosen))
+
+
+def _find_fastest(explanation: SlipExplanation) -> tuple[float, str]:
+    """Return the sliding speed of the fastest contact [m/s] and the names of its geoms."""
+    slips = explanation.slips
+    return max(zip(slips["speed"], slips["contact"].map(get_geoms), strict=True))
 
 
 def _compute_friction_use(mj: Any, model: Any, data: Any, name: str) -> float:
@@ -253,3 +306,64 @@ def _read_step(mj: Any, model: Any, data: Any) -> tuple[Problem, Problem | None,
         return problem, disk, find_surface_velocity(measured)
     # MuJoCo subtracts the surfaces' velocities from J v.
     return problem, disk, measured.jacobian @ data.qvel - final.efc_vel
+
+
+def _change_settings(mj: Any, model: Any, geoms: str) -> Iterator[tuple[str, Any]]:
+    """Yield the text of each setting that can reduce the slip of two geoms, with the changed model.
+
+    The first is the model itself.
+    """
+    yield "as it is", model
+    options: list[dict[str, Any]] = [
+        {"iterations": 10 * int(model.opt.iterations), "tolerance": 1e-12},
+        {"impratio": 10.0 * float(model.opt.impratio)},
+        {"noslip_iterations": 20},
+    ]
+    if get_option_value(mj, model, "cone") == "pyramidal":
+        options += [{"cone": "elliptic", **x} for x in ({}, *options[1:])]
+    settings = {
+        s.option_line: s for s in (MujocoSetting.from_options(mj, model, **x) for x in options) if s.options
+    }
+    yield from ((line, setting.apply_to(mj, model)) for line, setting in settings.items())
+    shortest = 2.0 * model.opt.timestep  # MuJoCo uses no shorter time constant.
+    if model.geom_solref[:, 0].max(initial=0.0) > shortest:  # Negative values are stiffnesses.
+        changed = copy.deepcopy(model)
+        for solref in (changed.geom_solref, changed.pair_solref):
+            solref[solref[:, 0] > shortest] = shortest, 1.0
+        yield f'solref="{shortest:g} 1" of all geoms', changed
+
+    numbers = [mj.mj_name2id(model, mj.mjtObj.mjOBJ_GEOM, name) for name in geoms.split(", ")]
+    if len(numbers) == 2 and min(numbers) >= 0:
+        changed = copy.deepcopy(model)
+        friction = FRICTION_FACTOR * float(model.geom_friction[numbers, 0].max())
+        changed.geom_friction[numbers, 0] = friction
+        is_own_pair = np.isin(model.pair_geom1, numbers) & np.isin(model.pair_geom2, numbers)
+        changed.pair_friction[is_own_pair, :2] *= FRICTION_FACTOR
+        yield f'friction="{friction:g}" of {" and ".join(geoms.split(", "))}', changed
+
+
+def _simulate_slip(mj: Any, model: Any, state: FloatArray, geoms: str) -> tuple[FloatArray, int]:
+    """Return the sliding speeds of two geoms (1 + REMEDY_STEPS,) [m/s] in the steps from a state.
+
+    A speed is nan if the geoms do not touch in this step. The second result is the step in which the simulation
+    diverges (0 is the first), from which on all speeds are nan, or -1.
+    """
+    data = mj.MjData(model)
+    means = np.full(REMEDY_STEPS + 1, np.nan)
+    mj.mj_setState(model, data, state, mj.mjtState.mjSTATE_INTEGRATION)
+    for step in range(REMEDY_STEPS + 1):
+        try:
+            mj.mj_forward(model, data)
+            if _is_diverging(mj, data):
+                return means, step
+            problem, disk, surface = _read_step(mj, model, data)
+            measured = problem if disk is None else disk
+            sliding = np.flatnonzero(measured.cones.n_tangents > 0).tolist()
+            blocks = [k for k in sliding if get_geoms(measured.block_name(k)) == geoms]
+            mj.mj_step(model, data)
+        except mj.FatalError:
+            return means, step
+        speeds = [np.linalg.norm(v) for v in compute_slip(measured, blocks, data.qvel, surface)]
+        if speeds:
+            means[step] = np.mean(speeds)
+    return means, -1

@@ -21,7 +21,7 @@ from lavender.io.stored import check_writable
               help="Steps simulated from each state, with its controls; the last one is explained.")  # fmt: skip
 @click.option("--contact", "contacts", multiple=True, metavar="GEOM",
               help="Contacts of geoms whose names contain this; may be repeated. Default: all.")  # fmt: skip
-@click.option("--out", type=FOLDER, help="Folder of a page and of numbers.json.")
+@click.option("--out", type=FOLDER, help="Folder of a page with the slip over time and of numbers.json.")
 def slip(
     model: Path, states: str | None, steps: int, contacts: tuple[str, ...], out: Path | None
 ) -> None:  # fmt: skip
@@ -30,7 +30,9 @@ def slip(
     MODEL is an MJCF or .mjb file. The first table shows the speed of each contact along its surface after the step, and
     the largest part of this speed with its cause: unfinished solving, shape of the cone, softness of friction, convex
     relaxation, or sliding at the friction limit. A part is the change of the speed if this property is replaced, too:
-    exact solution, round cone, hard friction, Coulomb's law. Then follow the causes of the fastest contact's slip.
+    exact solution, round cone, hard friction, Coulomb's law. Settings of MuJoCo are then simulated. The second table
+    shows the speed of the fastest contact with each, in the same step and as a mean of the next 25 steps; the last
+    lines name the settings that help.
 
     Exit code 1: no state has a contact with friction.
     """
@@ -61,14 +63,19 @@ def slip(
             f"{model}: no contact with friction in these states; give other --states, or more --steps"
         )
         raise click.exceptions.Exit(EXIT_UNMET)
-    print_table(make_console(), result.table, optional=("points",))
+    console, worst = make_console(), result.worst
+    print_table(console, result.table, optional=("points",))
     n = len(result.explanations)
     print_escaped(
         f"slip: mean over the points of {format_count(n, 'state')} with contact, in one step of each"
     )
     if n > 1:
-        print_escaped(f"\nState {result.worst.state} (counted from 0) has the fastest contact:")
-    print_escaped("\n".join(result.sentences))
+        print_escaped(f"\nState {worst.state} (counted from 0) has the fastest contact:")
+    print_escaped("\n".join(worst.sentences))
+    if worst.remedies:
+        print_escaped(f"\nSettings simulated from {format_count(worst.n_states, 'state')}, mean slip:")
+        print_table(console, worst.remedies_table)
+        print_escaped("\n".join(worst.advice))
     if out is not None:
         print_escaped(f"\nPage: {result.page.write(out)}")
     print_escaped(f"\n{format_provenance(result.provenance | {'model': model.name})}")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import lavender as lv
-from lavender.audit.slip import explain_slip
+from lavender.audit.slip import REMEDY_STEPS, explain_slip
 from lavender.audit.slip_states import explain_slip_of_states
 
 mujoco = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[peers]'")
@@ -140,6 +140,31 @@ def test_slip_of_a_gripped_box_depends_on_the_grip_force(grip, cause):
     assert dominant(explanation) == cause
 
 
+def test_slip_advice_lists_only_settings_that_reduce_simulated_slip():
+    soft = explain_slip_of_states(block(0.3, option='cone="elliptic"'), steps=600).explanations[0]
+    as_it_is, *others = soft.remedies
+    advised = [line.strip().rpartition(": ")[0] for line in soft.advice[1:]]
+    helpful = [r.setting for r in sorted(others, key=lambda r: r.later) if r.later <= 0.9 * as_it_is.later]
+    assert advised == helpful and '<option impratio="10"/>' in advised
+    # A larger friction coefficient does not reduce creep, although it is the first idea.
+    assert 'friction="1" of slope and box' in {r.setting for r in others} - set(advised)
+    stiff = explain_slip_of_states(block(0.3, option='cone="elliptic" impratio="10"'), steps=600).explanations[0]
+    # The creep of a softened row is proportional to its compliance, which impratio divides; 5 leaves room for the load.
+    assert stiff.variants[0].speeds.max() < soft.variants[0].speeds.max() / 5.0
+
+
+def test_slip_remedies_start_from_all_states_with_the_fastest_contact():
+    model = block(0.2, friction=0.4, option='cone="elliptic"')
+    speeds = np.array([0.5, 1.0, 0.2])
+    model.qpos0[2] -= 0.0001  # The box touches the slope in its first step.
+    states = {"qpos": np.repeat(model.qpos0[None], 3, axis=0), "qvel": speeds[:, None] * np.eye(model.nv)[:1]}
+    explanations = explain_slip_of_states(model, states, steps=1).explanations
+    assert [e.n_states for e in explanations] == [0, 3, 0]
+    parts = [{k: x[i : i + 1] for k, x in states.items()} for i in range(3)]
+    alone = [explain_slip_of_states(model, part, steps=1).explanations[0] for part in parts]
+    assert explanations[1].remedies[0].slip == pytest.approx(np.mean([e.remedies[0].slip for e in alone]))
+
+
 def conveyor(form, belt=1.0, compliance=0.0, mu=0.5):
     """A box of 1 kg that rests on a belt of 1 m/s and moves with it, by bodies or by J and M."""
     if form == "bodies":
@@ -190,6 +215,87 @@ def test_explain_slip_of_states_subtracts_surface_velocity_of_geoms():
         assert explanation.causes == ("no slip",) * len(explanation.contacts)
 
 
+@pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
+def test_explain_slip_of_states_remedy_has_the_slip_that_the_typed_setting_gives(cone):
+    """Each <option> is pasted into the model, which then continues from the explained state in MuJoCo alone."""
+    angle, steps, state_kind = 0.3, 100, mujoco.mjtState.mjSTATE_INTEGRATION
+    model = block(angle, option=f'cone="{cone}"')
+    data = mujoco.MjData(model)
+    for _ in range(steps - 1):
+        mujoco.mj_step(model, data)
+    mujoco.mj_forward(model, data)
+    state = np.empty(mujoco.mj_stateSize(model, state_kind))
+    mujoco.mj_getState(model, data, state, state_kind)
+    (explanation,) = explain_slip_of_states(model, steps=steps).explanations
+    settings = {remedy.setting: remedy for remedy in explanation.remedies}
+    assert next(iter(settings)) == "as it is" and 'solref="0.004 1" of all geoms' in settings
+    assert ('<option cone="elliptic" noslip_iterations="20"/>' in settings) == (cone == "pyramidal")
+    for text, remedy in settings.items():
+        if not text.startswith("<option"):
+            continue
+        option = text.removeprefix("<option ").removesuffix("/>")
+        typed = block(angle, option=option if "cone=" in option else f'cone="{cone}" {option}')
+        data = mujoco.MjData(typed)
+        mujoco.mj_setState(typed, data, state, state_kind)
+        means = []
+        for _ in range(REMEDY_STEPS + 1):
+            mujoco.mj_forward(typed, data)
+            jacobians = np.zeros((data.ncon, 3, typed.nv))
+            for jacobian, point in zip(jacobians, data.contact.pos, strict=True):
+                mujoco.mj_jac(typed, data, jacobian, None, point, 1)
+            mujoco.mj_step(typed, data)
+            means.append(np.linalg.norm((jacobians @ data.qvel)[:, :2], axis=1).mean())  # The normal is z.
+        assert remedy.slip == pytest.approx(means[0], rel=1e-6, abs=1e-12), text
+        assert remedy.later == pytest.approx(np.mean(means[1:]), rel=1e-6, abs=1e-12), text
+    best = min(explanation.remedies, key=lambda remedy: remedy.later)
+    assert best.setting in explanation.advice[1]
+    assert best.later < 0.3 * explanation.remedies[0].later
+
+
+def falling_states(model, velocities):
+    """Return the states of a box that has settled, with these velocities along x and upwards [m/s]."""
+    kind, data = mujoco.mjtState.mjSTATE_INTEGRATION, mujoco.MjData(model)
+    for _ in range(300):
+        mujoco.mj_step(model, data)
+    states = []
+    for x, up in velocities:
+        data.qvel[:] = 0.0
+        data.qvel[0], data.qvel[2] = x, up
+        states.append(np.empty(mujoco.mj_stateSize(model, kind)))
+        mujoco.mj_getState(model, data, states[-1], kind)
+    return np.array(states)
+
+
+def test_slip_over_time_counts_steps_with_contact_of_all_states():
+    model = block(0.0, friction=0.1)
+    states = falling_states(model, [(0.5, 0.0), (0.2, 1.0)])
+    touches, speeds = np.zeros((2, 1 + REMEDY_STEPS), bool), np.zeros((2, 1 + REMEDY_STEPS))
+    for own, speed, state in zip(touches, speeds, states, strict=True):
+        data = mujoco.MjData(model)
+        mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
+        for step in range(len(own)):
+            mujoco.mj_forward(model, data)
+            own[step] = data.ncon > 0
+            mujoco.mj_step(model, data)
+            speed[step] = abs(data.qvel[0])
+    n = int(touches[:, 1:].sum())
+    assert 0 < n < 2 * REMEDY_STEPS
+    both = explain_slip_of_states(model, {"state": states}).worst
+    now = both.remedies[0]
+    assert (now.touching, now.kept) == (n / (2 * REMEDY_STEPS), int(touches[:, -1].sum()))
+    np.testing.assert_array_equal(np.isfinite(now.speeds), touches.any(axis=0))
+    # The box turns by less than 1e-3 rad.
+    assert now.later == pytest.approx(speeds[:, 1:][touches[:, 1:]].mean(), rel=1e-2)
+    assert both.remedies_table.iloc[0].tolist()[3:] == [f"{n} of 50", f"{now.kept} of 2"]
+
+
+def test_slip_names_no_setting_twice():
+    options = 'noslip_iterations="20" tolerance="1e-12" iterations="10" impratio="2"'
+    model = block(0.2, option=options)
+    settings = [r.setting for r in explain_slip_of_states(model, steps=5).worst.remedies]
+    assert len(settings) == len(set(settings)) >= 4
+
+
 def test_slip_explanation_prints_the_digits_of_the_command(tmp_path):
     from lavender.report.render import format_cells
 
@@ -197,5 +303,5 @@ def test_slip_explanation_prints_the_digits_of_the_command(tmp_path):
     explanation = result.explanations[0]
     assert format_cells(explanation.table).to_string(index=False) in str(explanation)
     page = result.page.write(tmp_path / "slip")
-    assert "Causes of this slip" in page.read_text(encoding="utf-8")
+    assert "slip-over-time" in page.read_text(encoding="utf-8")
     assert mujoco.__version__ in (tmp_path / "slip" / "numbers.json").read_text(encoding="utf-8")

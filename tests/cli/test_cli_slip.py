@@ -15,7 +15,6 @@ def test_slip_command_prints_the_cause(lavender, tmp_path):
     code, output, error = lavender("slip", tmp_path / "slope.xml", "--steps", 15)
     assert code == 0, error
     assert "slope, box" in output and "sliding at the friction limit" in output
-    assert "MuJoCo's remedies: a larger friction" in output
     code, output, error = lavender("slip", tmp_path / "slope.xml", "--steps", 15, "--contact", "hand")
     assert code == 2 and "hand" in error
 
