@@ -274,7 +274,7 @@ def recompute_tune(source: Any, model: Any, worlds: int, steps: int, states: Any
                 "tune: motion": compare(m.motion, motion),
             }
             gaps = {name: max(gap, new[name]) for name, gap in gaps.items()}
-    print(*found.headline, *found.lines, sep="\n")
+    print(*found.headline, found.choices.to_string(index=False), sep="\n")
     return gaps
 
 

@@ -18,7 +18,6 @@ it diverged is judged only if the engine's answer is finite.
 from __future__ import annotations
 
 import copy
-import hashlib
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -27,7 +26,6 @@ from typing import Any
 
 import numpy as np
 
-from lavender._version import __version__
 from lavender.audit.engine_scenes import CLAIM_ENGINES, step_scene
 from lavender.audit.environment import get_environment_data, is_environment, iterate_environment
 from lavender.audit.pieces import NOT_JUDGED, Judging, Piece, Prediction, judge_steps
@@ -289,18 +287,6 @@ def _collect(
             raise
     result.is_stopped = result.n_processed < result.verdict.size
     return result
-
-
-def hash_parameters(runs: Runs, judging: Judging, spread: float | None) -> str:
-    """Return a hash of the model and of all parameters on which the numbers of an audit depend, except `worlds`."""
-    control = runs.control
-    if not isinstance(control, str):
-        # The results of a function may change from call to call.
-        control = os.urandom(8).hex() if callable(control) else np.asarray(control, float).tobytes()
-    states = None if runs.starts is None else runs.starts.vectors.tobytes()
-    model = hash_model(runs.model, options=True)
-    values = model, runs.steps, runs.seed, spread, control, states, judging, __version__, runs.mj.__version__
-    return hashlib.sha256(repr(values).encode()).hexdigest()
 
 
 def _make_empty_audit(runs: Runs, engine: str, common: dict[str, Any], *notes: str) -> Audit:

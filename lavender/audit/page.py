@@ -465,17 +465,3 @@ class StepSizes:
             )
             numbers[name] = dict(zip(("median", "maximum", "share"), values, strict=True))
         return numbers
-
-
-def describe_exceedance(n_worlds: int) -> str:
-    """Return a sentence on the probability that a further world has a larger error than all worlds measured.
-
-    If n + 1 worlds are drawn from one distribution, each has the largest error with probability 1 / (n + 1), whatever
-    the distribution. This does not hold for steps, because the steps of one world depend on each other.
-    """
-    if not n_worlds:
-        return ""
-    return (
-        f"The maximum is that of {format_count(n_worlds, 'world')} and not a bound: a further world that is drawn "
-        f"alike exceeds it with a probability of up to 1/{n_worlds + 1}."
-    )

@@ -29,25 +29,17 @@ from lavender.io.stored import check_writable
 @limit_option
 @threshold_option
 @click.option("--out", type=FOLDER, default=Path("lavender-tune"),
-              show_default=True, help="Folder of the page and of the settings judged.")  # fmt: skip
-@click.option(
-    "--no-reuse", is_flag=True, help="Judge all settings again, also settings of an earlier call in OUT."
-)
+              show_default=True, help="Folder of the page.")  # fmt: skip
 @quiet_option
-@click.pass_context
-def tune(
-    context: click.Context, /, model: Path, out: Path, no_reuse: bool, quiet: bool, **options: Any
-) -> None:
+def tune(model: Path, out: Path, quiet: bool, **options: Any) -> None:
     """Find faster or more accurate settings of MuJoCo for a model.
 
     MODEL is an MJCF file or an .mjb file. The time and the error of a step are measured with many settings on worlds of
-    the model. Two lines with options are printed: one that is faster and as accurate as the present setting, and one
+    the model. The table has two choices: one that is faster and as accurate as the present setting, and one
     that is more accurate and as fast. Both are chosen on half of the worlds and validated on the other half. With
-    --max-velocity-error E, the first line is the fastest setting whose errors do not exceed E on all worlds, or the one
-    with the smallest error if there is none. No line is printed if fewer than 20 % of the steps have contact: then
-    start from states with contact (--states).
-
-    After a stop, the same command reuses the errors of the settings judged in OUT; times are measured again.
+    --max-velocity-error E, the first sentence names the fastest setting whose errors do not exceed E on all worlds, or
+    the one with the smallest error if there is none. Nothing is recommended if fewer than 20 % of the steps have
+    contact: then start from states with contact (--states).
 
     Exit code 1: too few steps have contact, or no setting is within --max-velocity-error. Exit code 130: stopped by
     Ctrl-C; the page shows the completed part.
@@ -57,7 +49,7 @@ def tune(
     check_writable(out, folder=True)
     limit_to_one_thread()
     with show_progress(quiet) as watch:
-        tuning = run(model, watch=watch, folder=out, reuse=not no_reuse, **options)
+        tuning = run(model, watch=watch, **options)
     show_page(tuning.page, out, quiet)
     if tuning.reason_without_line or (tuning.error_limit is not None and tuning.within_limit is None):
         raise click.exceptions.Exit(EXIT_UNMET)

@@ -14,8 +14,9 @@ from lavender.audit.page import StepSizes
 from lavender.audit.settings import OPTIONS, PROBLEM_OPTIONS
 from lavender.audit.settings import MujocoSetting as Setting
 from lavender.audit.simulated_worlds import Runs
-from lavender.audit.tune import Measured, Tuning, mujoco_settings, sweep, tune
+from lavender.audit.tune import Measured, Tuning, mujoco_settings, tune
 from lavender.audit.tune.mujoco_settings import Stage, list_first_settings
+from lavender.report.render import format_cells
 
 mj = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[mujoco]'")
 
@@ -133,7 +134,13 @@ def test_tuning_has_its_approved_recommendation(name):
     of = {word: setting.setting.option_line for word, setting in of.items() if setting is not None}
     front = [m.setting.option_line or "the present setting" for m in found.pareto_front]
     met = f"is_limit_met: {found.page.numbers['is_limit_met']}" if found.error_limit is not None else ""
-    parts = [*found.headline, *found.lines, found.reason_without_line, met, f"{of}", f"Pareto front: {front}"]
+    parts = [
+        *found.headline,
+        format_cells(found.choices).to_string(index=False),
+        met,
+        f"{of}",
+        f"Pareto front: {front}",
+    ]
     check_text("tune.txt", name, "\n".join(part for part in parts if part))
 
 
@@ -146,7 +153,7 @@ def test_tuning_choice_does_not_depend_on_the_worlds_held_back():
         held = [measured(10.0, 31.0), replace(first, error=np.full(100, error))]
         after = replace(before, held=held, held_errors={m.setting: float(m.error.max()) for m in held})
         assert (after.faster, after.closer) == (before.faster, before.closer) == (first, first)
-        assert not any("not measured" in line for line in after.lines)
+        assert after.choices["held back: time"].tolist()[1] == "0.90"
 
 
 @pytest.mark.parametrize(("limit", "is_met"), [(1e-6, True), (0.0, False)])
@@ -160,7 +167,8 @@ def test_tune_with_an_error_limit_meets_it_on_held_back_worlds(boxes, monkeypatc
     for m in found.measured:  # Every faster setting exceeds the limit on one half of the worlds.
         if is_met and m.mean_step_time < 0.95 * choice.mean_step_time and not m.setting.changes_problem:
             assert max(m.error.max(), found.held_errors.get(m.setting, 0.0)) > limit
-    assert "held back: not measured" not in "".join(found.lines)
+    shown = found.choices[found.choices["choice"].str.startswith(("most accurate", "fastest"))]
+    assert len(shown) == 1 and "–" not in shown["held back: time"].tolist()
 
 
 def test_settings_that_are_judged_in_part_do_not_change_the_choice(boxes, monkeypatch):
@@ -205,8 +213,6 @@ def test_tune_measures_the_default_options_of_mujoco(boxes, monkeypatch):
     assert model.opt.ls_iterations == 8 and applied.ls_iterations == 50
     assert found.choices["choice"].tolist()[0] == "now"
     assert any(name.startswith("MuJoCo's defaults (") for name in found.choices["option"])
-    line = replace(chosen(measured(10.0, 1.0), replace(default, times=np.full(10, 1.0)))).lines[0]
-    assert line.endswith("<!-- as accurate as now, faster, MuJoCo's defaults -->")
     # A model with the default options: its own setting is not measured twice.
     assert not any(m.setting.is_default for m in tune(boxes(), worlds=2, steps=10, repeats=1).measured)
 
@@ -224,29 +230,18 @@ def test_tune_stopped_by_ctrl_c_returns_the_measured_settings(boxes, monkeypatch
     found = tune(boxes(EARLY), worlds=2, steps=10, repeats=1, watch=watch)
     assert found.stopped and len(found.measured) == 5 and not found.held
     assert "Stopped before the end" in html_of(found, tmp_path)
-    assert "not measured" in "".join(found.lines) or found.faster is found.closer is None
+    assert (found.choices["held back: time"] == "–").all()
 
 
-def test_ctrl_c_before_the_first_round_returns_the_present_setting(boxes, monkeypatch, tmp_path):
+def test_ctrl_c_before_the_first_round_stops_tune(boxes, monkeypatch):
     fewer(monkeypatch)
-    simulate = sweep.Stage.from_stretches_of_runs.__func__
-
-    def stop_after_first_stage(cls, runs, worlds, horizon):
-        if runs.steps > horizon:
-            raise KeyboardInterrupt
-        return simulate(cls, runs, worlds, horizon)
 
     def stop_at_timing(event):
         if event.case.startswith("timing"):
             raise KeyboardInterrupt
 
-    whole = tune(boxes(EARLY), worlds=4, steps=20, repeats=1, watch=stop_at_timing)
-    monkeypatch.setattr(sweep.Stage, "from_stretches_of_runs", classmethod(stop_after_first_stage))
-    brief = tune(boxes(EARLY), worlds=4, steps=20, repeats=1)
-    for found, n_steps in ((whole, 2 * 20), (brief, 10)):  # two of the four worlds; one stretch
-        assert found.stopped and [m.setting.options for m in found.measured] == [()]
-        assert len(found.measured[0].error) == n_steps and not found.held
-        assert "Stopped before the end" in html_of(found, tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        tune(boxes(EARLY), worlds=4, steps=20, repeats=1, watch=stop_at_timing)
 
 
 def test_tune_leaves_out_a_setting_that_ends_mujoco_in_an_error(boxes, monkeypatch):
@@ -264,34 +259,3 @@ def test_tune_leaves_out_a_setting_that_ends_mujoco_in_an_error(boxes, monkeypat
     monkeypatch.setattr(Stage, "judge_setting", lambda self, *given: measured(np.inf, np.inf))
     with pytest.raises(lv.InputError, match="diverge"):
         tune(boxes(), worlds=2, steps=10, repeats=1)
-
-
-def test_tune_resumed_after_ctrl_c_reuses_judged_settings(boxes, monkeypatch, tmp_path):
-    fewer(monkeypatch)
-    path, judged, judge_setting = boxes(EARLY), [], Stage.judge_setting
-    monkeypatch.setattr(
-        Stage, "judge_setting", lambda self, *given: judged.append(given[0]) or judge_setting(self, *given)
-    )
-
-    def stop(event):
-        if event.case.startswith("timing"):
-            raise KeyboardInterrupt
-
-    same = {"worlds": 2, "steps": 20, "repeats": 1, "folder": tmp_path}
-    first = tune(path, **same, watch=stop)
-    n = len(judged)
-    assert first.stopped and n > 3
-    judged.clear()
-    second = tune(path, **same)
-    assert not second.stopped and f"The errors of {n - 1} settings are reused (--no-reuse)." in second.notes
-    judged_again = [setting for setting in judged if setting.options][: n - 1]
-    assert not {s.options for s in judged_again} & {m.setting.options for m in first.measured if m.setting.options}
-    judged.clear()
-    whole = tune(path, **same, reuse=False)
-    assert len(judged) >= n and not any("reused" in note for note in whole.notes)
-    for m in whole.measured:
-        for other in second.measured:
-            if other.setting == m.setting:
-                assert (other.error == m.error).all() and (other.motion == m.motion).all()
-    # Another model or parameter is not reused.
-    assert not any("reused" in note for note in tune(path, **same | {"seed": 3}).notes)

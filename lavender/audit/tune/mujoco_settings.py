@@ -157,10 +157,6 @@ class Stage:
             ends[i] = np.nan if has_diverged(mj, data) else data.xpos
         return step_times, ends
 
-    def get_solver(self, setting: MujocoSetting) -> str:
-        """Return the name of MuJoCo's solver with a setting."""
-        return str(get_option_value(self.mj, setting.apply_to(self.mj, self.model), "solver"))
-
     def judge_setting(self, setting: MujocoSetting, limit: float = np.inf) -> Measured:
         """Judge a setting without timing it; its errors are infinite if a world diverges.
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lavender.audit.page import SHOWN_RATIO, ResultPage, StepSizes, describe_exceedance
+from lavender.audit.page import SHOWN_RATIO, ResultPage, StepSizes
 from lavender.audit.provenance import format_provenance
 from lavender.audit.settings import MERGE_NOTE, MujocoSetting
 from lavender.audit.tune.measured import Measured
@@ -28,13 +28,17 @@ from lavender.report.drawing import (
     write_label,
 )
 from lavender.report.page import DEFAULT_ERROR_LIMIT, Page, fold_table, tabulate_frame
-from lavender.report.text import format_count, format_size, format_speed
+from lavender.report.text import NONE, format_count, format_speed
 
 if TYPE_CHECKING:
     import pandas as pd
 
 # Times that differ by at most this fraction count as equal: noise is a few per cent.
 TIME_NOISE_FRACTION = 0.05
+CHOICES_NOTE = (
+    "Chosen on the worlds with even numbers, tested on the others. On other states the errors can be larger. "
+    + MERGE_NOTE
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,87 +201,9 @@ class Tuning:
             "contact may be neither with it. Start from states with contact (--states FILE), or take more --steps."
         )
 
-    @property
-    def reason_provisional(self) -> str:
-        """Reason why the lines are provisional; empty if the measurement is complete and its times are valid."""
-        if self.stopped:
-            return "the measurement was interrupted"
-        return "the machine was busy" if self.busy else ""
-
-    @property
-    def _provisional_prefix(self) -> str:
-        """Beginning of a provisional line; empty if the measurement is complete and its times are valid."""
-        return f"PROVISIONAL, {self.reason_provisional}: " if self.reason_provisional else ""
-
-    @property
-    def lines(self) -> list[str]:
-        """Lines to copy, and their results on the worlds held back; none if too few steps have contact."""
-        if self.reason_without_line:
-            return []
-        none = f"none of {len(self._same_problem)} settings"
-        small = min(m.worst_error for m in (self.present_result, self.faster) if m is not None)
-        within = f"not needed, {format_size(small)} m/s is within {self.threshold:g}"
-        closer = within if small <= self.threshold else none
-        lines = self._format_limit_choice()
-        for description, m, reason, gains, max_ratio in (
-            ("as accurate as now, faster", self.faster, none, "mean_step_time", 1.0 - TIME_NOISE_FRACTION),
-            ("as fast as now, more accurate", self.closer, closer, "worst_error", 1.0),
-        ):
-            if m is None:
-                provisional = self._provisional_prefix if reason is none else ""
-                lines.append(f"{provisional}{description}: {reason}")
-                continue
-            held = self._find_held_back(m)
-            if held is not None and getattr(held, gains) >= max_ratio * getattr(self.held[0], gains):
-                description += ": not on the worlds held back"
-            lines += self._format_choice(m, description, _format_comparison(m, self.present_result))
-        return lines
-
     def _find_held_back(self, m: Measured) -> Measured | None:
         """Return the result of a setting on the worlds held back; None if it was not measured there."""
         return next((h for h in self.held if h.setting == m.setting), None)
-
-    def _format_limit_choice(self) -> list[str]:
-        """Return the lines on `error_limit`; none without a limit."""
-        if self.error_limit is None:
-            return []
-        goal, m = f"error at most {self.error_limit:g} m/s", self.limit_choice
-        lines = []
-        if self.within_limit is None:
-            count = f"none of {len(self._same_problem)} settings"
-            lines = [f"{self._provisional_prefix}{goal}: {count}; the most accurate is"]
-        description = f"{goal}, fastest" if self.within_limit else "most accurate"
-        return lines + self._format_choice(m, description, _format_with_largest_error(m, self.present_result))
-
-    def _format_choice(self, m: Measured, description: str, comparison: str) -> list[str]:
-        """Return the line to copy with a description, and the results on both halves of the worlds."""
-        if m.setting.is_default:
-            description += ", MuJoCo's defaults"
-        description = f"{self._provisional_prefix}{description}"
-        held = self._find_held_back(m)
-        line = m.setting.option_line
-        return [
-            f"{line}  <!-- {description} -->" if line else f"{description}: {m.setting.name}",
-            f"    chosen on: {comparison}",
-            f"    held back: {'not measured' if held is None else _format_with_largest_error(held, self.held[0])}",
-        ]
-
-    @property
-    def _lines_note(self) -> str:
-        """Explanation below the lines: how they were chosen and tested, and the element that they belong to."""
-        if self.reason_without_line:
-            return "None, for the reason above."
-        sentences = ["Chosen on the worlds with even numbers, tested on the others."]
-        if self.faster or self.closer or self.error_limit is not None:
-            sentences.append("The errors were measured on these states. On other states they can be larger.")
-            if self.error_limit is not None:
-                sentences.append("The line for the error limit was chosen on all worlds.")
-            if self.reason_provisional:
-                sentences.append(f"They are provisional, because {self.reason_provisional}: measure again.")
-            if len(self.held) > 1 and self.n_held_worlds:
-                sentences.append(describe_exceedance(self.n_held_worlds))
-            sentences.append(MERGE_NOTE)
-        return " ".join(filter(None, sentences))
 
     def _tabulate_settings(self, settings: Iterable[Measured]) -> pd.DataFrame:
         """Build the table of some settings."""
@@ -314,7 +240,7 @@ class Tuning:
 
     @property
     def headline(self) -> list[str]:
-        """Return the headline: the setting, its gain, the present errors, the results on worlds held back."""
+        """The headline: the setting, its gain, the present errors, the results on worlds held back."""
         now, m, n = self.present_result, self.advised, len(self._same_problem)
         worst = format_speed(self._compute_largest_error(now), limit=self.shown_limit)
         own = (
@@ -351,7 +277,7 @@ class Tuning:
 
     @property
     def choices(self) -> pd.DataFrame:
-        """The present setting and the advised ones: option, relative time, and errors on the first half of worlds."""
+        """The present setting and the advised ones: option, relative time and errors, also on worlds held back."""
         import pandas as pd
 
         now = self.present_result
@@ -360,12 +286,19 @@ class Tuning:
             goal = f"fastest within {format_speed(self.error_limit)}"
             named.append((goal if self.within_limit else "most accurate", self.limit_choice))
         named += [("MuJoCo's defaults", m) for m in self._same_problem if m.setting.is_default]
-        rows = [
-            (name, m.setting.short_name, f"{m.mean_step_time / now.mean_step_time:.2f}",
-             format_speed(m.worst_error), format_speed(self._compute_largest_error(m)))
-            for name, m in named if m is not None
-        ]  # fmt: skip
-        return pd.DataFrame(rows, columns=["choice", "option", "time", "1 %", "worst"])
+        rows = []
+        for name, m in named:
+            if m is None:
+                continue
+            held, texts = self._find_held_back(m), [NONE, NONE]
+            if held is not None:
+                ratio = held.mean_step_time / self.held[0].mean_step_time
+                texts = [f"{ratio:.2f}", format_speed(float(held.error.max()))]
+            time = f"{m.mean_step_time / now.mean_step_time:.2f}"
+            worst = format_speed(self._compute_largest_error(m))
+            rows.append((name, m.setting.short_name, time, format_speed(m.worst_error), worst, *texts))
+        heads = ["choice", "option", "time", "1 %", "worst", "held back: time", "worst error"]
+        return pd.DataFrame(rows, columns=heads)
 
     def draw_settings(self, folder: Path) -> str:
         """Draw the error of each setting over its time relative to the present one."""
@@ -434,7 +367,8 @@ class Tuning:
             from markupsafe import Markup
 
             drawn = [] if self.reason_without_line else [Markup(self.draw_settings(folder))]
-            choices = tabulate_frame(self.choices, title="Choices", note=f"{self._lines_note}")
+            note = "" if self.reason_without_line else CHOICES_NOTE
+            choices = tabulate_frame(self.choices, title="Choices", note=note)
             blocks.append({"pair": [drawn, [choices]]})
             every = sorted(self.measured, key=lambda m: m.mean_step_time)
             other = [m for m in self.measured if m.setting.changes_problem]
@@ -452,7 +386,7 @@ class Tuning:
             f"lavender tune · {Path(self.model).name} · {format_count(len(self._same_problem), 'setting')}"
         )
         is_bad = worst > self.shown_limit
-        footer = ["Files: numbers.json, judged.npz, figures/ as PDF, SVG and PNG."]
+        footer = ["Files: numbers.json, figures/ as PDF, SVG and PNG."]
         code = [m.setting.option_line] if m is not None and m.setting.option_line else []
         mark = "✗ above the limit now" if is_bad else "✓ within the limit now"
         if self.reason_without_line:
@@ -464,7 +398,7 @@ class Tuning:
     def page(self) -> ResultPage:
         """Page with the result in sentences, figures and tables, as `lavender tune` writes it."""
         numbers = {
-            "model": self.model, "lines": self.lines, "why_no_line": self.reason_without_line, "busy": self.busy,
+            "model": self.model, "head": self.headline, "why_no_line": self.reason_without_line, "busy": self.busy,
             "error_limit": self.error_limit,
             "is_limit_met": None if self.error_limit is None else self.within_limit is not None,
             **({} if self.sizes is None else self.sizes.as_dict), "stopped": self.stopped,
@@ -473,20 +407,6 @@ class Tuning:
         last = format_provenance(self.provenance) if self.provenance else ""
         numbers |= {"provenance": self.provenance}
         return ResultPage(self.make_page, numbers, [self.choices], self.stopped, last)
-
-
-def _format_comparison(m: Measured, now: Measured) -> str:
-    """Compare time and error of a setting with the present ones."""
-    return (
-        f"{m.mean_step_time / now.mean_step_time:.2f} of the time, error {format_size(m.worst_error)} m/s "
-        f"instead of {format_size(now.worst_error)}"
-    )
-
-
-def _format_with_largest_error(m: Measured, now: Measured) -> str:
-    """Compare time and error of a setting with the present ones, and add the largest error."""
-    worst = f"at most {format_size(float(m.error.max()))} in {len(m.error)} steps"
-    return f"{_format_comparison(m, now)} ({worst})"
 
 
 def _to_dict(m: Measured) -> dict[str, Any]:

@@ -10,31 +10,23 @@ which are held back. `lavender.audit.tune.mujoco_settings` describes the measure
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 from collections.abc import Callable
-from contextlib import suppress
-from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lavender.audit.audit import hash_parameters
 from lavender.audit.page import StepSizes
-from lavender.audit.pieces import Judging
 from lavender.audit.provenance import describe_provenance
 from lavender.audit.settings import MujocoSetting
 from lavender.audit.simulated_worlds import Runs, can_any_geoms_collide, count_engine_warnings
-from lavender.audit.tune.measured import Measured, make_unmeasured
+from lavender.audit.tune.measured import Measured
 from lavender.audit.tune.mujoco_settings import Progress, Stage, list_first_settings, list_variants
 from lavender.audit.tune.recommendation import Tuning
 from lavender.base.arrays import check_float, check_int
 from lavender.base.errors import InputError
 from lavender.io.efc import from_mujoco_many
 from lavender.io.start_states import Control
-from lavender.io.stored import write_arrays
 from lavender.judge.residuals import DEFAULT_THRESHOLD
 from lavender.report import machine
 from lavender.report.runner import Event
@@ -46,14 +38,12 @@ MAX_VARIED_TIME_RATIO = 1.5
 # Assumed number of settings with variants that are tried, to estimate the remaining time.
 EXPECTED_VARIED_SETTINGS = 4
 TUNE_BUSY_CONSEQUENCE = "The times are invalid; measure again on an idle machine."
-JUDGED_FILE = "judged.npz"  # Errors of the settings judged, which a later call reuses.
 
 
 def tune(
     model: Any, *, worlds: int = 16, steps: int = 200, control: Control = "random", seed: int = 0,
     spread: float | None = None, states: Any = None, horizon: int = 10, repeats: int = 5,
     threshold: float = DEFAULT_THRESHOLD, max_velocity_error: float | None = None,
-    folder: str | os.PathLike[str] | None = None, reuse: bool = True,
     watch: Callable[[Event], None] | None = None,
 ) -> Tuning:  # fmt: skip
     """Measure settings of MuJoCo on worlds of a model.
@@ -74,17 +64,13 @@ def tune(
         Errors [m/s] and distances [m] up to this number count as accurate enough.
     max_velocity_error : float, m/s, optional
         Also recommend the fastest setting with an error of at most this number in every step of all worlds.
-    folder : path, optional
-        The errors of the settings judged are written there, and errors of an earlier call with the same model and
-        parameters are reused from there, unless `reuse` is false. Times are always measured again.
     watch : callable, optional
         Called with the progress.
 
     Returns
     -------
     Tuning
-        After Ctrl-C, it holds the results so far, and its `stopped` is true. Before the first round of timing, these
-        are the present setting on one stretch of one world, and then on all worlds.
+        After Ctrl-C, it holds the settings that were timed, and its `stopped` is true.
 
     Raises
     ------
@@ -107,59 +93,13 @@ def tune(
     # Raise the error of an unsupported model here, before any world is simulated.
     from_mujoco_many(runs.model, np.zeros((0, runs.model.nq + runs.model.nv)))
     can_touch = can_any_geoms_collide(runs.mj, runs.model)
-    key = hash_parameters(replace(runs, name=""), Judging("float64", threshold), spread)
-    judged = JudgedSettings(folder, reuse, f"{key}, {worlds} worlds, horizon {horizon}, {error_limit}")
     with count_engine_warnings(runs.mj):  # Settings with which worlds diverge are left out.
-        return _run_tuning(runs, spread, horizon, repeats, threshold, can_touch, error_limit, judged, watch)
-
-
-class JudgedSettings:
-    """Results of settings without times, kept in a file.
-
-    Parameters
-    ----------
-    folder : path or None
-        Folder of the file; None: nothing is kept.
-    reuse : bool
-        Whether to read the file of an earlier call.
-    key : str
-        Description of the model and the parameters; a file with another one is replaced.
-    """
-
-    def __init__(self, folder: str | os.PathLike[str] | None, reuse: bool, key: str) -> None:
-        self.path = None if folder is None else Path(folder) / JUDGED_FILE
-        self.key, self.n_reused = key, 0
-        self.arrays: dict[str, Any] = {}
-        if self.path is not None and reuse:
-            with suppress(OSError, ValueError, KeyError), np.load(self.path, allow_pickle=False) as file:
-                if str(file["key"]) == key:
-                    self.arrays = {name: file[name] for name in file.files if name != "key"}
-
-    @property
-    def note(self) -> str:
-        """Sentence on the number of reused results; empty if there are none."""
-        return f"The errors of {self.n_reused} settings are reused (--no-reuse)." * bool(self.n_reused)
-
-    def judge(self, stage: Stage, half: int, setting: MujocoSetting, limit: float) -> Measured:
-        """Return the result of `Stage.judge_setting` on a stage of even (0) or odd (1) worlds."""
-        options = hashlib.sha256(json.dumps(setting.options).encode()).hexdigest()[:16]
-        names = {name: f"{options}_{half}_{name}" for name in ("error", "motion", "rows", "contacts")}
-        solver = stage.get_solver(setting)
-        if names["error"] in self.arrays:
-            self.n_reused += 1
-            result = make_unmeasured(setting, solver)
-            return replace(result, **{name: self.arrays[key] for name, key in names.items()})
-        result = stage.judge_setting(setting, limit)
-        self.arrays |= {key: np.asarray(getattr(result, name)) for name, key in names.items()}
-        if self.path is not None:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            write_arrays(self.path, {**self.arrays, "key": np.array(self.key)})
-        return result
+        return _run_tuning(runs, spread, horizon, repeats, threshold, can_touch, error_limit, watch)
 
 
 def _run_tuning(
     runs: Runs, spread: float | None, horizon: int, repeats: int, threshold: float, can_touch: bool,
-    error_limit: float | None, judged: JudgedSettings, watch: Callable[[Event], None] | None,
+    error_limit: float | None, watch: Callable[[Event], None] | None,
 ) -> Tuning:  # fmt: skip
     """Measure settings on the worlds with even numbers, and the chosen settings on the others.
 
@@ -169,17 +109,16 @@ def _run_tuning(
     held_errors: dict[MujocoSetting, float] = {}
     measured: list[Measured] = []
     held: list[Measured] = []
-    early: list[Measured] = []  # The present setting, timed once; the result until the first round of timing.
     sizes: StepSizes | None = None
 
     def make_result(stopped: bool) -> Tuning:
         """Build the result so far."""
-        timed = [m for m in measured if np.isfinite(m.mean_step_time)] or early
+        timed = [m for m in measured if np.isfinite(m.mean_step_time)]
         busy = machine.make_busy_warning(progress.loads, os.cpu_count() or 1, TUNE_BUSY_CONSEQUENCE)
         return Tuning(
             runs.name, horizon, timed, held, threshold=threshold, stopped=stopped, sizes=sizes, busy=busy,
             n_held_worlds=runs.worlds // 2, error_limit=error_limit, held_errors=dict(held_errors),
-            notes=tuple(filter(None, (*runs.notes, note, judged.note))),
+            notes=tuple(filter(None, (*runs.notes, note))),
             provenance=describe_provenance(runs.model, runs.name),
         )  # fmt: skip
 
@@ -190,25 +129,13 @@ def _run_tuning(
             limit = max(float(measured[0].error.max()), threshold, error_limit or 0.0)
         for setting in settings:
             progress.begin_measurement("judging", setting.name)
-            results.append(judged.judge(stage, int(stage is held_back), setting, limit))
+            results.append(stage.judge_setting(setting, limit))
         return results
-
-    def measure_early(stage: Stage, judged: Measured) -> None:
-        """Time the present setting once, if no world diverges, as the result so far."""
-        nonlocal sizes
-        timed = replace(judged)
-        stage.time_settings([timed], 1, Progress(None))
-        if np.isfinite(timed.mean_step_time):
-            early[:] = [timed]
-            sizes = StepSizes(timed.rows, timed.contacts, can_touch)
 
     note = ""
     if watch is not None:
         watch(Event(0, 0, "simulating the worlds", ""))
     try:
-        # The first stretch of world 0, which starts without noise, gives an early result.
-        first_stage = Stage.from_stretches_of_runs(replace(runs, steps=horizon), range(1), horizon)
-        measure_early(first_stage, first_stage.judge_setting(MujocoSetting()))
         runs, note = runs.choose_spread(spread)
         halves = [range(i, runs.worlds, 2) for i in (0, 1)]
         stage, held_back = (Stage.from_stretches_of_runs(runs, half, horizon) for half in halves)
@@ -224,7 +151,6 @@ def _run_tuning(
                 f"{runs.name}: worlds diverge with the model's own setting, so other settings cannot be "
                 "compared with it: give other controls, states or fewer steps"
             )
-        measure_early(stage, measured[0])
         last = judge(held_back, [own])
         both = [*measured, *last]
         rows, contacts = (np.concatenate([getattr(m, name) for m in both]) for name in ("rows", "contacts"))
@@ -259,7 +185,7 @@ def _run_tuning(
         held_back.time_settings(last, 2 * repeats, progress)
         held += last if np.isfinite(last[0].mean_step_time) else []
     except KeyboardInterrupt:
-        if not early:
+        if not measured or not np.isfinite(measured[0].mean_step_time):
             raise
         return make_result(True)
     return make_result(False)
