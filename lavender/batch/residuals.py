@@ -38,7 +38,14 @@ from lavender.judge.residuals import (
 from lavender.problem import PRECISIONS, Problem, check_problem
 from lavender.problem.derived import cached_property
 from lavender_ext.batch.many import CODE, NUMBER, PLACE, Worker, Worlds, list_problem_data
+from lavender_ext.core.checks import make_instance
 
+# Row of `Worlds.numbers` of each field of a residual.
+NUMBER_OF_FIELD = {
+    "relative": NUMBER["relative"], "energy": NUMBER["energy"], "velocity": NUMBER["speed"],
+    "roundoff_floor": NUMBER["roundoff_floor"], "above_floor": NUMBER["above_floor"],
+    "energy_at_zero": NUMBER["reference_energy"], "velocity_at_zero": NUMBER["reference_speed"],
+}  # fmt: skip
 NO_VELOCITY = np.zeros(0)
 NO_MORE_WORLDS = -1  # The methods of `Worker` return this after the last world.
 
@@ -117,16 +124,19 @@ class WorldResults:
 
     def _store_residual(self, i: int, residual: Residual) -> None:
         """Store the judged numbers of a world that the loop did not process."""
-        numbers = {
-            "relative": residual.relative, "energy": residual.energy, "speed": residual.velocity,
-            "roundoff_floor": residual.roundoff_floor,
-            "reference_energy": residual.energy_at_zero, "reference_speed": residual.velocity_at_zero,
-            "above_floor": residual.above_floor,
-            "push": abs(residual.error[residual.worst_row]) if residual.worst_row >= 0 else 0.0,
-        }  # fmt: skip
-        for name, x in numbers.items():
-            self._worlds.numbers[NUMBER[name], i] = x
-        self._worlds.worst[i] = residual.worst_row
+        numbers = self._worlds.numbers
+        for name, row in NUMBER_OF_FIELD.items():
+            numbers[row, i] = getattr(residual, name)
+        push = abs(residual.error[residual.worst_row]) if residual.worst_row >= 0 else 0.0
+        numbers[NUMBER["push"], i], self._worlds.worst[i] = push, residual.worst_row
+
+    def _make_residual(self, i: int, judge: Callable[[int], Residual], **fields: Any) -> Residual:
+        """Return the residual of world i by the stored numbers; `judge` computes its other fields when one is read."""
+        numbers = self._worlds.numbers[:, i].tolist()
+        fields |= {name: numbers[row] for name, row in NUMBER_OF_FIELD.items()}
+        fields |= {"worst_row": int(self._worlds.worst[i]), "_rest": (lambda: judge(i).__getstate__(), ())}
+        found: Residual = make_instance(Residual, fields)
+        return found
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the results, in NumPy arrays, without the data of the compiled loop."""
@@ -252,8 +262,15 @@ class Residuals(WorldResults):
             self.without_digits[i] = residual
         self._worlds.numbers[NUMBER["rhs_energy"], i] = residual.energy_rhs
 
-    def _get_result(self, i: int) -> Residual:
+    def _judge_world(self, i: int) -> Residual:
         return residual(self.problems[i], self._impulse[self._get_rows(i)], self.precision[i], self.threshold)
+
+    def _get_result(self, i: int) -> Residual:
+        if i in self._nothing_to_do or not self._sizes[i]:
+            return self._judge_world(i)
+        return self._make_residual(
+            i, self._judge_world, precision=self.precision[i], threshold=self.threshold
+        )
 
     def __repr__(self) -> str:
         verdicts, counts = np.unique(self.verdict, return_counts=True)

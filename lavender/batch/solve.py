@@ -17,7 +17,7 @@ from lavender.base.deadline import NEVER, Deadline
 from lavender.base.errors import InputError, LavenderError
 from lavender.batch.data import Batch
 from lavender.batch.residuals import WorldResults, check_problems, convert_impulses_or_guesses, residual_many
-from lavender.judge.residuals import judge_impulse, residual
+from lavender.judge.residuals import Residual, judge_impulse, make_residual, residual
 from lavender.judge.solution import CONTRADICTED, Solution, Status, name_start, raise_if_interrupted
 from lavender.problem import Problem
 from lavender.problem.derived import cached_property
@@ -214,7 +214,14 @@ class Solutions(WorldResults, Sequence[Solution]):
         status = Status.TIME_LIMIT if late else Status.CONVERGED
         rest = self._make_postponed_fields, (i, impulse, status)
         solution = Solution.with_late_fields(impulse, status, self.tol, self._time_per_world, rest)
-        return solution.with_fields(start=name_start(self.problems[i], self.get_start(i)))
+        guess = None if type(self.problems) is Batch else self.problems[i].guess
+
+        def judge_world(i: int) -> Residual:
+            problem = self.problems[i]
+            return make_residual(problem, judge_impulse(problem, impulse).refine(self.tol))
+
+        judged = self._make_residual(i, judge_world)
+        return solution.with_fields(start=name_start(guess, self.get_start(i)), residual=judged)
 
     def _make_postponed_fields(self, i: int, impulse: FloatArray, status: Status) -> dict[str, Any]:
         """Compute the fields of a solution that are computed only at its first access."""

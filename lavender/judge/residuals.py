@@ -591,5 +591,6 @@ def _read_rows(judgement: measure.Judged) -> dict[str, FloatArray]:
     return {"error": mark_read_only(judgement.error), "slack": mark_read_only(judgement.slack)}
 
 
-for _name in ("error", "slack"):
+LATE_FIELDS = "error slack _problem _impulse worst_island floor_energy rounding _float64_relative"
+for _name in LATE_FIELDS.split():
     setattr(Residual, _name, late_field(_name))

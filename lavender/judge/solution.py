@@ -461,11 +461,11 @@ class Solution:
         return f"{self.solver.name}: {self.status.name}, {judged}, {self._work_text}, {self._time_text}{note}{wrong}"
 
 
-def name_start(problem: Any, impulse: Any) -> str:
-    """Return the name of the start of a solve with the argument `impulse`, a value of `Solution.start`."""
-    if impulse is not None and impulse is not problem.guess:
+def name_start(guess: FloatArray | None, impulse: Any) -> str:
+    """Return the name of the start of a solve with `problem.guess` and the argument `impulse`: `Solution.start`."""
+    if impulse is not None and impulse is not guess:
         return "the given impulses"
-    return "" if problem.guess is None else "problem.guess"
+    return "" if guess is None else "problem.guess"
 
 
 def get_order_name(order: Any) -> str:

@@ -76,7 +76,7 @@ def solve_small(
     start = start if start is None or impulse is None else start.copy()
     rest = compute_postponed_fields, (problem, spec, judged, counts, start, TIME_LIMIT)
     solution = Solution.with_late_fields(judged.impulse, TIME_LIMIT, tol, perf_counter() - begin, rest)
-    return solution.with_fields(start=name_start(problem, impulse)), None
+    return solution.with_fields(start=name_start(problem.guess, impulse)), None
 
 
 def compute_postponed_fields(

@@ -316,7 +316,7 @@ class Prepared:
                 setup.state.failed_call = arguments.failed_call
                 setup.state.loop = loop if arguments.history else None
         solution = self._run(loop, setup, arguments.max_iter, has_default_start)
-        name = name_start(problem, arguments.impulse)
+        name = name_start(problem.guess, arguments.impulse)
         return solution.with_fields(start=name) if name else solution
 
     # -- set-up ----------------------------------------------------------------------------------

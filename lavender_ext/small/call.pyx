@@ -507,7 +507,7 @@ def solve_compiled(problem, spec, impulse, tol, deadline=None):
             "_rest": (compute_postponed_fields, (problem, spec, judged, counts, kept, CONVERGED)),
         }
         if first is not None:
-            fields["start"] = name_start(problem, impulse)
+            fields["start"] = name_start(problem.guess, impulse)
         solution = make_instance(Solution, fields)
     return solution, judged, counts, first
 

@@ -1,6 +1,7 @@
 """Worlds by the thousand: the bits of single solves, whatever layout, precision, threads and bad neighbours."""
 
 import copy
+import dataclasses
 import pickle
 
 import numpy as np
@@ -229,7 +230,25 @@ def test_a_world_has_the_bits_of_its_single_solve(name):
                 found.relative[i], found.energy[i], found.velocity_error[i], found.worst_row[i], found.verdict[i],
                 found.roundoff_floor[i],
             )  # fmt: skip
-            assert found[i].verdict == one.verdict
+            own = found[i]
+            assert (str(own), own.verdict, own.rounding) == (str(one), one.verdict, one.rounding)
+            for field in dataclasses.fields(one):
+                if field.name != "_problem":
+                    np.testing.assert_array_equal(getattr(own, field.name), getattr(one, field.name), field.name)
+
+
+def test_first_numbers_of_a_world_are_read_from_the_arrays(monkeypatch):
+    """The problem of a world, which takes longer than many solves, is built only for its rows and names."""
+    batch = lv.Batch(*worlds(3), cones=DISKS)
+    many = lv.solve_many(batch, impulse=np.ones((3, 12)))
+    found = lv.residual_many(batch, 0.9 * many.impulse)
+    with monkeypatch.context() as patch:
+        patch.delattr(lv.Batch, "get_world")
+        for i in range(3):
+            assert many[i].success and many[i].residual.relative == many.relative[i]
+            assert many[i].impulse.tolist() == many.impulse[i].tolist() and many[i].start == "the given impulses"
+            assert (found[i].relative, found[i].worst_row) == (found.relative[i], found.worst_row[i])
+    assert found[1].worst_name == batch[1].row_name(found.worst_row[1])
 
 
 def test_batch_reads_its_arrays_at_each_solve():
