@@ -11,6 +11,7 @@ from lavender.base.errors import InputError
 from lavender.cli.completion import complete_case_or_file, complete_solver
 from lavender.cli.options import (
     ErrorReporter,
+    ListCommand,
     ListType,
     is_option_set,
     limit_to_one_thread,
@@ -32,7 +33,7 @@ NARROW_CHECK_OMITS = (
 )  # fmt: skip
 
 
-@click.command()
+@click.command(cls=ListCommand)
 @click.argument(
     "files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...", shell_complete=complete_case_or_file
 )

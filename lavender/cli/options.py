@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -53,6 +53,55 @@ class ListType(_ParamType):
             return self.fail(
                 f"{value!r} is not a list of {'whole ' if self.kind is int else ''}numbers", param, ctx
             )
+
+
+def _is_number(word: str) -> bool:
+    """Return whether a word is a number."""
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _is_solver(word: str) -> bool:
+    """Return whether a word names a solver, perhaps misspelt, and no family of the suite and no file."""
+    from lavender import suite
+
+    return word not in suite.FAMILIES and not set(word) & set("(*?[/\\.") and not Path(word).exists()
+
+
+def _is_order(word: str) -> bool:
+    """Return whether a word names a sweep order."""
+    from lavender.problem.ordering import SWEEP_ORDERS
+
+    return word.partition(":")[0] in SWEEP_ORDERS
+
+
+class ListCommand(click.Command):
+    """Command that takes lists with blanks, `--budgets 4 8`, as well as with commas, `--budgets 4,8`."""
+
+    #: Options with lists: whether a word after the first one belongs to the list.
+    TESTS: Mapping[str, Callable[[str], bool]] = {
+        **dict.fromkeys(("--tolerances", "--budgets", "--time-budgets"), _is_number),
+        "--solvers": _is_solver,
+        "--orders": _is_order,
+    }
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Join the words of each list by commas, then parse as click does."""
+        joined: list[str] = []
+        belongs: Callable[[str], bool] | None = None
+        for i, word in enumerate(args):
+            if belongs and args[i - 1] not in self.TESTS and not word.startswith("-") and belongs(word):
+                joined[-1] += f",{word}"
+                continue
+            joined.append(word)
+            if word in self.TESTS:
+                belongs = self.TESTS[word]
+            elif i == 0 or args[i - 1] not in self.TESTS:
+                belongs = None
+        return super().parse_args(ctx, joined)
 
 
 def limit_to_one_thread() -> None:

@@ -17,6 +17,7 @@ from lavender.cli.measuring import Measured, is_campaign, measure_files, show_pr
 from lavender.cli.options import (
     PATH,
     RECORDING_NAMES,
+    ListCommand,
     ListType,
     describe_solvers,
     exit_after_interrupt,
@@ -32,7 +33,7 @@ from lavender.io.start_states import MODEL_SUFFIXES
 from lavender.io.stored import check_writable
 
 
-@click.command()
+@click.command(cls=ListCommand)
 @click.argument(
     "files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...", shell_complete=complete_case_or_file
 )

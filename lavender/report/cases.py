@@ -27,7 +27,6 @@ from lavender.problem.derived import cached_property
 from lavender.report.case_kinds import make_case
 from lavender.report.store import CASE_COLUMNS, Row
 from lavender.report.text import escape_unprintable, make_file_name
-from lavender.solvers import registry
 from lavender.suite import Case
 
 # Archives in the folder of an audit that do not hold problems.
@@ -123,10 +122,6 @@ def resolve_sources(sources: Source | Iterable[Source], sequences: bool | None =
                 "or a Problem is needed"
             )
         elif not is_path(source) and not sequences:
-            if source in registry.known() and source not in suite.FAMILIES:
-                raise InputError(
-                    f"{source} is a solver and no case: give solvers as `--solvers pgs,{source}`"
-                )
             items += _list_items_of_set(str(source))
         elif sequences or (sequences is None and _holds_recorded_steps(Path(source))):
             items += _list_recorded_steps(Path(source), items)
