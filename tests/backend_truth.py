@@ -1,12 +1,5 @@
-"""Random quadratic programs and LCPs, their KKT errors in 50 digits, and calls of backends without this package.
+"""Random quadratic programs and LCPs, their KKT errors in 50 digits, and calls of backends without this package."""
 
-    python tests/backend_truth.py --programs 400 --lcps 200 --seconds 600
-
-compares each backend's answer by this package with the answer of the backend called alone through qpsolvers.
-"""
-
-import argparse
-import time
 import warnings
 
 import mpmath
@@ -158,55 +151,3 @@ def call_here(program, name, is_lcp, tol=TOL):
         return compute_kkt_error(program, x, z_box=-np.maximum(A @ x - b, 0.0)), solution
     answer = lv.solve_qp(lv.Problem.from_qp(**program), name, tol=tol)
     return compute_kkt_error(program, answer.x, answer.y, answer.z, answer.z_box), answer.solution
-
-
-def compare_backends(draws, names, seconds=np.inf, tol=TOL):
-    """Yield (draw, name, error here, error alone, solution) until `seconds` have passed."""
-    end = time.monotonic() + seconds
-    for kind, seed in draws:
-        program = draw_program(seed) if kind == "program" else draw_lcp(seed)
-        for name in names:
-            if time.monotonic() > end:
-                return
-            alone = call_alone(program, name, tol)
-            try:
-                here, solution = call_here(program, name, kind == "lcp", tol)
-            except lv.CapabilityError:
-                continue
-            yield (kind, seed), name, here, alone, solution
-
-
-def main():
-    """Print each answer that is farther from the KKT conditions than allowed, and the counts of each backend."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--programs", type=int, default=400)
-    parser.add_argument("--lcps", type=int, default=200)
-    parser.add_argument("--seconds", type=float, default=600.0)
-    parser.add_argument("--backends", default="")
-    parser.add_argument("--tol", type=float, default=TOL)
-    args = parser.parse_args()
-    import qpsolvers
-
-    names = args.backends.split(",") if args.backends else qpsolvers.available_solvers
-    n = max(args.programs, args.lcps)
-    draws = [(k, s) for s in range(n) for k, m in (("program", args.programs), ("lcp", args.lcps)) if s < m]
-    columns = "runs", "worse", "alone fails", "not solved", "contradicted", "right but contradicted"
-    counts = {name: dict.fromkeys(columns, 0) for name in names}
-    last = None
-    for draw, name, here, alone, solution in compare_backends(draws, names, args.seconds, args.tol):
-        count, last = counts[name], draw
-        count["runs"] += 1
-        count["alone fails"] += not alone <= 1e3 * args.tol
-        count["not solved"] += not here <= args.tol
-        count["contradicted"] += solution.is_contradicted
-        count["right but contradicted"] += solution.is_contradicted and here <= args.tol
-        if here > max(MAX_RATIO * alone, args.tol):
-            count["worse"] += 1
-            print(f"{draw} {name}: {here:.1e} here, {alone:.1e} alone, {solution.status.name}: {solution.message}")
-    print(f"last draw {last}")
-    for name, count in counts.items():
-        print(name, ", ".join(f"{k} {v}" for k, v in count.items()))
-
-
-if __name__ == "__main__":
-    main()

@@ -82,20 +82,3 @@ def test_lanes_solve_most_worlds(width):
     assert many.success[1:].all()  # No impulse moves the empty rows of world 0.
     assert lv.residual_many(batch, many.impulse).relative[1:].max() <= 1e-6
     assert np.median(many.iterations) <= 5  # Newton steps over velocities are twice as many.
-
-
-def test_invalid_world_in_a_lane_has_an_error_of_its_own(width):
-    rng = np.random.default_rng(0)
-    jac, mass, free = (
-        rng.standard_normal((16, 12, 18)),
-        np.tile(np.eye(18) + 0.1, (16, 1, 1)),
-        rng.standard_normal((16, 18)),
-    )
-    cones = lv.Cones.contacts(0.6, count=4)
-    valid = lv.solve_many(lv.Batch(jac, mass, free, cones=cones)).impulse
-    jac[5, 1, 1], mass[9, 0, 0] = np.nan, -1.0
-    many = lv.solve_many(lv.Batch(jac, mass, free, cones=cones), errors="status")
-    assert sorted(many.faults) == [5, 9]
-    assert np.isnan(many.impulse[[5, 9]]).all()
-    others = np.setdiff1d(np.arange(16), [5, 9])
-    assert many.impulse[others].tobytes() == valid[others].tobytes()

@@ -3,7 +3,6 @@
 import json
 import os
 import re
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -99,22 +98,6 @@ def test_residual_many_arrays_equal_the_numbers_of_single_residuals(kind):
     if isinstance(worlds, lv.Batch):
         for i, problem in enumerate(worlds):
             assert worlds.start(i).tolist() == problem.start().tolist()
-
-
-def test_solve_many_invalid_world_between_valid_ones_has_no_numbers():
-    batch = draw_worlds("batch")
-    assert (np.abs([s.impulse for s in lv.solve_many(batch)]).max(axis=1) > 0.0).all()
-    free = np.array([p.generalized.v_free for p in batch])
-    free[2] = np.nan
-    jac, mass = (np.array([getattr(p.generalized, n).toarray() for p in batch]) for n in ("jac", "mass"))
-    start = np.full((6, 6), 0.1)
-    start[4, 3] = np.inf
-    many = lv.solve_many(lv.Batch(jac, mass, free, cones=batch[0].cones), impulse=start, errors="status")
-    assert sorted(many.faults) == [2, 4]
-    for i in (2, 4):
-        assert many.status[i] is lv.Status.INVALID_PROBLEM and f"world {i}" in str(many.faults[i])
-        assert (many.iterations[i], many.worst_row[i]) == (0, -1)
-        assert np.isnan(many.velocity[i]).all() and np.isnan(many.impulse[i]).all()
 
 
 def test_velocity_tol_accepts_what_is_within_it_from_every_end_that_claims_nothing_else():
@@ -804,25 +787,6 @@ def test_sweeps_move_a_pinned_body_that_turns_in_every_order(order):
         np.testing.assert_allclose(found, expected, atol=1e-8)
 
 
-def test_row_builder_bulk_contacts_have_the_names_and_rows_of_single_calls():
-    names, points = ["z", "a", "m"], np.array([[0.0, 0.1, 0.0], [0.2, 0.0, 0.0], [-0.2, 0.3, 0.0]])
-    problems = []
-    for bulk in (True, False):
-        builder = lv.RowBuilder(np.ones(3), [np.eye(3)] * 3, np.zeros((3, 6)), 0.01, position=np.zeros((3, 3)))
-        if bulk:
-            builder.contacts(
-                [[-1, 2], [-1, 0], [-1, 1]], points, [[0.0, 0.0, 1.0]] * 3, mu=[0.1, 0.2, 0.3], names=names
-            )
-        else:
-            for body, point, mu, name in zip([2, 0, 1], points, [0.1, 0.2, 0.3], names, strict=True):
-                builder.contact(-1, body, point, [0.0, 0.0, 1.0], mu=mu, name=name)
-        problems.append(builder.problem())
-    one, other = problems
-    assert [one.block_name(i) for i in range(3)] == names == [other.block_name(i) for i in range(3)]
-    np.testing.assert_array_equal(one.dense(), other.dense())
-    np.testing.assert_array_equal(one.cones.mu, other.cones.mu)
-
-
 @pytest.mark.parametrize("suffix", [".npz", ".hdf5"])
 def test_write_that_fails_leaves_no_file_behind(suffix, tmp_path, monkeypatch):
     def fail(*_):
@@ -877,15 +841,3 @@ def test_solution_that_meets_tol_at_its_iteration_limit_is_converged(seed):
         for n in (*range(1, 30), 45, 77, 130):
             solution = lv.solve(problem, name, tol=1e-2, max_iter=n)
             assert solution.success == (solution.status is lv.Status.CONVERGED), f"{name}, {n}: {solution}"
-
-
-@pytest.mark.parametrize("name", ["auto", "newton", "pgs", "sequential_impulses", "nncg"])
-def test_prepared_problem_solved_twice_gives_the_bits_of_two_solves(name):
-    problem = random_contact_problem(1)
-    problem = replace(problem, guess=lv.solve(problem, tol=1e-2).impulse)
-    for more in ({}, {"max_iter": 3, "tol": 1e-14}):
-        prepared, expected = lv.prepare(problem, name), lv.solve(problem, name, **more)
-        for _ in range(2):
-            found = prepared.solve(**more)
-            assert found.impulse.tobytes() == expected.impulse.tobytes()
-            assert found.iterations == expected.iterations and found.status is expected.status

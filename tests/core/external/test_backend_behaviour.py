@@ -14,7 +14,7 @@ from lavender.report.timing import Task, make_row
 from lavender.solvers import registry
 
 OBSERVED = {b.name: b for b in backends.BACKENDS if b.behaviour is not None}
-N_DRAWS = 12  # Three programs of each kind; `python tests/backend_truth.py --kinds 200` draws more.
+N_DRAWS = 12  # Three programs of each kind.
 
 
 def mark_slow(names):

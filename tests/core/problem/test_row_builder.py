@@ -341,14 +341,16 @@ def test_row_builder_with_arrays_of_blocks_has_the_bits_of_single_calls(dimensio
     for block_type in rng.permutation(list(ARRAYS)):
         pairs = [(-1, 0), (0, 1), (0, 1), (2, -1)]
         values = draw_arguments(rng, block_type, n, dimensions)
+        names = {"names": [f"{letter} {block_type}" for letter in "zamb"]} if seed % 2 else {}
         for i, (a, b) in enumerate(pairs):
             one = {name: x[i].tolist() for name, x in values.items()}
+            one |= {"name": names["names"][i]} if names else {}
             single_keys.append(getattr(single, block_type)(a, b, **one))
         if block_type == "contact":
             points, normals = values.pop("point"), values.pop("normal")
-            array_keys += arrays.contacts(pairs, points, normals, **values).tolist()
+            array_keys += arrays.contacts(pairs, points, normals, **values, **names).tolist()
         else:
-            array_keys += arrays.joints(block_type, pairs, **values).tolist()
+            array_keys += arrays.joints(block_type, pairs, **values, **names).tolist()
     assert array_keys == single_keys
     first, second = single.problem(), arrays.problem()
     assert first == second and first.b.tobytes() == second.b.tobytes()

@@ -1,4 +1,7 @@
-"""The contract finds deliberate mistakes: one solver in NumPy, and each of its variants with one mistake."""
+"""The contract finds deliberate mistakes: one solver in NumPy, and each of its variants with one mistake.
+
+`FAULTS` also have the check that must fail, and words of its sentence.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -26,6 +29,9 @@ class Sweeps:
     mistake = ""
     count = 0  # Sweeps of all solves.
 
+    def __init__(self, order="given", ground=None, seed=0):
+        self.order, self.seed = order, seed
+
     def prepare(self, problem):
         return State(problem, problem.dense(), problem.b, problem.cones)
 
@@ -39,6 +45,24 @@ class Sweeps:
         for name in kept.get(self.mistake, ()):
             setattr(new, name, getattr(state, name))
         return new
+
+    def list_units(self, state):
+        """Return the first rows of contacts, and all other rows, in the order of a sweep."""
+        c = state.cones
+        units = np.union1d(c.ptr[:-1], np.flatnonzero(~c.contact_rows))
+        if self.order == "random":
+            return np.random.default_rng([self.seed, state.done]).permutation(units)
+        orders = {"reverse": units[::-1], "colored": np.r_[units[::2], units[1::2]]}
+        return orders.get(self.order, units)
+
+    def find_end(self, state, x, tol):
+        """Return the status of a solve that ends before this sweep, or None."""
+        if tol == 0.0 and self.mistake != "stops at zero error":
+            return None
+        relative = self.measure(state, x)
+        if relative <= (tol or 1e-15):
+            return lv.Status.CONVERGED
+        return None if relative < 1e12 else lv.Status.DIVERGED
 
     def measure(self, state, x):
         """Return the number that the solver compares with tol."""
@@ -58,11 +82,10 @@ class Sweeps:
             x[:] = state.problem.start()
         before = x.copy()
         for k in range(n + (self.mistake == "one iteration more" and n > 1)):
-            relative = self.measure(state, x) if tol > 0.0 or self.mistake == "stops at zero error" else 1.0
-            if relative <= (tol or 1e-15):
+            if status := self.find_end(state, x, tol):
                 if self.mistake == "returns the iterate before the judged one":
                     x[:] = before
-                return self.claim(lv.Status.CONVERGED, k)
+                return self.claim(status, k)
             before = state.before = x.copy()
             if self.mistake == "every fourth sweep of a run is skipped" and k % 4 == 3:
                 continue
@@ -76,20 +99,19 @@ class Sweeps:
         work = {"sweeps": 1 if self.mistake == "counts one sweep" else n}
         if self.mistake == "counts no work":
             work = {}
-        return lv.Claim(status, n, work)
+        return lv.Claim(status, n, work, "the error grew" if status is lv.Status.DIVERGED else "")
 
     def sweep(self, state, x):
         A, b, c, m = state.A, state.b, state.cones, self.mistake
-        for i in range(c.n_blocks):
-            first, end = c.ptr[i], c.ptr[i + 1]
+        for first in self.list_units(state):
+            i = np.searchsorted(c.ptr, first, side="right") - 1
             if c.kind[i] == ROW:
-                for q in range(first, end):
-                    low, high = c.lower[q], c.upper[q]
-                    low = 0.0 if m == "a lower bound above zero is zero" and low > 0.0 else low
-                    high = 0.0 if m == "an upper bound below zero is zero" and high < 0.0 else high
-                    high = np.inf if m == "upper bounds are ignored" else high
-                    low = -high if m == "bounds are symmetric" and 0.0 < high < np.inf else low
-                    x[q] = min(max(low, x[q] - (A[q] @ x - b[q]) / state.problem.d[q]), high)
+                low, high = c.lower[first], c.upper[first]
+                low = 0.0 if m == "a lower bound above zero is zero" and low > 0.0 else low
+                high = 0.0 if m == "an upper bound below zero is zero" and high < 0.0 else high
+                high = np.inf if m == "upper bounds are ignored" else high
+                low = -high if m == "bounds are symmetric" and 0.0 < high < np.inf else low
+                x[first] = min(max(low, x[first] - (A[first] @ x - b[first]) / state.problem.d[first]), high)
                 continue
             x[first] = max(0.0, x[first] - (A[first] @ x - b[first]) / A[first, first])
             for rows, bound in self.components(c, i):
@@ -127,11 +149,14 @@ class Sweeps:
             yield np.arange(roll, roll + 2), mu if m == "rolling is bounded by mu" else c.rolling[i]
 
 
+ROWS = frozenset({"linear", "lcp"})
 SPEC = lv.SolverSpec(
     "numpy_sweeps", Sweeps, laws=frozenset({"linear", "lcp", "coulomb"}), box_friction_laws=frozenset({"coulomb"}),
-    operators=frozenset({"matrix"}), supports_rolling=True, max_iter=5000,
-    refusal=lambda p: None if p.is_symmetric else "needs a symmetric A", summary="projected Gauss-Seidel in NumPy",
+    operators=frozenset({"matrix"}), supports_rolling=True, max_iter=5000, order=True, seed=True,
+    refusal=lambda p: None if p.is_symmetric or p.law in ROWS else "needs a symmetric A",
+    summary="projected Gauss-Seidel in NumPy",
 )  # fmt: skip
+OF_ROWS = replace(SPEC, laws=ROWS, box_friction_laws=frozenset(), supports_rolling=False)
 MISTAKES = (
     "a lower bound above zero is zero", "an upper bound below zero is zero", "upper bounds are ignored",
     "bounds are symmetric", "discs are squares", "boxes are squares", "planar friction is doubled",
@@ -163,3 +188,165 @@ def test_contract_finds_a_solver_with_one_mistake(mistake, monkeypatch):
 
 def test_contract_is_met_by_the_solver_without_a_mistake(monkeypatch):
     assert find_unmet("", monkeypatch) == ""
+
+
+class StopsAtTwo(Sweeps):
+    def find_end(self, state, x, tol):
+        return lv.Status.CONVERGED if state.done >= 2 else None
+
+    def claim(self, status, n):
+        return lv.Claim(status, n, {"sweeps": n + 1})
+
+
+class MisnamesWork(Sweeps):
+    def claim(self, status, n):
+        return lv.Claim(status, n, {"passes": n})
+
+
+class IgnoresOrder(Sweeps):
+    def list_units(self, state):
+        self.order = "given"
+        return super().list_units(state)
+
+
+class IgnoresSeed(Sweeps):
+    def list_units(self, state):
+        self.seed = 0
+        return super().list_units(state)
+
+
+class SpendsMore(Sweeps):
+    def run(self, state, impulse, n, tol, time_limit=None):
+        return super().run(state, impulse, max(n, 2), tol)
+
+
+class RaisesOnNothing(Sweeps):
+    def prepare(self, problem):
+        problem.d.max()
+        return super().prepare(problem)
+
+
+class Silent(Sweeps):
+    def run(self, state, impulse, n, tol, time_limit=None):
+        return lv.Claim(lv.Status.NUMERICAL_ERROR, 0, {"sweeps": 1})
+
+
+class NoZeros(Sweeps):
+    def prepare(self, problem):
+        if not problem.dense().any(axis=1).all():
+            raise ValueError("a row of A is zero")
+        return super().prepare(problem)
+
+
+class Option(Sweeps):
+    def __init__(self, order="given", ground=None, seed=0, extra=1):
+        super().__init__(order, ground, seed)
+
+
+class SingleNorm(Sweeps):
+    """Its stop test divides one norm of the error over all rows by one norm of b."""
+
+    def measure(self, state, x):
+        p = state.problem
+        step = np.clip(x - (state.A @ x - p.b) / p.d, p.cones.lower, p.cones.upper) - x
+        return 100.0 * np.linalg.norm(p.d * step) / max(np.linalg.norm(p.b), 1e-300)
+
+
+class Symmetrises(Sweeps):
+    """It solves with (A + A^T)/2, and its claims are true."""
+
+    def prepare(self, problem):
+        state = super().prepare(problem)
+        state.A = 0.5 * (state.A + state.A.T)
+        return state
+
+
+class SinglePrecision(Sweeps):
+    def sweep(self, state, x):
+        super().sweep(state, x)
+        x[:] = x.astype(np.float32)
+
+
+class CachesBySize(Sweeps):
+    """The objects share the matrices of earlier problems of the same size."""
+
+    cache = {}  # noqa: RUF012 - shared by all objects on purpose
+
+    def prepare(self, problem):
+        state = super().prepare(problem)
+        state.A = self.cache.setdefault(problem.m, state.A)
+        return state
+
+
+class Deadband(Sweeps):
+    """It leaves out the rows whose b is below a thousandth of the largest."""
+
+    def list_units(self, state):
+        b = np.abs(state.problem.b)
+        return [q for q in super().list_units(state) if b[q] >= 1e-3 * b.max()]
+
+
+#: Faulty solver, the check that must fail, and words of its sentence.
+FAULTS = [
+    (SingleNorm, "problems_are_solved", "for two islands whose b differ by 1e6 (law lcp) the result is"),
+    (Symmetrises, "problems_are_solved", "for an asymmetric A (law lcp) the result is"),
+    (SinglePrecision, "problems_are_solved", "CONVERGED and lv.residual"),
+    (CachesBySize, "problems_are_solved", "the result is"),
+    (Deadband, "problems_are_solved", "for two islands whose b differ by 1e6"),
+    (Silent, "problems_are_solved", "A failure has no message"),
+    (NoZeros, "problems_are_solved", "a row of A is zero"),
+    (RaisesOnNothing, "problems_are_solved", "was raised in"),
+    (MisnamesWork, "problems_are_solved", "Its work must count one of backend_calls"),
+    (Option, "options_match_the_spec", "the options extra are in the spec or in the factory, not in both"),
+    (SpendsMore, "budgets_are_kept", "max_iter=1"),
+    (StopsAtTwo, "budgets_are_kept", "or the claim is wrong"),
+    (StopsAtTwo, "interruptions_return_the_iterate", "TIME_LIMIT after at least 1 iteration is required"),
+    (IgnoresOrder, "orders_change_the_sweep", "give the same bits after 2 sweeps"),
+    (IgnoresSeed, "orders_change_the_sweep", "give the same bits after 2 sweeps"),
+]
+
+
+def failure(spec, name):
+    return find_failure(spec, contract.CHECKS[name]).text
+
+
+@pytest.mark.parametrize("factory, check, words", FAULTS, ids=[f"{f.__name__}-{c}" for f, c, _ in FAULTS])
+def test_contract_of_a_faulty_solver_names_the_unmet_check(register, factory, check, words):
+    spec = replace(OF_ROWS, factory=factory)
+    register(spec)
+    sentence = failure(spec, check)
+    assert words in sentence
+    assert "np." not in sentence and "assert" not in sentence
+
+
+@pytest.mark.parametrize(
+    "check, more, words",
+    [
+        ("options_match_the_spec", {"options": {"omega": "a factor"}}, "the options omega are in the spec or"),
+        ("problems_are_solved", {"laws": {"lcp", "cone"}, "refusal": lambda p: "no" * (p.law == "cone")},
+         "the spec lists the law cone, but refuses every problem with it"),
+        ("budgets_are_kept", {"refusal": lambda p: "never"}, "the law linear, but refuses every problem with it"),
+    ],
+)  # fmt: skip
+def test_contract_of_a_wrong_spec_names_the_unmet_check(register, check, more, words):
+    spec = replace(OF_ROWS, **more)
+    register(spec)
+    assert words in failure(spec, check)
+
+
+def test_checks_apply_to_listed_capabilities_only():
+    spec = replace(SPEC, order=False, seed=False, resumable=False, callback=False, history=False)
+    names = {check.name for check in contract.list_checks(spec)}
+    assert not names & {"orders_change_the_sweep", "interruptions_return_the_iterate"}
+    assert "problems_are_solved" in names
+
+
+@pytest.mark.parametrize("name", ["my solver", "a\nb"])
+def test_register_name_with_other_characters_raises(name):
+    with pytest.raises(lv.InputError, match="letters, digits"):
+        lv.register(replace(SPEC, name=name))
+
+
+def test_unknown_solver_initials_suggest_the_name_with_these_initials():
+    with pytest.raises(lv.UnknownName, match="did you mean 'sequential_impulses'"):
+        lv.solve(lv.Problem.lcp(np.eye(2), [1.0, 1.0]), "si")

@@ -6,7 +6,6 @@ import signal
 import threading
 import time
 import weakref
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -73,25 +72,6 @@ def test_ctrl_c_during_solve_many_starts_no_more_problems(solver, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         lv.solve_many([dataclasses.replace(TINY, copy=False) for _ in range(n)], solver, threads=2)
     assert 1 <= len(begun) < n / 2
-
-
-@pytest.mark.parametrize("solver", ["auto", "newton", "pgs"])
-@pytest.mark.parametrize("form", ["matrix", "jacobian"])
-def test_prepared_solve_of_another_b_has_the_bits_of_a_new_problem(solver, form):
-    rng = np.random.default_rng(3)
-    jac, mass, free = rng.normal(size=(6, 9)), np.diag(rng.uniform(1.0, 2.0, 9)), rng.normal(size=9)
-    if form == "matrix":
-        problem = lv.Problem.contact(jac @ jac.T + 0.1 * np.eye(6), rng.normal(size=6), 0.5)
-    else:
-        problem = lv.Problem.from_jacobian(jac, mass, free, mu=0.5, compliance=0.01)
-    prepared = lv.prepare(problem, solver)
-    for _ in range(3):
-        b = problem.b + 0.1 * rng.normal(size=6)
-        own, single = prepared.solve(b=b), lv.solve(replace(problem, b=b), solver)
-        assert own.impulse.tobytes() == single.impulse.tobytes()
-        assert own.success and own.residual.relative == single.residual.relative
-        assert prepared.problem.b.tolist() == b.tolist()
-    assert prepared.solve().impulse.tobytes() == single.impulse.tobytes()  # b stays.
 
 
 def test_prepared_solve_of_another_velocity_keeps_the_targets():
