@@ -135,7 +135,7 @@ def report(
         if not records_files:
             measured = measure_files(context, files, path, watch)
         # These modules import pandas, which only a report needs.
-        from lavender.report.findings import Report, list_skip_reasons, print_report, write
+        from lavender.report.findings import Report, print_report, write
         from lavender.report.page import DEFAULT_ERROR_LIMIT
         from lavender.report.tables import read_engine_answers
 
@@ -170,7 +170,8 @@ def report(
         print_escaped("Stopped; the same command continues from here.", style="yellow")
         raise click.exceptions.Exit(EXIT_INTERRUPTED)
     if not (records_files or len(shown.runs)):
-        print_escaped(f"nothing was measured: {'; '.join(list_skip_reasons(shown.skips))}", style="yellow")
+        reasons = "; ".join(dict.fromkeys(shown.skips["reason"]))
+        print_escaped(f"nothing was measured: {reasons}", style="yellow")
         raise click.exceptions.Exit(EXIT_UNMET)
     if (n_left_out := sum(map(len, shown.left_out.values()))) and not records_files:
         print_escaped(

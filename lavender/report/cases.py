@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import math
@@ -181,7 +182,7 @@ def list_steps_in_folder(folder: str | Path) -> list[Item]:
     if len(paths) < 2:
         n = f"{len(paths)} problem files ({', '.join(SUFFIXES)})"
         raise InputError(f"{folder} holds {n}; a sequence needs two")
-    lines = {str(line["file"]): line for line in _read_engine_records(folder)}
+    lines = {str(line.get("file")): line for line in read_engine_lines(folder)}
     has_worlds = any("world" in line for line in lines.values())
     # The files of a `Recorder` end with the number of the world, and its lines have the number of the step.
     numbered = [m.groups() for p in paths if (m := re.fullmatch(r"(.*?)(\d+)", p.stem)) and not has_worlds]
@@ -213,19 +214,24 @@ def list_steps_in_folder(folder: str | Path) -> list[Item]:
     ]
 
 
-def _read_engine_records(folder: Path) -> list[dict[str, Any]]:
-    """Read the engine's data of the steps in a folder, each with its "file"; empty if a line cannot be read."""
-    try:
+def read_engine_lines(folder: Path) -> list[dict[str, Any]]:
+    """Return the last line for each file of a folder's `engine.jsonl`, without those that are not JSON.
+
+    A C engine that runs again into the same folder replaces the files and appends further lines.
+    """
+    lines: list[Any] = []
+    if (folder / ENGINE).is_file():
         text = read_whole_file(folder / ENGINE, "the engine's answers").decode(errors="replace")
-        lines = [dict(json.loads(line)) for line in text.splitlines()]
-        return lines if all("file" in line for line in lines) else []
-    except (ValueError, TypeError, RecursionError):
-        return []
+        for line in text.splitlines():
+            with contextlib.suppress(ValueError, RecursionError):
+                lines.append(json.loads(line))
+    lines = [line for line in lines if isinstance(line, dict)]
+    return list({str(line.get("file", i)): line for i, line in enumerate(lines)}.values())
 
 
 def _read_unrecorded_steps(folder: Path) -> dict[Path, str]:
     """Return {file: reason} for steps that could not be recorded."""
-    lost = [line for line in _read_engine_records(folder) if "left_out" in line]
+    lost = [line for line in read_engine_lines(folder) if "left_out" in line and "file" in line]
     steps = {folder / Path(str(line["file"])).name: str(line["left_out"]) for line in lost}
     return {path: reason for path, reason in steps.items() if not path.exists()}
 
@@ -261,7 +267,7 @@ def _holds_recorded_steps(folder: Path) -> bool:
     assign impulses to the same blocks; states that have nothing in common are single cases.
     """
     paths = _list_problem_files(folder) if folder.is_dir() else []
-    lines = [line for line in _read_engine_records(folder) if "left_out" not in line]
+    lines = [line for line in read_engine_lines(folder) if "left_out" not in line]
     if any("world" in line for line in lines):
         return len(paths) > 1 and all("every" in line for line in lines)
     if len(paths) < 2 or len({re.sub(r"\d+$", "", p.stem) for p in paths}) > 1:

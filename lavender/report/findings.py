@@ -149,16 +149,7 @@ class Report(Contents):
         texts = [*texts[:1], *(text.replace(" takes", "") for text in texts[1:])]
         tied = f"{_join(ties)} tie{'s' * (len(ties) == 1)} with it" if len(ties) else ""
         text = "; ".join(filter(None, (tied, f"{', '.join(texts)} that time" if texts else "")))
-        same, n = int((self.ranking["solved"] == row["solved"]).sum()) - 1, len(self.subject)
-        last = ""
-        if len(self.ranking) == same + 1:
-            pass  # No solver remains of which to say anything.
-        elif n > 1 and same <= 3:
-            last = f"no other solver solves {f'all {n}' if row['solved'] == n else 'as many'}"
-        elif same == 0:
-            last = "no other solver solves it"
-        text = "; ".join(filter(None, (text, last)))
-        return f"{text.replace('no', 'No', 1) if text.startswith('no other') else text}." if text else ""
+        return f"{text}." if text else ""
 
     def _describe_single_wins(self) -> str:
         """Return on how many problems which other solvers are faster, and the largest factor."""
@@ -210,42 +201,22 @@ class Report(Contents):
         runs = runs[runs["tol"] == runs["tol"].max()]
         if not len(runs):
             return f"{text}Each step is solved cold."
-        names = ["case", "solver", "tol", "iterations", "solution_hash"]
-        cold = set(
-            self.frame.loc[self.frame["start"] == "cold", names]
-            .astype(str)
-            .itertuples(index=False, name=None)
-        )
-        n = sum(run not in cold for run in runs[names].astype(str).itertuples(index=False, name=None))
         carrying = runs["carry_time"].mean()
         mapping = f" (mapping takes {format_time(carrying)} a step, not included)" if carrying > 0.0 else ""
-        changed = f"which changed {n} of {len(runs)} solves"
-        return f"{text}Each step starts from the impulses of the step before{mapping}, {changed}."
+        return f"{text}Each step starts from the impulses of the step before{mapping}."
 
     def _describe_engine(self) -> str:
-        """Return the errors of the engine's own answers, and its place if it is ranked."""
+        """Return the errors of the engine's own answers; the tables have its times."""
         answers = tables.read_own_answers(self)
-        parts = []
-        if len(answers):
-            worst = answers.loc[answers["velocity"].idxmax()]
-            above = int((answers["velocity"] > self.error_limit).sum())
-            parts.append(
-                f"leaves up to {format_speed(worst['velocity'])} ({worst['worst'] or worst['file']}), above "
-                f"{format_speed(self.error_limit)} in {above} of {format_count(len(answers), 'answer')}"
-            )
-        if ENGINE_NAME in self.ranking.index:
-            row, n = self.ranking.loc[ENGINE_NAME], len(self.subject)
-            place = (
-                "ties with the first"
-                if row["tie"] and self.ranking["tie"].sum() > 1
-                else f"has place {row['place']}"
-            )
-            solved = f"{row['solved']} of {n} to {format_power(self.tolerance)}"
-            parts.append(
-                f"{place}: {solved}, in {format_time(row['mean'])} on average, without copy and judge"
-            )
-        name = tables.get_engine_name(answers if len(answers) else self.engines) if parts else ""
-        return f"Your engine's own {name} {'; it '.join(parts)}." if parts else ""
+        if not len(answers):
+            return ""
+        worst, name = answers.loc[answers["velocity"].idxmax()], str(answers["solver"].mode()[0])
+        above = int((answers["velocity"] > self.error_limit).sum())
+        return (
+            f"Your engine's own {name.replace('NEWTON', 'Newton')} leaves up to {format_speed(worst['velocity'])} "
+            f"({worst['worst'] or worst['file']}), above {format_speed(self.error_limit)} in {above} of "
+            f"{format_count(len(answers), 'answer')}."
+        )
 
     @cached_property
     def code(self) -> tuple[str, ...]:
@@ -283,23 +254,17 @@ class Report(Contents):
     @cached_property
     def warnings(self) -> list[str]:
         """Sentences on a busy machine, missing times, cases that are left out, and possible mistakes in data."""
+        shows_times = self.busy and not self.is_campaign and not self.is_sweep_study
         return [
-            *(
-                [f"{self.busy} The times are invalid; measure again with --no-reuse."]
-                if self._shows_times
-                else []
-            ),
+            *([f"{self.busy} The times are invalid; measure again with --no-reuse."] if shows_times else []),
             *(["Error and robustness without times: runs end by iterations."] if self.is_campaign else []),
-            *([f"Not measured to the end: {_join(self.unfinished)}."] if self.unfinished else []),
-            *_limit("left out", [f"{cases}: {reason}" for cases, reason in list_cases_not_loaded(self)]),
+            *_limit(
+                "left out",
+                [f"{r.case}: {r.reason}" for r in self.skips[self.skips["solver"] == ""].itertuples()],
+            ),
             *_limit("gains energy", list_energy_gains(self)),
             *_limit("suspicious", [f"{case}: {reason}" for case, reason in list_diagnostics(self)]),
         ]
-
-    @property
-    def _shows_times(self) -> bool:
-        """Whether the machine was busy and the first screen shows times, which then are void."""
-        return bool(self.busy and not self.is_campaign and not self.is_sweep_study)
 
     @property
     def is_sweep_study(self) -> bool:
@@ -769,33 +734,3 @@ def list_diagnostics(report: Report) -> list[tuple[str, str]]:
         more = f", {n} of {format_count(steps[name], 'step')}" if n > 1 else ""
         found.append((f"{same['case'].iloc[0]}{more}", str(same["diagnostics"].iloc[0])))
     return found
-
-
-def _group_by_reason(skips: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    """Group skips by their reason without the name of the case."""
-    pairs = zip(skips["case"], skips["reason"], strict=True)
-    reasons = [text.removeprefix("did not load: ").removeprefix(f"{case}: ") for case, text in pairs]
-    return {str(reason): same for reason, same in skips.groupby(reasons, sort=False)}
-
-
-def list_skip_reasons(skips: pd.DataFrame) -> list[str]:
-    """Return each different reason of some skips; if it holds for several cases, with their number."""
-    groups = [
-        (r, same["case"].nunique(), same["reason"].iloc[0]) for r, same in _group_by_reason(skips).items()
-    ]
-    return [first if n == 1 else f"{reason} ({n} cases)" for reason, n, first in groups]
-
-
-def list_cases_not_loaded(report: Report) -> list[tuple[str, str]]:
-    """Return (cases that did not load, reason), grouped by reason, and the number of steps of each sequence."""
-    cases = []
-    for name, some in report.left_out.items():
-        for reason, same in ({some["reason"].iloc[0]: some} if name else _group_by_reason(some)).items():
-            first, more = same.iloc[0], len(same) - 1
-            if name:
-                cases.append((f"{format_count(len(same), 'step')} of {name}", reason))
-            elif more:
-                cases.append((f"{first['case']} and {format_count(more, 'more case')}", reason))
-            else:
-                cases.append((first["case"], first["reason"]))
-    return cases

@@ -39,7 +39,6 @@ from lavender.report.store import (
     open_store,
 )
 from lavender.report.timing import (
-    LONG_TIME,
     CampaignPlan,
     Plan,
     Task,
@@ -61,12 +60,6 @@ UNGUARDED_TIME_RATIO = 0.05
 MAX_REPEATED_STEPS = 20
 # The error of the motion is computed for about this number of steps of a sequence, evenly distributed.
 MAX_MOTION_STEPS = 20
-# A solver with up to this multiple of the fastest time on a case is timed again, alternately with the fastest.
-NEAR_TIME_RATIO = 1.6
-MAX_NEAR = 5  # Solvers that are timed again on a case, at most.
-# [s] Solvers are timed again on a case until this time has passed; every solver at least once.
-AGAIN_TIME = 1.0
-
 Watch = Callable[["Event"], Any]
 
 
@@ -294,49 +287,11 @@ class Runner:
             self.add_row(case)
         else:
             case = self.load_case(item)
-        rows: list[Row] = []
         for name in self.names:
             if case is not None:
                 self.report_progress(item.name, name)
-                rows += self.measure_solver(case, item.problem, name)
+                self.measure_solver(case, item.problem, name)
             self.done += 1
-        if not self.plan.campaign and self.plan.repeats > 1:
-            self.repeat_near_best(item, rows)
-
-    def repeat_near_best(self, item: Item, rows: list[Row]) -> None:
-        """Time the fastest solvers to the middle tolerance again, alternately, and store their rows again.
-
-        Disturbances of the machine then affect these solvers equally. Each gets `2 repeats + 1` times in all.
-        """
-        if not self.plan.tolerances:
-            return
-        tolerance, best = self.plan.tolerances[len(self.plan.tolerances) // 2], dict[str, Row]()
-        to_tolerance = [r for r in rows if r["mode"] == "tol" and r["start"] == "cold"]
-        reached = [r for r in to_tolerance if max(r["relative"], r["tol"]) <= tolerance]
-        for r in sorted(reached, key=lambda r: r["time"]):
-            best.setdefault(r["solver"], r)
-        limit = NEAR_TIME_RATIO * min((r["time"] for r in best.values()), default=0.0)
-        near = [r for r in best.values() if r["time"] <= limit][:MAX_NEAR]
-        if len(near) < 2 or any(self.was_timed_again(r) for r in near):
-            return
-        changed, begun = dict[str, Row](), perf_counter()
-        for _ in range(2 * self.plan.repeats + 1):
-            for i, r in enumerate(near):
-                if len(r["times"]) <= 2 * self.plan.repeats:
-                    self.report_progress(item.name, f"{r['solver']}, again")
-                    task = Task.of_row(r, self.plan.time_limit)
-                    new = self.measure_task(item.problem, task, self.specs[r["solver"]], None)[0]
-                    near[i] = changed[r["solver"]] = add_times(
-                        r, [*r["times"], *(new["times"] or [math.inf])]
-                    )
-            if perf_counter() - begun > AGAIN_TIME:
-                break
-        for row in changed.values():
-            self.add_row(row)
-
-    def was_timed_again(self, row: Row) -> bool:
-        """Whether a row has more times than its first measurement takes."""
-        return len(row["times"]) > (1 if max(row["times"], default=0.0) > LONG_TIME else self.plan.repeats)
 
     def measure_sequence(self, items: list[Item]) -> None:
         """Measure every solver on the steps of a sequence, in passes: each budget and tolerance, cold and carried."""
@@ -436,12 +391,11 @@ class Runner:
         self.add_skip(case, name, f"{name} → {other.name}: {reason}" if other else reason)
         return other
 
-    def measure_solver(self, case: Row, problem: Problem, name: str) -> list[Row]:
-        """Measure one solver on one case, at every budget and tolerance; return the rows."""
+    def measure_solver(self, case: Row, problem: Problem, name: str) -> None:
+        """Measure one solver on one case, at every budget and tolerance."""
         spec = self.select_solver(case["case"], name, [problem])
         if spec is None:
-            return []
-        name, rows = spec.name, list[Row]()
+            return
 
         def measure_or_reuse(task: Task) -> Row:
             """Measure one task, or return its row if an earlier run stored it."""
@@ -452,12 +406,10 @@ class Runner:
             else:
                 row = self.measure_task(problem, task, spec, None)[0]
                 self.add_row(row)
-            self.report_progress(case["case"], name, row, reused)
-            rows.append(row)
+            self.report_progress(case["case"], spec.name, row, reused)
             return row
 
         self.plan.measure_solver(case, problem, spec, measure_or_reuse)
-        return rows
 
     def measure_task(self, problem: Problem, task: Task, spec: SolverSpec, impulse: Any) -> tuple[Row, Any]:
         """Solve a task; return its row and impulses (m,) [N s]."""

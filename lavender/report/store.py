@@ -22,8 +22,8 @@ import numpy as np
 
 from lavender.base.errors import InputError, require_packages
 from lavender.io.stored import as_path, make_folder, read_whole_file
-from lavender.judge.solution import CLAIM_CHECKS, CONFIRMED
-from lavender.report.text import escape_unprintable, format_tolerance
+from lavender.judge.solution import CONFIRMED
+from lavender.report.text import format_tolerance
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -37,46 +37,15 @@ ERROR = (
 KEY = ("run", "case", "sha", "solver", "start", "mode", "tol", "max_iter", "time_limit", "order")
 #: Columns of runs with their defaults, which are the values of a run without an answer and determine the types.
 RUN_COLUMNS: Row = {
-    "run": "",
-    "case": "",
-    "sha": "",
-    "solver": "",
-    "start": "cold",
-    "mode": "tol",
-    "tol": math.nan,
-    "max_iter": 0,
-    "time_limit": math.nan,
-    "order": "given",
-    "step": -1,
-    "status": "",
-    "relative": math.inf,
-    "error_energy": math.inf,
-    "velocity": math.inf,
-    "roundoff_floor": math.nan,
-    "energy_change": math.nan,
-    "energy_gain": math.nan,
-    "motion_error": math.nan,
-    "worst_row": -1,
-    "worst_name": "",
-    "success": False,
-    "claims": False,
-    "claim_check": CONFIRMED,
-    "status_conflict": "",
-    "iterations": 0,
-    "work": "{}",
-    "form": "",
-    "message": "",
-    "time": math.nan,
-    "time_median": math.nan,
-    "repetitions": 0,
-    "carry_time": math.nan,
-    "setup_time": math.nan,
-    "solve_time": math.nan,
-    "calibration_time": math.nan,
-    "load": math.nan,
-    "solution_hash": "",
-    "times": (),
-}
+    "run": "", "case": "", "sha": "", "solver": "", "start": "cold", "mode": "tol", "tol": math.nan, "max_iter": 0,
+    "time_limit": math.nan, "order": "given", "step": -1, "status": "", "relative": math.inf,
+    "error_energy": math.inf, "velocity": math.inf, "roundoff_floor": math.nan, "energy_change": math.nan,
+    "energy_gain": math.nan, "motion_error": math.nan, "worst_row": -1, "worst_name": "", "success": False,
+    "claims": False, "claim_check": CONFIRMED, "status_conflict": "", "iterations": 0, "work": "{}", "form": "",
+    "message": "", "time": math.nan, "time_median": math.nan, "repetitions": 0, "carry_time": math.nan,
+    "setup_time": math.nan, "solve_time": math.nan, "calibration_time": math.nan, "load": math.nan,
+    "solution_hash": "", "times": (),
+}  # fmt: skip
 #: Columns of cases with their defaults. The second line of names is not repeated in the rows of runs.
 CASE_COLUMNS: Row = {
     "law": "", "rows": 0, "blocks": 0, "islands": 0, "contacts": 0, "mass_ratio": math.nan, "structure": "",
@@ -86,7 +55,6 @@ CASE_DETAILS: Row = {
     "run": "", "case": "", "sha": "", "step": -1, "source": "", "identity": "", "guess": "", "stored": math.nan,
     "diagnostics": (),
 }  # fmt: skip
-CHOICES = {"start": ("cold", "warm", "carried"), "mode": ("tol", "budget"), "claim_check": CLAIM_CHECKS}
 SKIP_COLUMNS: Row = {"run": "", "case": "", "solver": "", "reason": "", "sequence": ""}
 MACHINE_COLUMNS = ("started", "cpu", "cores", "threads", "platform", "python", "lavender")
 
@@ -220,11 +188,11 @@ def read(path: str | Path) -> DataFrame:
             )  # fmt: skip
         if len(lines) and not ("kind" in lines and lines["kind"].isin(KINDS).all()):
             raise ValueError(f"each line needs a kind, one of {', '.join(KINDS)}")
-    except (ValueError, RecursionError, OverflowError, TypeError) as error:
+        lines = lines if len(lines) else make_lines([])
+        lines.attrs = {"source": str(path), "dropped": int(dropped > 0)}
+        select_runs(lines)  # Raises an error if a column has values of another type.
+    except (ValueError, TypeError, AttributeError, RecursionError, OverflowError) as error:
         raise InputError(f"{path} is not a records.jsonl that `lavender report` wrote: {error}") from None
-    lines = lines if len(lines) else make_lines([])
-    lines.attrs = {"source": str(path), "dropped": int(dropped > 0)}
-    select_runs(lines)  # Raises the errors of invalid columns.
     return lines
 
 
@@ -232,42 +200,20 @@ def read(path: str | Path) -> DataFrame:
 
 
 def convert_columns(lines: DataFrame, kind: str, columns: Row) -> DataFrame:
-    """Return the lines of one kind with these columns, in the types of the defaults, which replace missing values.
-
-    Texts are made printable; only messages may have several lines.
-    """
+    """Return the lines of one kind with these columns, in the types of the defaults, which replace missing values."""
     import pandas as pd
 
     some, converted = lines[lines["kind"] == kind], {}
     for name, default in columns.items():
-        if name not in some:
-            values = pd.Series([default] * len(some), index=some.index, dtype=object)
+        values = some[name] if name in some else pd.Series(None, index=some.index, dtype=object)
+        if not (known := values.notna()).all():
+            values = values.astype(object).where(known, None).map(lambda x, y=default: y if x is None else x)
+        if isinstance(default, tuple):
+            values = values.map(list)
+        elif isinstance(default, str):
+            values = values.astype(str).astype("category")
         else:
-            known = some[name].notna()
-            values = some[name] if known.all() else some[name].astype(object).where(known, None)
-            values = values if known.all() else values.map(lambda x, y=default: y if x is None else x)
-        try:
-            if isinstance(default, tuple):
-                values = values.map(list)
-            elif isinstance(default, str):
-                unique, choices = values.unique().tolist(), CHOICES.get(name, ())
-                if not all(isinstance(text, str) and (text in choices or not choices) for text in unique):
-                    raise TypeError(
-                        f"one of {', '.join(choices)} is needed" if choices else "a text is needed"
-                    )
-                texts = {text: escape_unprintable(text, name == "message") for text in unique}
-                values = values.map(texts).astype("category")
-            elif isinstance(default, bool):
-                if not values.isin([True, False]).all():
-                    raise TypeError("true or false is needed")
-                values = values.astype(bool)
-            else:
-                values = values.astype("int64" if isinstance(default, int) else float)
-        except (TypeError, ValueError, OverflowError) as error:
-            raise InputError(
-                f"{lines.attrs.get('source') or 'lines'}: the column {name!r} of a {kind} has an invalid value "
-                f"({error}); give a records.jsonl that `lavender report` wrote"
-            ) from None
+            values = values.astype("int64" if type(default) is int else type(default))
         converted[name] = values
     return pd.DataFrame(converted, index=some.index)
 
@@ -278,9 +224,9 @@ def select_runs(lines: DataFrame) -> DataFrame:
     Raises
     ------
     InputError
-        A column has values of another type, or no line describes the case or the machine of a run.
+        No line describes the case or the machine of a run.
     """
-    runs = _keep_last(convert_columns(lines, "run", RUN_COLUMNS).drop(columns="times"), KEY)
+    runs = convert_columns(lines, "run", RUN_COLUMNS).drop(columns="times").drop_duplicates(KEY, keep="last")
     cases, machines = select_cases(lines), select_machines(lines)
     described = convert_columns(lines, "case", {"case": ""})["case"].unique()
     for name, known in (("case", described), ("run", machines)):
@@ -302,13 +248,6 @@ def select_runs(lines: DataFrame) -> DataFrame:
     return runs.astype(dict.fromkeys(texts, "category"))
 
 
-def _keep_last(frame: DataFrame, key: Iterable[str]) -> DataFrame:
-    """Return the last of the rows with equal keys, at the place of the first of them."""
-    group = frame.groupby(list(key), sort=False, observed=True, dropna=False).ngroup()
-    last = frame.assign(_group=group).drop_duplicates("_group", keep="last")
-    return last.sort_values("_group", kind="stable").drop(columns="_group")
-
-
 def select_cases(lines: DataFrame) -> DataFrame:
     """Return the last description of each case, by its name; of two sequences with one name, the steps of the last."""
     cases = convert_columns(lines, "case", CASE_DETAILS | CASE_COLUMNS).drop_duplicates("case", keep="last")
@@ -323,7 +262,9 @@ def select_skips(lines: DataFrame) -> DataFrame:
 
     `sequence` is the sequence of a step that did not load.
     """
-    skips = _keep_last(convert_columns(lines, "skip", SKIP_COLUMNS), ("run", "case", "solver"))
+    skips = convert_columns(lines, "skip", SKIP_COLUMNS).drop_duplicates(
+        ["run", "case", "solver"], keep="last"
+    )
     loaded = convert_columns(lines, "case", {"run": "", "case": ""})
     last = dict(zip(zip(loaded["run"], loaded["case"], strict=True), loaded.index, strict=True))
     is_open = [bool(r.solver) or last.get((r.run, r.case), -1) < r.Index for r in skips.itertuples()]
@@ -338,28 +279,9 @@ def select_machines(lines: DataFrame) -> dict[str, Row]:
     texts = convert_columns(lines, "machine", defaults).astype(dict.fromkeys(("run", "cpu"), object))
     for i, row in zip(texts.index, texts.to_dict("records"), strict=True):
         parts = {name: lines[name].get(i) if name in lines else {} for name in ("versions", "plan", "build")}
-        tolerances = parts["plan"].get("tolerances", []) if isinstance(parts["plan"], dict) else None
-        if not (
-            all(isinstance(part, dict) for part in parts.values())
-            and isinstance(tolerances, (list, tuple))
-            and all(isinstance(x, (int, float)) and 0.0 < x < math.inf for x in tolerances)
-        ):
-            raise InputError(
-                f"{lines.attrs.get('source') or 'lines'}: versions, plan or build of a machine are invalid; tables of "
-                "words and numbers and positive tolerances are needed"
-            )
         machines.pop(row["run"], None)
-        machines[row["run"]] = {**row, **_escape_texts(parts)}
+        machines[row["run"]] = {**row, **parts}
     return machines
-
-
-def _escape_texts(value: Any) -> Any:
-    """Make all texts in a value printable."""
-    if isinstance(value, str):
-        return escape_unprintable(value)
-    if isinstance(value, Mapping):
-        return {escape_unprintable(str(k)): _escape_texts(v) for k, v in value.items()}
-    return [_escape_texts(v) for v in value] if isinstance(value, list) else value
 
 
 def select_solvers(lines: DataFrame, names: Iterable[str]) -> DataFrame:

@@ -8,7 +8,6 @@ in advance. Single cases count from a cold start, steps of a sequence with carri
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -22,11 +21,12 @@ from lavender import io
 from lavender.base.arrays import check_choice
 from lavender.base.deadline import format_seconds
 from lavender.base.errors import LavenderError
-from lavender.io.stored import ENGINE, SUFFIXES, read_whole_file
+from lavender.io.stored import SUFFIXES
 from lavender.judge.residuals import DEFAULT_THRESHOLD, at_floor
 from lavender.judge.solution import CONFIRMED, CONTRADICTED
 from lavender.problem.derived import cached_property
 from lavender.report import machine
+from lavender.report.cases import read_engine_lines
 from lavender.report.drawing import FILE_KINDS
 from lavender.report.page import DEFAULT_ERROR_LIMIT, check_columns
 from lavender.report.store import (
@@ -195,7 +195,7 @@ def read_engine_answers(sources: Sequence[str], lines: Frame) -> Frame:
     answers = []
     for folder in dict.fromkeys([*map(Path, sources), *(Path(str(s)).parent for s in files["source"])]):
         own = [Path(s).name for s in stored["source"].astype(str) if Path(s).parent == folder]
-        entries = _read_lines(folder) or [{"file": name, "solver": "engine"} for name in own]
+        entries = read_engine_lines(folder) or [{"file": name, "solver": "engine"} for name in own]
         answers += [row for entry in entries if (row := _complete_answer(folder, entry)) is not None]
     return _make_answers(answers)
 
@@ -204,21 +204,6 @@ def _make_answers(rows: Sequence[Row] = ()) -> Frame:
     """Return the DataFrame of an engine's answers."""
     table = pd.DataFrame(rows, columns=["folder", *ANSWER_TEXTS, *ANSWER_NUMBERS])
     return table.set_index(table["folder"] + "/" + table["file"])
-
-
-def _read_lines(folder: Path) -> list[Row]:
-    """Return the last line for each file of a folder's `engine.jsonl`, without those that are not JSON.
-
-    A C engine that runs again into the same folder replaces the files and appends further lines.
-    """
-    answers: list[Any] = []
-    if (folder / ENGINE).is_file():
-        text = read_whole_file(folder / ENGINE, "the engine's answers").decode(errors="replace")
-        for line in text.splitlines():
-            with contextlib.suppress(ValueError, RecursionError):
-                answers.append(json.loads(line))
-    answers = [answer for answer in answers if isinstance(answer, dict)]
-    return list({str(answer.get("file", i)): answer for i, answer in enumerate(answers)}.values())
 
 
 def _complete_answer(folder: Path, answer: Row) -> Row | None:
@@ -255,11 +240,6 @@ def read_own_answers(report: Contents) -> Frame:
     answers = report.engines[report.engines.index.isin(list(sources)) & report.engines["velocity"].notna()]
     cases = answers.index.map(sources)
     return answers.assign(case=cases, step=report.cases.loc[cases, "step"].to_numpy())
-
-
-def get_engine_name(answers: Frame) -> str:
-    """Return the name of the solver that gave the largest number of an engine's answers."""
-    return str(answers["solver"].mode()[0]).replace("NEWTON", "Newton")
 
 
 # -- contents ----------------------------------------------------------------------------------------------
@@ -339,42 +319,24 @@ class Contents:
         return bool(self.machine.get("plan", {}).get("campaign"))
 
     @cached_property
-    def _finished_part(self) -> tuple[pd.DataFrame, list[str]]:
-        """Runs of the newest run that can be compared, and solvers that were not measured to the end on their cases.
-
-        A stopped run has the cases on which every solver was measured; if it was stopped in its first sequence, it has
-        the solvers before the one that was measured then.
-        """
+    def newest(self) -> pd.DataFrame:
+        """The newest run; if it was stopped, the cases on which every solver was measured."""
         # Times are compared only within one run, and a file that has changed is another problem.
         sha = self.runs["case"].astype(object).map(self.cases["sha"].astype(str).to_dict())
         is_newest = self.runs["run"] == self.machine.get("run", "")
         frame = self.runs[is_newest & (self.runs["sha"].astype(str) == sha)]
         if not (self.is_stopped and len(frame)):
-            return frame, []
-        last, solvers = frame.iloc[-1], self.machine["plan"].get("solvers", ())
+            return frame
+        last, solvers = frame.iloc[-1], set(self.machine["plan"].get("solvers", ()))
         is_running = (frame["sequence"] == (last["sequence"] or None)) & (frame["solver"] == last["solver"])
-        finished = frame[~is_running]
-        done: dict[str, set[str]] = {}
-        for case, solver in finished[["case", "solver"]].drop_duplicates().itertuples(index=False):
-            done.setdefault(case, set()).add(solver)
         skips, sequences = self.skips[self.skips["run"] == self.machine["run"]], self.cases["sequence"]
+        done = {case: set(some) for case, some in frame[~is_running].groupby("case", observed=True)["solver"]}
         for name, solver in zip(skips["case"], skips["solver"], strict=True):
             for case in [name] if name in self.cases.index else self.cases.index[sequences == name]:
                 done.setdefault(str(case), set()).add(solver)
-        whole = finished[finished["case"].isin([name for name, some in done.items() if some >= set(solvers)])]
-        if len(whole) or not last["sequence"]:
-            return whole, []
-        return finished, [name for name in solvers if name not in done.get(str(last["case"]), set())]
-
-    @property
-    def newest(self) -> pd.DataFrame:
-        """The newest run; if it was stopped, the part in which all cases have the same measurements."""
-        return self._finished_part[0]
-
-    @property
-    def unfinished(self) -> list[str]:
-        """Solvers of a stopped run that were not measured to the end on the shown cases."""
-        return self._finished_part[1]
+        return frame[
+            ~is_running & frame["case"].isin([case for case, some in done.items() if some >= solvers])
+        ]
 
     @cached_property
     def frame(self) -> pd.DataFrame:

@@ -88,11 +88,6 @@ class Task:
             step=case["step"],
         )  # fmt: skip
 
-    @classmethod
-    def of_row(cls, row: Row, time_limit: float) -> Task:
-        """Create the task that measures the run of a row once more."""
-        return cls(**{name: row[name] for name in _SHARED} | {"time_limit": time_limit})
-
     @property
     def arguments(self) -> dict[str, Any]:
         """Keyword arguments of the call: options, sweep order, tolerance, and largest number of iterations."""
@@ -295,8 +290,7 @@ class Plan:
         Exact iteration counts (`tol=0`), for solvers that can stop after any iteration.
     repeats : int
         Number of solves of each kind, of which minimum and median are recorded. A solve of more than 50 ms is not
-        repeated, and steps of sequences of more than twenty steps are solved once. The fastest solvers of a case are
-        then repeated alternately, until each has twice as many solves and one more.
+        repeated, and steps of sequences of more than twenty steps are solved once.
     time_limit : float, s
         Limit of one solve.
     sequence_time_limit : float, s
