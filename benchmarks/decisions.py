@@ -88,7 +88,7 @@ def count_work(name: str, factor: float) -> dict[str, float]:
         limited = DecisionTree(problem, Deadline(1e9))
         for limit in (1e-3, 1e-2, 1e-1):  # [s]
             limited.deadline = Deadline(limit)
-            fits = limited.deadline.get_remaining_seconds() is not None and not limited.is_late
+            fits = limited.has_time("newton", limited.min_newton_cost)
             call = choose_call_deadline(problem, Deadline(limit))
             share = ((call and call.get_remaining_seconds()) or 0.0) / limit
             counted[f"{label}, {limit:g} s"] = 1.0 + fits + round(2.0 * share, 1)

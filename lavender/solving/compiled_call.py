@@ -22,11 +22,6 @@ from lavender_ext.small.call import bind_types, solve_compiled
 NO_STAGE_MESSAGE = "the time limit was over before its turn: the start"
 
 
-# Under a time limit, the compiled call for more than SMALL_ROWS is made if this multiple of its least cost fits: it
-# may use half of the time, and hands nothing over if it does not end.
-CALL_MARGIN = 3.0
-
-
 def fits_in_time(problem: Problem, deadline: Deadline, loosely: bool = False) -> bool:
     """Return whether the compiled call of a problem that `auto` may continue ends before the deadline.
 
@@ -34,7 +29,7 @@ def fits_in_time(problem: Problem, deadline: Deadline, loosely: bool = False) ->
     """
     if not deadline.is_set or len(problem.b) <= SMALL_ROWS or deadline.fits(get_loose_limit(problem)):
         return True
-    return not loosely and deadline.fits(CALL_MARGIN * get("newton").load()().cost(problem).total)
+    return not loosely and deadline.fits(DECISIONS.call_time * get("newton").load()().cost(problem).total)
 
 
 def choose_call_deadline(problem: Problem, deadline: Deadline) -> Deadline:

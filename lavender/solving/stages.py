@@ -17,32 +17,32 @@ from lavender.problem.derived import cached_property
 from lavender.solvers.costs import RATES, estimate_first_factor_cost, estimate_formation_cost, get_loose_limit
 from lavender.solvers.decisions import DECISIONS
 from lavender.solvers.newton import NewtonState
+from lavender.solvers.newton_systems.systems import find_bodies
 from lavender.solvers.registry import get
 from lavender.solving.log import get_relaxation
-from lavender.solving.steps import Newton, RelaxedNewton, Step, estimate_cost, starts_relaxed
+from lavender.solving.steps import STEP_CLASSES, Iterations, Step, estimate_cost
 
 
 @dataclass(frozen=True)
 class Stage:
     """One stage of the tree."""
 
-    solver: str  # Name in `METHODS`, or "certificate".
+    solver: str  # Name of a step, which begins with the solver's, or "certificate".
     iterations: float  # Largest number of iterations.
     cost: float  # [ns] Estimated cost of these iterations.
     why: str  # Reason, for `lavender.explain`.
     least: float = inf  # Sweeps stop if they predict that more than this number of sweeps is still needed.
-    # Position among the stages after which only islands that are not solved continue; 0 for other stages.
-    position: int = 0
+    position: int = 0  # Among the stages after which only unsolved islands continue; 0 for other stages.
 
 
 class DecisionTree:
-    """The stages of `auto` for a problem, as an iterable, and the costs that it compares [ns].
+    """The stages of `auto` for a problem, as an iterable, their steps, and the costs that it compares [ns].
 
     `log.best` is the smallest relative residual so far; without a log, no stage runs. Stages before `first_stage` have
     run on a problem with more islands.
     """
 
-    pace = 2.0  # Time of counted work on this machine as a multiple of its cost; assumed until sweeps have measured it.
+    pace = DECISIONS.assumed_pace  # Time of counted work on this machine as a multiple of its cost.
     has_swept = False  # Whether sweeps have had their share before the first stage.
     compiled_call_failed = False  # Whether the compiled call over velocities of J and M has failed.
     started_from_zero = False  # Whether that call started from the zero impulse.
@@ -53,7 +53,7 @@ class DecisionTree:
         self, problem: Problem, deadline: Deadline = NEVER, log: Any = None, first_stage: int = 1
     ) -> None:
         self.problem, self.law, self.deadline, self.log = problem, problem.law, deadline, log
-        self.first_stage = first_stage
+        self.first_stage, self.steps = first_stage, dict[str, Step]()
         self.sweep = estimate_cost("anderson", problem).iteration  # [ns] Cost of one sweep.
         self.first = DECISIONS.first_sweeps * self.sweep  # [ns] Cost of the first sweeps.
         # [ns] Lower bound of the cost of Newton's method, without its analysis.
@@ -64,9 +64,24 @@ class DecisionTree:
         """Smallest relative residual so far; NaN if no stage runs."""
         return nan if self.log is None else float(self.log.best)
 
-    def skip(self, stage: Stage) -> None:
-        """Return the cost of a stage that does not run to the alternation."""
-        self.remaining_cost += stage.cost
+    def get_step(self, name: str) -> Step:
+        """Return the step of a solver, which is created when it is first needed."""
+        if name not in self.steps:
+            self.steps[name] = STEP_CLASSES.get(name, Iterations)(name, self.log, self)
+        return self.steps[name]
+
+    @cached_property
+    def is_large(self) -> bool:
+        """Whether the convex relaxation is solved first: under Coulomb's law, if the problem is large.
+
+        Of J and M, this requires that the velocities belong to free bodies. Over the rows of a sparse A, Newton's
+        method on Coulomb's law takes fewer steps than on the relaxation.
+        """
+        problem = self.problem
+        large = problem.law == "coulomb" and problem.m >= DECISIONS.relaxed_rows
+        if not large or problem.cones.has_round or not problem.is_symmetric:
+            return False
+        return problem.generalized is None or find_bodies(problem) is not None
 
     @cached_property
     def relaxed_sweep(self) -> float:
@@ -76,7 +91,7 @@ class DecisionTree:
     @cached_property
     def newton_state(self) -> NewtonState | None:
         """Newton's method after its analysis; None if it refuses the problem, fails or would end after the deadline."""
-        if get("newton").refuses(self.problem) is not None or self.is_late:
+        if get("newton").refuses(self.problem) or not self.has_time("newton", self.min_newton_cost):
             return None
         try:
             state: NewtonState = get("newton").load()().prepare(self.problem)
@@ -103,31 +118,24 @@ class DecisionTree:
     def solver_costs(self) -> dict[str, float]:
         """Estimated costs [ns] of the factorising solvers, the cheapest first; a failed `newton` comes last."""
         found = {} if self.newton_state is None else {"newton": self.newton_state.cost}
-        if self.can_pivot:
+        if self.direct < inf:
             found["direct"] = self.direct
         failed = "newton" if self.compiled_call_failed else ""
         return dict(sorted(found.items(), key=lambda item: (item[0] == failed, item[1])))
 
     @cached_property
-    def can_pivot(self) -> bool:
-        """Whether `direct` is considered: for bounded rows, or linear ones of bodies, if A is given or cheap."""
-        if self.law == "linear" and self.problem.rows is not None:
-            max_cost = self.min_newton_cost
-        elif self.law == "lcp":
-            max_cost = self.first
-        else:
-            return False
-        return self.formation <= max_cost and self.deadline.fits(self.formation / DECISIONS.time_share)
-
-    @cached_property
-    def formation(self) -> float:
-        """Cost to form A from bodies or from J and M [ns], whether or not A is cached."""
-        return estimate_formation_cost(self.problem, self.problem.matrix is not None)
-
-    @cached_property
     def direct(self) -> float:
-        """Cost of `direct` on bounded rows [ns], including the cost to form A."""
-        return self.formation + estimate_cost("direct", self.problem).total
+        """Cost of `direct` [ns] and to form A, cached or not, for bounded rows, or linear ones of bodies; else inf.
+
+        It is inf also if A is neither given nor cheap.
+        """
+        if self.law != "lcp" and (self.law != "linear" or self.problem.rows is None):
+            return inf
+        formation = estimate_formation_cost(self.problem, self.problem.matrix is not None)
+        is_cheap = formation <= (self.first if self.law == "lcp" else self.min_newton_cost)
+        if not is_cheap or not self.deadline.fits(formation / DECISIONS.time_share):
+            return inf
+        return formation + estimate_cost("direct", self.problem).total
 
     @property
     def newton(self) -> float:
@@ -139,46 +147,30 @@ class DecisionTree:
         """Cost [ns] of the cheapest factorising solver, or of the first sweeps if there is none."""
         return self.newton if self.newton < inf else self.first
 
-    @property
-    def is_late(self) -> bool:
-        """Whether no factorising solver can return a result before the deadline."""
-        return not self.has_time_for_newton()
-
-    def has_time_for_newton(self, before: float = 0.0) -> bool:
-        """Return whether the least cost of Newton's method fits after `before` [ns]."""
-        needed = before + 2.0 * get_loose_limit(self.problem)
-        if self.problem.generalized is None and self.deadline.fits(needed):
-            return True  # The least cost of bodies and matrices is below the loose limit.
-        return self.has_time("newton", self.min_newton_cost, before)
-
     def has_time(self, name: str, cost: float, before: float = 0.0) -> bool:
         """Return whether a factorising solver of this cost [ns] ends in time if it starts after `before` [ns]."""
-        if not self.deadline.is_set:
-            return True
-        needed = before + self.pace * cost
+        fits, needed = self.deadline.fits, before + self.pace * cost
         if name == "newton" and "newton_state" in vars(self):
-            return self.deadline.fits(needed)
-        return self.deadline.fits(get_loose_limit(self.problem) + needed) or self.deadline.fits(
-            estimate_cost(name, self.problem).setup + needed
-        )
-
-    def has_time_to_factorise_after(self, steps: dict[str, Step], cost: float) -> bool:
-        """Return whether work of this cost [ns] leaves time for a factorising solver, or all of them have ended."""
-        if "newton_state" not in vars(self):
-            return self.has_time_for_newton(cost)
-        step = steps.get("newton")
-        if self.newton_state is None or step is None or not step.over:
-            return self.newton_state is not None and self.has_time("newton", self.newton, cost)
-        return not step.late
+            return fits(needed)
+        loose = get_loose_limit(self.problem)
+        return fits(loose + needed) or fits(estimate_cost(name, self.problem).setup + needed)
 
     def leaves_time(self, stage: Stage, step: Step) -> bool:
-        """Return whether a stage of any solver but sweeps can end before the deadline."""
-        if isinstance(step, RelaxedNewton):
-            return self.has_time("newton", stage.cost)
-        if isinstance(step, Newton):
-            return self.newton_state is not None and self.has_time("newton", self.newton_state.cost)
-        if step.name == "direct":
-            return self.has_time("direct", self.direct if self.can_pivot else stage.cost)
+        """Return whether a stage can end before the deadline, and sweeps leave time for a solver that factors."""
+        if stage.solver == "anderson":
+            newton = self.steps.get("newton")
+            if stage.position > 0:
+                return True
+            if newton is not None and newton.over:
+                return not newton.late
+            cost = min(stage.cost, DECISIONS.time_share * self.deadline.get_remaining_nanoseconds())
+            if "newton_state" not in vars(self):
+                return self.has_time("newton", self.min_newton_cost, cost)
+            return self.newton_state is not None and self.has_time("newton", self.newton, cost)
+        if self.newton_state is not None and stage.solver.startswith("newton"):
+            return self.has_time("newton", self.newton_state.cost)
+        if stage.solver == "direct":
+            return self.has_time("direct", self.direct if self.direct < inf else stage.cost)
         if step.state is not None:
             return True
         return self.deadline.fits(estimate_cost(stage.solver, self.problem).setup / DECISIONS.time_share)
@@ -191,7 +183,7 @@ class DecisionTree:
         therefore, only the costs of `direct` and of Newton's method over bodies or velocities are compared.
         """
         p = self.problem
-        if self.law == "linear" or p.cones.has_round or (self.can_pivot and self.direct < self.first):
+        if self.law == "linear" or p.cones.has_round or self.direct < self.first:
             return True
         # Started at the same point as a failed compiled call, Newton's method would stall again.
         if self.compiled_call_failed or p.matrix is not None:
@@ -203,17 +195,16 @@ class DecisionTree:
         p, ratio, first = self.problem, DECISIONS.budget_ratio, self.first
         if p.matrix is not None and self.law == "linear":
             yield Stage("direct", inf, self.min_newton_cost, "linear, a matrix")
-        relaxed = starts_relaxed(p)
-        if relaxed:
+        if self.is_large:
             yield from self.iterate_relaxed_stages()
         max_cost = self.min_newton_cost if self.law == "linear" else first
-        pivots_first = self.factorises_first and self.can_pivot and self.direct < max_cost
+        pivots_first = self.factorises_first and self.direct < max_cost
         if pivots_first:
             n = ratio * DECISIONS.pivot_factorisations
             yield Stage("direct", n, ratio * self.direct, "a narrow band: before any analysis")
-        elif not (relaxed or self.factorises_first):
+        elif not (self.is_large or self.factorises_first):
             yield self.sweeps(first, "the first sweeps, before any analysis")
-        if not relaxed and not self.factorises_first and first < self.newton < inf:
+        if not self.is_large and not self.factorises_first and first < self.newton < inf:
             why = f"up to {format_seconds(1e-9 * self.newton)}, as much as {next(iter(self.solver_costs))} costs"
             yield self.sweeps(self.newton - first, why, self.newton)
         if p.generalized is not None and not np.all(p.compliance):
@@ -221,22 +212,20 @@ class DecisionTree:
             # The certificate's smallest violation is computed over velocities.
             cost = self.newton if self.newton_state is None else self.newton_state.cost
             yield Stage("certificate", 1.0, cost, "whether the least violation proves that there is none")
-        if relaxed:
-            yield from self.iterate_alternating_stages()
-            return
-        for stage in self.iterate_factorising_stages(ratio):
-            if not (pivots_first and stage.solver == "direct"):  # It has had this budget.
-                yield stage
-        if self.law == "coulomb" and p.generalized is None and ratio * self.unit >= RATES["linear program"]:
-            yield Stage("certificate", 1.0, RATES["linear program"], "whether a linear program proves it")
+        if not self.is_large:
+            for stage in self.iterate_factorising_stages(ratio):
+                if not (pivots_first and stage.solver == "direct"):  # It has had this budget.
+                    yield stage
+            cost = RATES["linear program"]
+            if self.law == "coulomb" and p.generalized is None and ratio * self.unit >= cost:
+                yield Stage("certificate", 1.0, cost, "whether a linear program proves it")
         yield from self.iterate_alternating_stages()
 
     def iterate_relaxed_stages(self) -> Iterator[Stage]:
         """Yield the first stages of a large problem with friction, unless they have run on a larger problem."""
         if self.first_stage <= 1 and not self.has_cheap_newton:
             cost = self.min_newton_cost
-            least = cost / self.relaxed_sweep
-            yield Stage("anderson", inf, cost, "before any analysis", least=least, position=1)
+            yield Stage("anderson", inf, cost, "before any analysis", cost / self.relaxed_sweep, position=1)
         state = self.newton_state
         if state is None:
             return
@@ -262,7 +251,7 @@ class DecisionTree:
         """Yield all solvers in rounds with doubled work, until no solver improves the residual in two rounds."""
         self.remaining_cost = DECISIONS.total_ratio * self.unit
         times = DECISIONS.budget_ratio
-        if starts_relaxed(self.problem):
+        if self.is_large:
             times = DECISIONS.turn_factorisations / DECISIONS.factorisations
         for k in count():
             before = self.best
@@ -279,8 +268,8 @@ class DecisionTree:
         """Yield one round, in which each solver may cost `times` the cheapest factorising solver."""
         p, cost, setup = self.problem, times * self.unit, 0.0
         why = f"in turn, {times:.3g} times the cheapest factorising solver's cost"
-        if starts_relaxed(p):
-            yield from (self.factorisation(name, cost, why) for name in self.solver_costs)
+        yield from (self.factorisation(name, cost, why) for name in self.solver_costs)
+        if self.is_large:
             # An iteration costs as much as a sweep under the cone law.
             n = DECISIONS.admm_fraction * cost / self.relaxed_sweep
             yield from self.repeat_while_converging(Stage("admm", n, DECISIONS.admm_fraction * cost, why))
@@ -290,7 +279,6 @@ class DecisionTree:
             # `admm` forms and factors A of J and M. Its set-up cost does not depend on cached data.
             setup = estimate_formation_cost(p, False)
             setup += estimate_first_factor_cost(p.m, float(p.metric.entries_of_matrix))
-        yield from (self.factorisation(name, cost, why) for name in self.solver_costs)
         if setup <= cost:
             yield from self.repeat_while_converging(Stage("admm", n, cost, why))
         if not self.sweeps_failed and not p.cones.has_round:
@@ -304,7 +292,7 @@ class DecisionTree:
         while is_converging:
             before = self.best
             yield stage
-            gains = starts_relaxed(self.problem) and self.best < before
+            gains = self.is_large and self.best < before
             is_converging = gains and self.best * (self.best / before) ** max_more <= self.log.tol
 
     def factorisation(self, name: str, cost: float, why: str) -> Stage:

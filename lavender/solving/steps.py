@@ -19,42 +19,22 @@ from lavender.solvers.costs import Cost, estimate_formation_cost, get_loose_limi
 from lavender.solvers.decisions import DECISIONS
 from lavender.solvers.direct import SufficientDirect
 from lavender.solvers.newton import WARM_START_MAX_RESIDUAL
-from lavender.solvers.newton_systems.systems import find_bodies
 from lavender.solvers.registry import get
 from lavender.solving.log import SolveLog, get_relaxation
 from lavender.solving.loop import Loop
 from lavender_ext.judge.measure import all_finite, residuals_by_island
 
-MAX_CALL_ITERATIONS = 2**30  # Largest number of iterations in one call.
-MIN_PREDICTED_RESIDUAL = 1e-16  # Predictions of remaining sweeps replace a smaller tol by this one.
-FIRST_SWEEPS_OF_LARGE_PROBLEM = 8  # Sweeps of `is_large` problems before the first prediction.
-FIRST_RELAXED_FACTORISATIONS = 6  # Interior points on the relaxation need at least as many factorisations.
-RELAXED_TOLERANCE = 0.01  # The relaxation's tolerance relative to tol, since Coulomb's residual is larger.
-FORMATION_COST_RATIO = 4.0  # Sweeps use a formed A only if this multiple of the cost to form it remains.
-HALVING_FACTORISATIONS = 30  # A turn of Newton's method continues while the last ones halve the residual.
-#: Solver of each step, by its name. On large piles, `admm` needs fewer iterations from zero than from sweeps.
-METHODS = {
-    "anderson": "anderson", "newton": "newton", "direct": "direct", "admm": "admm", "admm from zero": "admm",
-    "newton on the relaxation": "newton", "nncg": "nncg",
-}  # fmt: skip
-
-
-def name_limited_sweeps(problem: Problem) -> str:
-    """Return the name of the sweeps under a tight time limit: `nncg` under Coulomb's law, except on few bodies."""
-    is_small = problem.rows is not None and problem.m <= DECISIONS.island_rows
-    return "anderson" if problem.law != "coulomb" or is_small else "nncg"
-
 
 def make_solver(name: str, problem: Problem) -> Any:
-    """Create the solver of a step."""
-    if name == "direct" and problem.law == "linear":
+    """Create the solver of a step, whose name begins with that of the solver."""
+    solver = name.split()[0]
+    if solver == "direct" and problem.law == "linear":
         return SufficientDirect()  # `auto` needs no refinement of a solution that meets tol.
+    if solver == "nncg":
+        return get(solver).load()(restart="against")
     # Solve blocks exactly under the cone law, and for a matrix: rows of a contact may differ in unit.
-    if name == "nncg":
-        return get(name).load()(restart="against")
     exact = problem.law == "cone" or (problem.law == "coulomb" and problem.matrix is not None)
-    spec = get(METHODS[name])
-    return spec.load()(**({"sweep": "blocks"} if exact and "sweep" in spec.options else {}))
+    return get(solver).load()(**({"sweep": "blocks"} if exact and "sweep" in get(solver).options else {}))
 
 
 def estimate_cost(name: str, problem: Problem) -> Cost:
@@ -63,33 +43,20 @@ def estimate_cost(name: str, problem: Problem) -> Cost:
     return cost
 
 
-def starts_relaxed(problem: Problem) -> bool:
-    """Return whether `auto` solves the convex relaxation first: under Coulomb's law, if the problem is large.
-
-    Of J and M, this requires that the velocities belong to free bodies. Over the rows of a sparse A, Newton's method on
-    Coulomb's law takes fewer steps than on the relaxation.
-    """
-    large = problem.law == "coulomb" and problem.m >= DECISIONS.relaxed_rows
-    if not large or problem.cones.has_round or not problem.is_symmetric:
-        return False
-    return problem.generalized is None or find_bodies(problem) is not None
-
-
 def prepare_sweeps(solver: Any, problem: Problem, deadline: Deadline) -> Any:
     """Prepare sweeps, over the given form if they may form A and too little time remains for it."""
     may_form = problem.generalized is not None or problem.law == "lcp"
-    too_late = may_form and not (
-        deadline.fits(get_loose_limit(problem))
-        or deadline.fits(FORMATION_COST_RATIO * estimate_formation_cost(problem))
-    )
-    return build_state_in_given_form(solver, problem) if too_late else solver.prepare(problem)
+    if not may_form or deadline.fits(get_loose_limit(problem)):
+        return solver.prepare(problem)
+    has_time = deadline.fits(DECISIONS.formation_time * estimate_formation_cost(problem))
+    return solver.prepare(problem) if has_time else build_state_in_given_form(solver, problem)
 
 
 class Step:
     """A solver on the problem of a log. It runs in turns, and continues at the end of its last turn.
 
-    `over` is true if the step cannot continue, `late` if it has no time to continue. The step stops if it predicts that
-    more than `least` iterations are still needed.
+    `tree` is the `DecisionTree` of the solve. `over` is true if the step cannot continue, `late` if it has no time to
+    continue. The step stops if it predicts that more than `least` iterations are still needed.
     """
 
     over = late = False
@@ -97,16 +64,18 @@ class Step:
     state: Any = None
     impulse: FloatArray  # Present iterate (m,) [N s].
 
-    def __init__(self, name: str, log: SolveLog) -> None:
-        self.name, self.log = name, log
+    def __init__(self, name: str, log: SolveLog, tree: Any) -> None:
+        self.name, self.log, self.tree = name, log, tree
         self.solver = make_solver(name, log.problem)
 
     def run(self, n: float) -> None:
         """Run at most n iterations and record the stage in the log."""
         log, before = self.log, self.log.best
         try:
-            claim = self.advance(int(min(max(n, 1.0), log.remaining_iterations, MAX_CALL_ITERATIONS)))
-            self.record_history(claim)
+            # Counts of kernels have 32 bits.
+            claim = self.advance(int(min(max(n, 1.0), log.remaining_iterations, 2**30)))
+            if log.recorder is not None and not isinstance(self, Iterations):  # Their loop makes records.
+                log.recorder.record_impulse(self.name, log.iterations + claim.iterations, self.impulse)
         except BREAKDOWN as error:
             log.failure, self.over = format_error(error), True
             claim = Claim(Status.NUMERICAL_ERROR, 0)
@@ -124,12 +93,6 @@ class Step:
         self.store_iterate_in_log(claim.judged)
         return claim
 
-    def record_history(self, claim: Claim) -> None:
-        """Record the iterate at the end of a stage, if a history is requested."""
-        log = self.log
-        if log.recorder is not None:
-            log.recorder.record_impulse(self.name, log.iterations + claim.iterations, self.impulse)
-
     def store_iterate_in_log(self, judged: Any = None) -> None:
         """Offer the iterate, and the judge's pass over it if there is one, to the log if it is finite."""
         if all_finite(self.impulse):
@@ -144,7 +107,11 @@ class Newton(Step):
     impulse over bodies or over the rows of A.
     """
 
-    started_from_zero = is_second_start = has_stalled = False
+    is_second_start = has_stalled = False
+
+    def __init__(self, name: str, log: SolveLog, tree: Any) -> None:
+        super().__init__(name, log, tree)
+        self.state, self.started_from_zero = tree.newton_state, tree.started_from_zero
 
     def run(self, n: float) -> None:
         """Run at most n iterations, with a second start from zero and over rows of A if the method stalls."""
@@ -164,11 +131,12 @@ class Newton(Step):
 
     def advance(self, n: int) -> Claim:
         """Run about n iterations, on large problems with friction more; choose the start at the first call."""
-        log, is_large, done, work = self.log, starts_relaxed(self.log.problem), 0, dict[str, int]()
+        log, is_large, done, work = self.log, self.tree.is_large, 0, dict[str, int]()
+        extension = int(DECISIONS.turn_extension)
         if not self.state.begun:
             self.impulse = log.problem.start() if self.is_second_start else log.impulse.copy()
             self.started_from_zero = self.started_from_zero or not (self.impulse - log.problem.start()).any()
-        count = max(1, n - HALVING_FACTORISATIONS) if is_large else n
+        count = max(1, n - extension) if is_large else n
         while True:
             before, left = log.best, log.remaining_iterations - done
             claim = self.solver.advance(self.state, self.impulse, count, log.tol, log.time_left, left)
@@ -177,7 +145,7 @@ class Newton(Step):
             is_slow = not is_large or (done >= n and log.best > 0.5 * before)
             if is_slow or claim.status is not Status.MAX_ITERATIONS or done >= log.remaining_iterations:
                 break
-            count = HALVING_FACTORISATIONS
+            count = extension
         self.has_stalled = claim.status is Status.STALLED
         return replace(claim, iterations=done, work=work)
 
@@ -185,22 +153,18 @@ class Newton(Step):
 class RelaxedNewton(Step):
     """Interior points on the convex relaxation, judged under Coulomb's law. They stop if contacts slip."""
 
-    like: Any = None  # `NewtonState` of the problem; its elimination order is reused.
-
     def advance(self, n: int) -> Claim:
         """Run at most n factorisations, and compare both laws after each from the first possible end on."""
         log = self.log
-        if self.state is None:
-            self.state = self.solver.update(self.like, get_relaxation(log.problem))
+        if self.state is None:  # The elimination order of the problem's own state is reused.
+            self.state = self.solver.update(self.tree.newton_state, get_relaxation(log.problem))
             self.impulse = log.problem.start()
-        system, trial = self.state.system, self.impulse.copy()
-        claim, done = Claim(Status.MAX_ITERATIONS, 0), 0
-        work: dict[str, int] = {}
-        count, slips = min(n, FIRST_RELAXED_FACTORISATIONS) if system is not None else n, False
+        system, trial, slips = self.state.system, self.impulse.copy(), False
+        claim, done, work = Claim(Status.MAX_ITERATIONS, 0), 0, dict[str, int]()
+        count = min(n, int(DECISIONS.relaxed_start)) if system is not None else n
         while done < n and claim.status is Status.MAX_ITERATIONS:
-            claim = self.solver.advance(
-                self.state, self.impulse, count, RELAXED_TOLERANCE * log.tol, log.time_left, n - done
-            )
+            tol = DECISIONS.relaxed_tol * log.tol
+            claim = self.solver.advance(self.state, self.impulse, count, tol, log.time_left, n - done)
             done, work, count = done + claim.iterations, sum_work_counts((work, claim.work)), 1
             if claim.status is not Status.MAX_ITERATIONS or system is None:
                 self.store_iterate_in_log()
@@ -219,26 +183,24 @@ class RelaxedNewton(Step):
 
 
 class Iterations(Step):
-    """A resumable solver, which runs in chunks between checks of the clock and Ctrl-C."""
+    """A resumable solver, which runs in chunks between checks of the clock and Ctrl-C.
+
+    `admm` on large problems with friction starts again if another solver has found a better impulse.
+    """
 
     time_fraction = 1.0  # Fraction of the remaining time that a stage may use.
-    restarts = False  # Whether a stage starts from the best impulse if another solver has found a better one.
-
-    def __init__(self, name: str, log: SolveLog) -> None:
-        super().__init__(name, log)
-        self.restarts = name == "admm" and starts_relaxed(log.problem)
 
     def advance(self, n: int) -> Claim:
         """Run at most n iterations and offer the last and the best iterate to the log."""
         log, left = self.log, self.log.deadline.get_remaining_seconds()
-        if self.state is None or (self.restarts and log.best < self.state.best[0]):
+        restarts = self.name == "admm" and self.tree.is_large
+        if self.state is None or (restarts and log.best < self.state.best[0]):
             self.prepare_and_set_start()
-        deadline = None
-        if left is not None:
-            deadline = log.deadline if self.time_fraction == 1.0 else Deadline(self.time_fraction * left)
+        is_whole = left is None or self.time_fraction == 1.0
+        deadline = log.deadline if is_whole else Deadline(self.time_fraction * left)
         loop = Loop(
             problem=log.problem, solver=self.solver, state=self.state, impulse=self.impulse, tol=log.tol,
-            deadline=deadline, records=None if log.recorder is None else [],
+            deadline=None if left is None else deadline, records=None if log.recorder is None else [],
         )  # fmt: skip
         begun = 0.0 if log.recorder is None else log.recorder.time
         claim = self.run_loop(loop, n)
@@ -251,17 +213,14 @@ class Iterations(Step):
                 log.judge_and_store_best(impulse)
         return claim
 
-    def record_history(self, claim: Claim) -> None:
-        """Do nothing: the loop has made the records."""
-
     def prepare_and_set_start(self) -> None:
         """Prepare the solver and start from the best impulse of the log, zero, or the relaxation's solution."""
         log, start = self.log, self.log.impulse
-        if self.name == "admm from zero":
+        if self.name == "admm from zero":  # On large piles, it needs fewer iterations than from sweeps.
             start = log.problem._start
         elif self.name == "admm" and self.state is None and log.relaxed is not None:
             start = log.relaxed
-        self.state, self.impulse = self.solver.prepare(self.log.problem), start.copy()
+        self.state, self.impulse = self.solver.prepare(log.problem), start.copy()
 
     def run_loop(self, loop: Loop, n: int) -> Claim:
         """Run at most n iterations."""
@@ -278,10 +237,6 @@ class Sweeps(Iterations):
     predicted = 0.0  # Predicted number of sweeps that are still needed, from the last checks.
     n_islands = 0  # Number of islands; 0 if it is not known.
 
-    def __init__(self, name: str, log: SolveLog) -> None:
-        super().__init__(name, log)
-        self.is_large = starts_relaxed(log.problem)
-
     def advance(self, n: int) -> Claim:
         """Run at most n sweeps, offer the result to the log, and predict how many remain."""
         before = self.log.best
@@ -291,7 +246,7 @@ class Sweeps(Iterations):
 
     def predict(self, sweeps: int, before: float, now: float) -> None:
         """Predict the number of remaining sweeps from the last ones and the residuals before and after them."""
-        tol = max(self.log.tol, MIN_PREDICTED_RESIDUAL)
+        tol = max(self.log.tol, DECISIONS.predicted_residual)
         if now > tol:
             gain = math.log(before / now) if now < before else 0.0
             self.predicted = sweeps * math.log(now / tol) / gain if gain > 0.0 else inf
@@ -303,16 +258,17 @@ class Sweeps(Iterations):
 
     def run_loop(self, loop: Loop, n: int) -> Claim:
         """Run at most n sweeps; predict how many remain at intervals."""
-        first = FIRST_SWEEPS_OF_LARGE_PROBLEM if self.is_large else int(DECISIONS.first_sweeps)
-        growth = 1.0 if self.is_large else 0.5
-        done, due, tol = self.state.watch.total, 0, max(self.log.tol, MIN_PREDICTED_RESIDUAL)
+        is_large, log = self.tree.is_large, self.log
+        first = int(DECISIONS.large_sweeps if is_large else DECISIONS.first_sweeps)
+        growth, tol = 1.0 if is_large else 0.5, max(log.tol, DECISIONS.predicted_residual)
+        done, due = self.state.watch.total, 0
         if self.time_fraction == 1.0:  # Checks would cost as much as the first sweeps: run these without.
             loop.tol = 0.0
             claim = loop.run_chunks(min(n, first))
             if claim.status is not Status.MAX_ITERATIONS:
                 return claim
-            loop.tol = self.log.tol
-        now = self.log.best
+            loop.tol = log.tol
+        now = log.best
         while True:
             step = n - due
             if self.least < inf:
@@ -323,9 +279,15 @@ class Sweeps(Iterations):
                 return replace(claim, status=Status.MAX_ITERATIONS)
             if claim.status is not Status.MAX_ITERATIONS or due == n:
                 return claim
-            before, now = now, self.measure_progress()
-            if self.has_solved_half():
-                return claim
+            before, now = now, float(self.state.best[0])
+            if not is_large:  # Sweeps of large problems take as long as a pass of the judge.
+                self.store_iterate_in_log()
+                now = log.best
+            elif self.n_islands != 1:
+                island_of_block, table = residuals_by_island(log.problem.metric, self.impulse)
+                self.n_islands = len(table)
+                if np.mean(table[island_of_block, 0] <= log.tol) >= 0.5:  # The other islands continue alone.
+                    return claim
             self.predicted = inf
             self.predict(step, before, now)
             if now <= tol or self.is_hopeless(self.least):
@@ -334,27 +296,11 @@ class Sweeps(Iterations):
     def is_hopeless(self, max_remaining: float) -> bool:
         """Return whether more than `max_remaining` sweeps are predicted; large problems first make some of these."""
         done = 0.0 if self.state is None else self.state.watch.total
-        is_early = self.is_large and done < DECISIONS.sweep_fraction * max_remaining
+        is_early = self.tree.is_large and done < DECISIONS.sweep_fraction * max_remaining
         return self.predicted > max_remaining and not is_early
-
-    def measure_progress(self) -> float:
-        """Return the smallest relative residual so far."""
-        if self.is_large:
-            return float(self.state.best[0])  # Sweeps of large problems take as long as a pass of the judge.
-        self.store_iterate_in_log()
-        return self.log.best
-
-    def has_solved_half(self) -> bool:
-        """Return whether at least half of the blocks of a large problem belong to solved islands."""
-        if not self.is_large or self.n_islands == 1:
-            return False
-        island_of_block, table = residuals_by_island(self.log.problem.metric, self.impulse)
-        self.n_islands = len(table)
-        return float(np.mean(table[island_of_block, 0] <= self.log.tol)) >= 0.5
 
 
 #: Class of the step of each solver; the other solvers have `Iterations`.
 STEP_CLASSES = {
-    "anderson": Sweeps, "nncg": Sweeps, "direct": Step, "newton": Newton,
-    "newton on the relaxation": RelaxedNewton,
+    "anderson": Sweeps, "direct": Step, "newton": Newton, "newton on the relaxation": RelaxedNewton,
 }  # fmt: skip

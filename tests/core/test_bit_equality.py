@@ -27,7 +27,6 @@ from lavender import registry
 from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.solvers.newton_systems import general
 from lavender.solvers.pivoting import PivotState
-from lavender.solving.auto import create_solver_step
 from lavender.solving.log import SolveLog
 from lavender.solving.stages import DecisionTree
 from lavender_ext.core.method import OUTCOMES
@@ -182,7 +181,7 @@ def run_step_of_auto(problem, sizes, kind):
     get_zero_impulse_reference(problem)
     log = SolveLog(problem, 1e-14, 10**6)
     log.judge_and_store_best(problem.start())
-    step = create_solver_step(kind, log, DecisionTree(problem))
+    step = DecisionTree(problem, log=log).get_step(kind)
     for n in sizes:
         step.run(n)
     return log.iterations, step.impulse.tobytes()

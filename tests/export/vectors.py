@@ -20,7 +20,6 @@ import lavender as lv
 from lavender.base.errors import InputError
 from lavender.export import HEADER
 from lavender.solvers import registry
-from lavender.solving.steps import METHODS as CANDIDATES
 from lavender_ext.core.method import OUTCOMES
 from lavender_ext.driver.driver import Driver
 
@@ -181,14 +180,13 @@ def split_into_steps(solution: lv.Solution, step: Step) -> list[Step]:
         return [step]
     work: dict[str, int] = {}
     for stage in solution.stages:
-        name, _, _ = stage.solver.partition(" on ")
-        solver = CANDIDATES.get(name, name)
+        solver = stage.solver.split()[0]
         pivots = solver in ("direct", "lemke")  # Pivoting methods need no iteration limit.
         iterations = 0 if pivots else max((stage.work.get(kind, 0) for kind in ITERATION_COUNTS), default=0)
-        work[name] = work.get(name, 0) + (2 * iterations or registry.specs()[solver].max_iter)
+        work[solver] = work.get(solver, 0) + (2 * iterations or registry.specs()[solver].max_iter)
     steps = []
     for name, count in (work or {"anderson": 1}).items():
-        steps.append(replace(step, solver=CANDIDATES.get(name, name), iterations=count, options={}))
+        steps.append(replace(step, solver=name, iterations=count, options={}))
     return steps
 
 
