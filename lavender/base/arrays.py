@@ -168,6 +168,8 @@ def as_float_array(name: str, value: Any) -> np.ndarray:
 
     The numbers are not checked.
     """
+    if type(value) is np.ndarray and (value.dtype is FLOAT64 or value.dtype is FLOAT32):
+        return value
     get_shape(name, value)
     check_unmasked(name, value)
     array = to_numpy(name, value)

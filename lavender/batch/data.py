@@ -128,7 +128,7 @@ class Batch(Sequence[Problem]):
                 raise InputError(
                     f"velocity_ptr has {len(velocities) - 1} worlds, row_ptr {n}; equal numbers are needed"
                 )
-            sizes, nvs = np.diff(rows), np.diff(velocities)
+            sizes, nvs = rows[1:] - rows[:-1], velocities[1:] - velocities[:-1]
             self.shape: tuple[int, ...] = (int(rows[-1]),)
             self.velocity_shape: tuple[int, ...] = (int(velocities[-1]),)
             capacity = None
@@ -165,6 +165,33 @@ class Batch(Sequence[Problem]):
         # `lavender.io.engine_motion.EngineMotion` of worlds that an engine moves by accelerations.
         self.engine_motions: dict[int, Any] = {}
 
+    @classmethod
+    def _from_valid_rows(
+        cls, jac: FloatArray, mass: FloatArray, pattern: Any, free: FloatArray, target: FloatArray,
+        compliance: FloatArray, cones: Cones, places: np.ndarray,
+    ) -> Batch:  # fmt: skip
+        """Build a ragged batch under the cone law from contiguous float64 arrays, without the checks of `__init__`.
+
+        `mass` (n, entries) are lower triangles with the pattern (indptr, indices). `places` (2, n + 1) are the first
+        row and the first block of each world, and their ends.
+        """
+        batch, (n, nv), (rows, blocks) = cls.__new__(cls), free.shape, places
+        batch._n, batch.friction, batch.precision, batch.engine_motions = n, "cone", "float64", {}
+        batch.shape, batch.velocity_shape, batch.cones = target.shape, (n * nv,), cones
+        batch._has_shared_cones, batch._pattern, batch._jac_row, batch._mass_row = (
+            False,
+            pattern,
+            nv,
+            mass.shape[1],
+        )
+        batch._arrays = jac.reshape(-1), mass.reshape(-1), free.reshape(-1), target, compliance, None
+        batch.at = at = np.zeros(n, WORLD)
+        at["rows"], at["velocities"], at["blocks"] = rows[1:] - rows[:-1], nv, blocks[1:] - blocks[:-1]
+        at["row"] = at["target"] = at["soft"] = at["cone_row"] = rows[:-1]
+        at["jac"], at["mass"], at["block"] = nv * rows[:-1], mass.shape[1] * np.arange(n), blocks[:-1]
+        at["free"] = at["velocity"] = nv * np.arange(n)
+        return batch
+
     # Function that returns the names of a world's blocks.
     names_of: Callable[[int], Sequence[str]] | None = None
     # Function that returns which rows of a world are angular, as the argument `angular` of `Problem`.
@@ -200,8 +227,8 @@ class Batch(Sequence[Problem]):
                 f"worlds without padding rows{alternative}"
             )
         ends = first + sizes
-        block, last = np.searchsorted(cones.ptr, first), np.searchsorted(cones.ptr, ends)
-        bad = np.flatnonzero((cones.ptr[block] != first) | (cones.ptr[last] != ends))
+        block, last = cones.ptr.searchsorted(first), cones.ptr.searchsorted(ends)
+        bad = ((cones.ptr[block] != first) | (cones.ptr[last] != ends)).nonzero()[0]
         if len(bad):
             raise InputError(
                 f"the blocks of the cones do not begin and end with the {sizes[bad[0]]} rows of world "
@@ -323,7 +350,7 @@ class Batch(Sequence[Problem]):
 
 def _compute_offsets(sizes: Any) -> np.ndarray:
     """Compute the offsets of consecutive parts from their sizes."""
-    return np.cumsum(sizes, dtype=np.int64) - sizes
+    return sizes.cumsum(dtype=np.int64) - sizes
 
 
 def _check_world_pointers(name: str, value: Any) -> np.ndarray:
@@ -389,9 +416,9 @@ def _flatten(
     """
     x = as_float_array(name, value)
     if x.ndim == 0 and name not in ("J", "M"):
-        return np.full(int(np.max(sizes, initial=0)), float(x)), 0, 0
+        return np.full(int(sizes.max(initial=0)), float(x)), 0, 0
     if shape is None:
-        total = int(np.sum(sizes))
+        total = int(sizes.sum())
         if x.size != total:
             raise InputError(f"{name} has shape {x.shape}; {total} numbers are needed, world after world")
         return np.ascontiguousarray(x).reshape(-1), _compute_offsets(sizes), 0
@@ -405,9 +432,11 @@ def _flatten(
     has_contiguous_rows = x.shape[-1] < 2 or x.strides[-1] == size
     if not (has_item_strides and has_contiguous_rows) or (is_matrix and x.strides[1] < shape[1] * size):
         x = np.ascontiguousarray(x)
-    # A flat view of the memory that the array spans.
-    length = 1 + sum((k - 1) * stride // size for k, stride in zip(x.shape, x.strides, strict=True))
-    flat = np.lib.stride_tricks.as_strided(x, (length if x.size else 0,), (size,), writeable=False)
+    if x.flags.c_contiguous:
+        flat = x.reshape(-1)
+    else:  # A flat view of the memory that the array spans.
+        length = 1 + sum((k - 1) * stride // size for k, stride in zip(x.shape, x.strides, strict=True))
+        flat = np.lib.stride_tricks.as_strided(x, (length if x.size else 0,), (size,), writeable=False)
     return flat, np.arange(n) * (x.strides[0] // size), x.strides[1] // size if is_matrix else shape[-1]
 
 

@@ -14,7 +14,6 @@ judge uses the round-off floor of float32. MJX and Warp pad worlds with rows of 
 
 from __future__ import annotations
 
-import operator
 import warnings
 from typing import Any, NamedTuple
 
@@ -37,15 +36,14 @@ from lavender.batch.data import ERRORS, Batch, check_row_counts, check_shared_lo
 from lavender.io import mujoco as single
 from lavender.io.engine_motion import MOVERS
 from lavender.io.mujoco_discrete import MASS_TOLERANCE, compute_discrete_matrix
-from lavender.io.mujoco_memory import CHANGED_ADVICE, import_mujoco, read_step
+from lavender.io.mujoco_memory import CHANGED_ADVICE, import_mujoco, read_sizes, read_step
 from lavender.io.start_states import can_sleep
 from lavender.io.stiff_rows import make_engine_batch
 from lavender.problem import FRICTION_LAWS
-from lavender.problem.cones import ROW, Cones, get_block_kinds
+from lavender.problem.cones import Cones, get_block_kinds
 from lavender.problem.generalized import Compressed
 from lavender_ext.core.blocks import concatenate_blocks
-from lavender_ext.io.mujoco_rows import copy_rows
-from lavender_ext.judge.measure import all_finite
+from lavender_ext.io.mujoco_rows import copy_rows, copy_state, join_worlds
 
 # Values of mjtConstraint: equality; friction loss of a joint and of a tendon; elliptic contact, the largest value.
 # Rows of all other types have impulses >= 0.
@@ -247,21 +245,18 @@ class MujocoScratch:
         if not isinstance(model, mj.MjModel):
             raise InputError(f"model is a {type(model).__name__}; a mujoco.MjModel is needed")
         self.model = model
-        names = [
-            name for name in dir(model) if name.startswith("n") and isinstance(getattr(model, name), int)
-        ]
-        self._get_sizes = operator.attrgetter(*names)
-        self._sizes: Any = None
+        self._sizes = b""
         self._kept: list[Any] = []  # Not more than one MjData, which a call takes out while it uses it.
 
     def take_data(self) -> Any:
         """Return an MjData as after its creation, to be given back by `keep_data`."""
-        mj, sizes = import_mujoco(), self._get_sizes(self.model)
+        mj = import_mujoco()
+        sizes = read_sizes(mj, self.model)
         try:
             data = self._kept.pop()
         except IndexError:
             data = None
-        if data is None or sizes != self._sizes:
+        if data is None or not sizes or sizes != self._sizes:
             self._sizes = sizes
             return mj.MjData(self.model)
         mj.mj_resetData(self.model, data)
@@ -339,15 +334,14 @@ def from_mujoco_many(
     if velocity is not None and kinds[size] != mj.mjtState.mjSTATE_INTEGRATION:
         raise InputError(f"velocity was given with states of {size} numbers; mjSTATE_INTEGRATION is needed")
     n, nv, dt = len(values), model.nv, float(model.opt.timestep)
-    free, smooth, acceleration = np.full((n, nv), np.nan), np.zeros((n, nv)), np.full((n, nv), np.nan)
-    momentum, mover = np.zeros((n, nv)), ""
-    mass = np.zeros((n, len(model.M_colind)))
-    mass[:, model.M_rowadr + model.M_rownnz - 1] = 1.0  # States that are not finite keep the identity as M.
-    triangle = model.M_colind, np.append(model.M_rowadr, len(model.M_colind))
+    # v, a0, a and dt J^T f of each state, and the entries of M.
+    moves, mass, mover = np.zeros((n, 4, nv)), np.zeros((n, len(model.M_colind))), ""
     # Matrices of the integrator "discrete", which may have other patterns.
     matrices: dict[int, Compressed] = {}
-    rows_of_states: dict[int, Any] = {}
-    pending = iter(range(n))
+    # J, numbers of rows, number of contacts, and blocks of each finite state.
+    rows_of_states: list[Any] = [None] * n
+    bad = [] if errors == "raise" else (~np.isfinite(values).all(axis=1)).nonzero()[0].tolist()
+    pending = iter(range(n) if not bad else [i for i in range(n) if i not in set(bad)])
     threads = min(check_int("threads", threads, 1, None), max(n, 1))
 
     if scratch is not None and (
@@ -360,18 +354,15 @@ def from_mujoco_many(
         )
         raise InputError(f"scratch is {given}; MujocoScratch(model) of this model is needed, with threads=1")
 
-    is_finite = np.isfinite(values).all(axis=1)
     has_moving_surfaces, kind = bool(getattr(model, "flg_surfacevel", 0)), int(kinds[size])
 
-    def work(stop: bytearray) -> None:
+    def work(stop: bytearray) -> Any:
         nonlocal mover
         data = mj.MjData(model) if scratch is None else scratch.take_data()
         step = read_step(model, data)
         for i in pending:
             if stop[0]:
                 break
-            if not is_finite[i]:
-                continue
             mj.mj_setState(model, data, values[i], kind)
             try:
                 mj.mj_forward(model, data)
@@ -380,10 +371,8 @@ def from_mujoco_many(
             if has_moving_surfaces:  # efc_vel contains their velocities, too.
                 mj.mj_mulJacVec(model, data, data.efc_vel, data.qvel)
             step.read(data)
-            free[i], smooth[i], mass[i] = data.qvel, data.qacc_smooth, data.M
-            acceleration[i], momentum[i] = data.qacc, dt * data.qfrc_constraint
             mover = mover or single.find_mover(step, is_stepped=False)
-            if not all_finite(data.qacc):
+            if not copy_state(step, i, moves, mass):
                 if errors == "raise":
                     raise InputError(f"state {i}: {single.DIVERGED_TEXT}")
                 data.efc_force[:] = np.nan
@@ -393,7 +382,7 @@ def from_mujoco_many(
                 except CapabilityError as error:
                     raise CapabilityError(f"state {i}: {error}") from None
                 matrices[i] = matrix.lower
-                smooth[i] += 0.0 if matrix.change is None else matrix.change
+                moves[i, 1] += 0.0 if matrix.change is None else matrix.change
             blocks = single.make_blocks(step, data, 1)
             rows = copy_rows(step, blocks)
             rows_of_states[i] = *rows, blocks
@@ -401,47 +390,33 @@ def from_mujoco_many(
                 velocity[i] = _predict_velocity(mj, model, data, mover, rows)
         if scratch is not None:
             scratch.keep_data(data)
+        return step
 
-    run_on_threads(work, threads)
-    order = sorted(rows_of_states)
-    jacs, numbers, contacts, blocks_of_states = (
-        list(zip(*(rows_of_states.pop(i) for i in order), strict=True)) or [()] * 4
+    indptr, indices = single.find_mass_pattern(run_on_threads(work, threads)[0])
+    if bad:
+        moves[bad, :3:2] = np.nan
+        mass[np.ix_(bad, indptr[1:] - 1)] = 1.0  # The identity.
+    jac, (target, compliance, lam), free, change, places, contact_counts = join_worlds(
+        rows_of_states, moves, dt
     )
-    counts, contact_counts = np.zeros(n + 1, np.int64), np.zeros(n, np.int64)
-    counts[np.array(order, int) + 1] = [len(jac) for jac in jacs]
-    contact_counts[np.array(order, int)] = contacts
-    ptr = np.cumsum(counts)
-    jac = np.concatenate([np.zeros((0, nv)), *jacs])
-    inv_compliance, aref, force, velocity, scale = np.concatenate([np.zeros((0, 5)), *numbers]).T
-    triangles = (mass, *triangle) if not matrices else _merge_lower_triangles(matrices, mass, triangle)
-    target, compliance, lam = dt * aref + velocity, 1.0 / inv_compliance, dt * force
-    if (scale != 1.0).any():
-        target, compliance, lam = target * scale, compliance * scale * scale, lam / scale
-    blocks = concatenate_blocks(list(blocks_of_states))
-    block_ptr, kind, *bounds = blocks.arrays
-    is_frictionless = (kind != ROW) & (np.diff(block_ptr) == 1)
-    cones = Cones._from_blocks(blocks)
-    if is_frictionless.any():
-        cones = Cones(block_ptr, np.where(is_frictionless, ROW, kind), *bounds)
-    free += dt * smooth
+    if matrices:
+        mass, indices, indptr = _merge_lower_triangles(matrices, mass, indices, indptr)
+    blocks_of_states = [None if rows is None else rows[3] for rows in rows_of_states]
+    cones = Cones._from_blocks(concatenate_blocks([each for each in blocks_of_states if each is not None]))
 
     def make_batch(soft: FloatArray) -> Batch:
-        return Batch(
-            jac, triangles, free, target=target, cones=cones, compliance=soft, friction="cone", row_ptr=ptr
-        )
+        return Batch._from_valid_rows(jac, mass, (indptr, indices), free, target, soft, cones, places)
 
-    change = None if model.opt.noslip_iterations else dt * (acceleration - smooth)
-    batch = make_engine_batch(make_batch, compliance, lam, change, mover, momentum)
-
-    blocks_of_worlds = dict(zip(order, blocks_of_states, strict=True))
+    answer = None if model.opt.noslip_iterations else change
+    batch = make_engine_batch(make_batch, compliance, lam, answer, mover, moves[:, 3])
 
     def name_blocks_of_world(i: int) -> Any:
-        blocks = blocks_of_worlds.get(i)
+        blocks = blocks_of_states[i]
         m = 0 if blocks is None else blocks.n_rows
         return [] if blocks is None else single.make_block_names(mj, model, blocks.ints[2 * m + 1 :], m, 1)
 
     def find_angular_rows_of_world(i: int) -> Any:
-        blocks = blocks_of_worlds.get(i)
+        blocks = blocks_of_states[i]
         m = 0 if blocks is None else blocks.n_rows
         return None if blocks is None else single.find_angular_rows(mj, model, blocks.ints[2 * m + 1 :], m)
 
@@ -466,12 +441,13 @@ def _predict_velocity(mj: Any, model: Any, data: Any, moved_by: str, rows: Any) 
     return single.integrate_forces(mj, model, data, jac, force)
 
 
-def _merge_lower_triangles(matrices: dict[int, Compressed], mass: FloatArray, triangle: Any) -> Any:
+def _merge_lower_triangles(
+    matrices: dict[int, Compressed], mass: FloatArray, indices: Any, indptr: Any
+) -> Any:
     """Return (values (n, entries), indices, indptr) of lower triangles, with the union of their patterns.
 
-    Worlds without a matrix in `matrices` keep their row of `mass`, with the pattern `triangle` (indices, indptr).
+    Worlds without a matrix in `matrices` keep their row of `mass`, with the pattern (indices, indptr).
     """
-    indices, indptr = triangle
     nv = len(indptr) - 1
 
     def positions(columns: Any, first: Any) -> Any:
@@ -486,7 +462,7 @@ def _merge_lower_triangles(matrices: dict[int, Compressed], mass: FloatArray, tr
         values[i] = 0.0
         values[i, np.searchsorted(union, place)] = matrices[i][2]
     rows, columns = np.divmod(union, nv)
-    return values, columns, np.searchsorted(rows, np.arange(nv + 1))
+    return values, columns.astype(np.int32), rows.searchsorted(np.arange(nv + 1)).astype(np.int32)
 
 
 def _warn_of_old_forces(

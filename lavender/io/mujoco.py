@@ -250,11 +250,13 @@ def is_euler_damped(mj: Any, model: Any) -> bool:
     off = int(bits.mjDSBL_EULERDAMP) | int(getattr(bits, "mjDSBL_DAMPER", getattr(bits, "mjDSBL_PASSIVE", 0)))
     if int(model.opt.disableflags) & off:
         return False
-    if model.dof_damping.any():
+    if np.count_nonzero(model.dof_damping):  # In a tenth of the time of `any`.
         return True
     # MuJoCo 4 has polynomial dampings, and dampings of actuators that act on the velocities of joints.
     poly, actuators = getattr(model, "dof_dampingpoly", None), getattr(model, "jnt_actuatorid", None)
-    return bool((poly is not None and poly.any()) or (actuators is not None and (actuators != -1).any()))
+    return bool(poly is not None and np.count_nonzero(poly)) or (
+        actuators is not None and bool(np.count_nonzero(actuators != -1))
+    )
 
 
 def _make_fields(
@@ -338,19 +340,15 @@ def _read_mass(step: Step, data: Any) -> tuple[Any, Any]:
         raise InputError(
             "M of this MjData is 0, because mj_forward(model, data) was not called: call it, or step the simulation"
         )
-    kept = step.cache
-    copied = mujoco_rows.copy_mass(step, kept.pattern)
-    if copied is None:
-        kept.pattern = _find_mass_pattern(step.model)
-        copied = mujoco_rows.copy_mass(step, kept.pattern)
+    pattern = find_mass_pattern(step)
     if step.is_discrete:
-        matrix = compute_discrete_matrix(kept.mj, step.model, data, CHANGED_ADVICE)
+        matrix = compute_discrete_matrix(step.cache.mj, step.model, data, CHANGED_ADVICE)
         return matrix.lower, matrix.change
-    values, gap = copied
-    mass = *kept.pattern, values
+    values, gap = mujoco_rows.copy_mass(step, pattern)
+    mass = *pattern, values
     if not gap <= MASS_TOLERANCE:
         # The smooth force may be small, because its terms cancel.
-        lower = abs(sp.csr_array((values, kept.pattern[1], kept.pattern[0]), shape=(step.n, step.n)))
+        lower = abs(sp.csr_array((values, pattern[1], pattern[0]), shape=(step.n, step.n)))
         product = (lower + sp.triu(lower.T, 1)) @ np.abs(data.qacc_smooth)
         size = max_abs_of_array(product + np.abs(data.qfrc_smooth))
         gap *= max_abs_of_array(data.qfrc_smooth) / size if size > 0.0 else 1.0
@@ -362,14 +360,17 @@ def _read_mass(step: Step, data: Any) -> tuple[Any, Any]:
     return mass, None
 
 
-def _find_mass_pattern(model: Any) -> tuple[IntArray, IntArray]:
-    """Return (indptr, indices) of the lower triangle of M.
+def find_mass_pattern(step: Step) -> tuple[IntArray, IntArray]:
+    """Return (indptr, indices) of the lower triangle of M, which steps of one model share.
 
     Raises
     ------
     InputError
         Rows of M are not consecutive, or their columns do not ascend to the diagonal entry.
     """
+    kept, model = step.cache, step.model
+    if mujoco_rows.has_mass_pattern(step, kept.pattern):
+        return kept.pattern
     count, columns = model.M_rownnz, mark_read_only(model.M_colind.copy())
     indptr = np.append(0, np.cumsum(count)).astype(np.int32)
     is_consecutive = np.all(count > 0) and np.array_equal(indptr, np.append(model.M_rowadr, len(columns)))
@@ -382,7 +383,8 @@ def _find_mass_pattern(model: Any) -> tuple[IntArray, IntArray]:
         raise InputError(
             f"M_rowadr, M_rownnz and M_colind do not describe the lower triangle of M. {OTHER_MODEL_ADVICE}"
         )
-    return mark_read_only(indptr), columns
+    kept.pattern = mark_read_only(indptr), columns
+    return kept.pattern
 
 
 def _read_jacobian(step: Step, data: Any, blocks: Any) -> Any:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import ctypes
 import re
 from functools import cache
+from itertools import takewhile
+from types import SimpleNamespace
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -138,6 +140,29 @@ def find_layout(mj: Any) -> tuple[IntArray | None, tuple[int, ...]]:
     if not np.array_equal(stored, addresses) or not 0 <= members[0] - stored[-1] < layout[-1]:
         return None, tuple(layout)
     return mark_read_only(offsets), tuple([x + members[0] - stored[-1] for x in layout[:3]] + layout[3:])
+
+
+@cache
+def _count_size_bytes(mj: Any) -> int:
+    """Return the number of bytes before `opt` in mjModel, which are its sizes; 0 if it is not known."""
+    try:
+        from mujoco.introspect.structs import STRUCTS
+
+        sizes = takewhile(lambda field: field.name != "opt", STRUCTS["mjModel"].fields)
+        places, count, _ = _lay_out({"sizes": SimpleNamespace(fields=[*sizes])}, "sizes")
+    except (ImportError, KeyError, AttributeError):  # A type or struct is unknown.
+        return 0
+    model = mj.MjModel.from_xml_string(PROBE)
+    names = "nq", "nv", "ngeom", "nbuffer"
+    is_same = all(
+        ctypes.c_int32.from_address(model._address + places[x]).value == getattr(model, x) for x in names
+    )
+    return count if is_same else 0
+
+
+def read_sizes(mj: Any, model: Any) -> bytes:
+    """Return the sizes of the model in memory; empty if their place is not known."""
+    return ctypes.string_at(model._address, _count_size_bytes(mj))
 
 
 def list_addresses(data: Any) -> IntArray:

@@ -82,7 +82,7 @@ def make_engine_batch(
                 higher = raise_compliance(batch[i])
                 raised[rows] = engine[rows] if higher is None else higher
                 stiff.add(i)
-    if not np.array_equal(raised, engine):
+    if stiff and not np.array_equal(raised, engine):
         batch = make_batch(raised.reshape(compliance.shape))
     if impulse is not None and change is not None:
         flat = impulse.reshape(-1)

@@ -15,7 +15,7 @@ import numpy as np
 
 from lavender_ext.core.arrays cimport as_double_pointer, as_int_pointer, make_read_only, ndarray
 from lavender_ext.core.blocks cimport Blocks, allocate_blocks
-from lavender_ext.core.validate cimport is_valid_magnitude, is_valid_number, update_max_abs
+from lavender_ext.core.validate cimport all_finite, is_valid_magnitude, is_valid_number, update_max_abs
 from lavender_ext.core.block_types cimport ROW, blocks_t, choose_contact_kind, write_contact_bounds
 
 ctypedef const double* doubles
@@ -121,9 +121,9 @@ cdef class Step:
 def make_blocks(Step step, int32_t max_equality_rows):
     """Return the blocks, or the number of a row with an unknown type or an invalid id.
 
-    Each row of an equality with more than `max_equality_rows` is a block. The blocks have a fault if a bound is not a valid
-    number. Their `ints` hold type, id, dim and geom from index 2 m + 1, their `numbers` the factor of each row from index 5 m, and
-    the last m numbers the keys as uint64.
+    Each row of an equality with more than `max_equality_rows` is a block. If this is 1, contacts without friction are rows, too.
+    The blocks have a fault if a bound is not a valid number. Their `ints` hold type, id, dim and geom from index 2 m + 1, their
+    `numbers` the factor of each row from index 5 m, and the last m numbers the keys as uint64.
     """
     cdef const step_t* s = &step.at
     cdef int32_t i = 0, j, k = 0, of, size, count, type_, m = s.m, c = s.contacts
@@ -174,7 +174,7 @@ def make_blocks(Step step, int32_t max_equality_rows):
                 return i
             if type_ == PYRAMIDAL:
                 size, count = 1, 2 * (size - 1)         # one row per edge of the pyramid
-            else:
+            elif size > 1 or max_equality_rows > 1:
                 kind[k] = choose_contact_kind(False, False, False, size - 1)
             if type_ == ELLIPTIC:
                 friction = <doubles>(s.contact + of * s.stride + s.friction)
@@ -247,22 +247,27 @@ def read_jacobian(Step step, Blocks blocks):
     return make_read_only(indptr_), make_read_only(indices_), make_read_only(data_)
 
 
-def copy_mass(Step step, tuple pattern):
-    """Return the entries of the lower triangle of M, and max |M x - y| / max |y| with x = qacc_smooth, y = qfrc_smooth.
+def has_mass_pattern(Step step, tuple pattern):
+    """Return whether (indptr, indices) is the pattern of the lower triangle of MuJoCo's M."""
+    cdef const step_t* p = &step.at
+    cdef const int32_t* at = <int32_t*>(<ndarray>pattern[0]).data
+    cdef int32_t i
+    if (len(pattern[0]) != p.n + 1 or len(pattern[1]) != p.mass_entries or at[p.n] != p.mass_entries
+            or memcmp(at, p.M_rowadr, p.n * sizeof(int32_t))
+            or memcmp((<ndarray>pattern[1]).data, p.M_colind, p.mass_entries * sizeof(int32_t))):
+        return False
+    for i in range(p.n):
+        if p.M_rownnz[i] != at[i + 1] - at[i]:
+            return False
+    return True
 
-    None is returned if (indptr, indices) in `pattern` is not the pattern of MuJoCo's M.
-    """
+
+def copy_mass(Step step, tuple pattern):
+    """Return the entries of the lower triangle of M, and max |M x - y| / max |y| with x = qacc_smooth, y = qfrc_smooth."""
     cdef const step_t* p = &step.at
     cdef const int32_t* at = <int32_t*>(<ndarray>pattern[0]).data
     cdef int32_t i, q, end
     cdef double row, x, gap = 0.0, size = 0.0
-    if (len(pattern[0]) != p.n + 1 or len(pattern[1]) != p.mass_entries or at[p.n] != p.mass_entries
-            or memcmp(at, p.M_rowadr, p.n * sizeof(int32_t))
-            or memcmp((<ndarray>pattern[1]).data, p.M_colind, p.mass_entries * sizeof(int32_t))):
-        return None
-    for i in range(p.n):
-        if p.M_rownnz[i] != at[i + 1] - at[i]:
-            return None
     values, product_ = new(p.mass_entries), new(p.n)
     cdef double* product = <double*>(<ndarray>product_).data
     memcpy(<double*>(<ndarray>values).data, p.M, p.mass_entries * sizeof(double))
@@ -471,3 +476,57 @@ def copy_rows(Step step, Blocks blocks):
         for k in range(count):
             jac[<int64_t>i * n + (p.efc_J_colind[first + k] if step.is_sparse else k)] = p.efc_J[first + k] * columns[4][i]
     return jac_, numbers_, contacts
+
+
+def copy_state(Step step, Py_ssize_t i, moves, mass):
+    """Write qvel, qacc_smooth, qacc and dt qfrc_constraint to moves[i] (4, n), and M to mass[i]; return whether qacc is finite."""
+    cdef const step_t* p = &step.at
+    cdef double* to = <double*>(<ndarray>moves).data + 4 * i * p.n
+    cdef const double** sources = [p.qvel, p.qacc_smooth, p.qacc]
+    cdef int32_t k
+    for k in range(3):
+        memcpy(to + k * p.n, sources[k], p.n * sizeof(double))
+    for k in range(p.n):
+        to[3 * p.n + k] = p.dt * p.qfrc_constraint[k]
+    memcpy(<double*>(<ndarray>mass).data + i * p.mass_entries, p.M, p.mass_entries * sizeof(double))
+    return all_finite(p.qacc, p.n)
+
+
+def join_worlds(list worlds, moves, double dt):
+    """Join worlds: rows as (J, numbers, number of contacts, blocks), or None for a world without; `moves` as in `copy_state`.
+
+    Returns J (m, n); targets, compliances and impulses (3, m) in the units of a problem; v* (worlds, n); velocity changes by
+    the constraints (worlds, n); first rows and first blocks of the worlds, with their ends; numbers of contacts.
+    """
+    cdef Py_ssize_t count = len(worlds), n = moves.shape[2], i, k, m = 0
+    places_, contacts_ = np.zeros((2, count + 1), np.int64), np.zeros(count, np.int64)
+    free_, change_ = new((count, n)), new((count, n))
+    cdef int64_t[:, ::1] places = places_
+    cdef int64_t[::1] contacts = contacts_
+    cdef const double* x = <double*>(<ndarray>moves).data
+    cdef double* free = <double*>(<ndarray>free_).data
+    cdef double* change = <double*>(<ndarray>change_).data
+    cdef double* jac
+    cdef double* numbers
+    for i in range(count):
+        for k in range(n):
+            free[i * n + k], change[i * n + k] = x[k] + dt * x[n + k], dt * (x[2 * n + k] - x[n + k])
+        x += 4 * n
+        places[0, i + 1], places[1, i + 1] = places[0, i], places[1, i]
+        if worlds[i] is not None:
+            places[0, i + 1] += (<Blocks>worlds[i][3]).at.n_rows
+            places[1, i + 1] += (<Blocks>worlds[i][3]).at.n_blocks
+            contacts[i] = worlds[i][2]
+    m = places[0, count]
+    jac_, numbers_ = new((m, n)), new((3, m))
+    jac, numbers = <double*>(<ndarray>jac_).data, <double*>(<ndarray>numbers_).data
+    for i in range(count):
+        if worlds[i] is None:
+            continue
+        k = places[0, i]
+        memcpy(jac + k * n, (<ndarray>worlds[i][0]).data, (places[0, i + 1] - k) * n * sizeof(double))
+        x = <double*>(<ndarray>worlds[i][1]).data
+        for k in range(k, places[0, i + 1]):
+            numbers[k], numbers[m + k], numbers[2 * m + k] = (dt * x[1] + x[3]) * x[4], 1.0 / x[0] * x[4] * x[4], dt * x[2] / x[4]
+            x += 5
+    return jac_, numbers_, free_, change_, places_, contacts_

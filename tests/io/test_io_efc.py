@@ -1,5 +1,8 @@
 """Many states of MuJoCo in arrays: the problems and answers of one at a time, in float64 and in float32."""
 
+import ctypes
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 from mujoco_scene import mj, scene, whole_mass
@@ -74,6 +77,49 @@ def test_from_mujoco_many_with_scratch_has_the_bits_of_calls_without_it():
         assert impulse.tobytes() == expected.impulse.tobytes()
         assert all(batch[i] == expected.batch[i] for i in range(len(some)) if np.isfinite(some[i]).all())
     assert scratch.take_data() is kept  # Every call used the same MjData.
+
+
+def test_scratch_of_a_model_of_another_size_is_made_anew():
+    model = mj.MjModel.from_xml_string("<mujoco><size nuserdata='77'/></mujoco>")
+    scratch = lv.io.MujocoScratch(model)
+    first = scratch.take_data()
+    scratch.keep_data(first)
+    assert scratch.take_data() is first and len(first.userdata) == 77
+    scratch.keep_data(first)
+    sizes = (ctypes.c_int32 * 200).from_address(model._address)  # noqa: SLF001
+    sizes[[*sizes].index(77)] = 78  # As mj_recompile of MuJoCo's C library does.
+    assert len(scratch.take_data().userdata) == 78
+
+
+def test_scratch_leaves_the_data_of_the_caller_unchanged():
+    model = mj.MjModel.from_xml_string(scene())
+    own = forwarded(model, states_of(model, 1)[0])
+    state = np.zeros((1, mj.mj_stateSize(model, mj.mjtState.mjSTATE_INTEGRATION)))
+    mj.mj_getState(model, own, state[0], mj.mjtState.mjSTATE_INTEGRATION)
+
+    def list_arrays():
+        values = {name: getattr(own, name) for name in dir(own) if not name.startswith("_")}
+        return {name: x.tobytes() for name, x in values.items() if isinstance(x, np.ndarray)}
+
+    before, scratch = list_arrays(), lv.io.MujocoScratch(model)
+    for _ in range(2):
+        lv.io.from_mujoco_many(model, state + 0.01, errors="status", scratch=scratch)
+    assert len(before) > 100 and list_arrays() == before
+
+
+def test_two_scratches_in_two_threads_have_the_results_of_one_thread():
+    model = mj.MjModel.from_xml_string(scene())
+    states = states_of(model, 12)
+    expected = lv.io.from_mujoco_many(model, states)
+
+    def convert(part):
+        scratch = lv.io.MujocoScratch(model)
+        return [lv.io.from_mujoco_many(model, states[i : i + 1], scratch=scratch) for i in part]
+
+    with ThreadPoolExecutor(2) as pool:
+        found = [one for part in pool.map(convert, (range(6), range(6, 12))) for one in part]
+    assert np.concatenate([one.impulse for one in found]).tobytes() == expected.impulse.tobytes()
+    assert all(one.batch[0] == expected.batch[i] for i, one in enumerate(found))
 
 
 @pytest.mark.parametrize("jacobian", ["dense", "sparse"])
