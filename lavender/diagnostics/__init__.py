@@ -29,7 +29,11 @@ from lavender.problem import Problem, check_problem
 
 __all__ = ["Diagnostic", "diagnose"]
 
-CHECKS = (*blocks.CHECKS, *motion.CHECKS, *bodies.CHECKS, blocks.diagnose_conflict)
+CHECKS = (
+    blocks.diagnose_blocks, blocks.diagnose_row_order, blocks.diagnose_duplicate_contacts,
+    motion.diagnose_joint_targets, motion.diagnose_targets, bodies.diagnose_geometry, bodies.diagnose_masses,
+    blocks.diagnose_conflict,
+)  # fmt: skip
 
 
 def diagnose(

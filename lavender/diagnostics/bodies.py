@@ -72,12 +72,9 @@ def are_normals_first(p: Problem) -> bool:
     """Return whether J has the rows of rigid bodies with all normals first, and not in the order of the cones."""
     contact = p.cones.is_contact
     k = int(np.count_nonzero(contact))
-    if (
-        p.generalized is None
-        or k < 2
-        or reconstruct_bodies(p) is not None
-        or 3 * k != np.count_nonzero(p.cones.contact_rows)
-    ):
+    if p.generalized is None or k < 2 or 3 * k != np.count_nonzero(p.cones.contact_rows):
+        return False
+    if reconstruct_bodies(p) is not None:
         return False
     first = int(p.cones.ptr[:-1][contact][0])
     i = np.arange(k)[:, None]
@@ -168,15 +165,10 @@ def diagnose_masses(p: Problem) -> Iterator[Diagnostic]:
     own = share.pop("")
     best = min(share, key=lambda name: abs(share[name] + 0.4))
     if abs(own + 0.4) > 1.6 and abs(share[best] + 0.4) < 0.5:
-        reason = (
-            f"radii of gyration are {10 ** (0.5 * own):.2g} times the arms of contacts and joints; ordinary "
-        )
-        yield make_diagnostic(
-            p,
-            "masses",
-            reason + f"({10 ** (0.5 * share[best]):.2g}) if {best} was given",
-            ratio=10 ** (0.5 * own),
-        )
+        ratio = 10 ** (0.5 * own)
+        reason = f"radii of gyration are {ratio:.2g} times the arms of contacts and joints; ordinary "
+        reason += f"({10 ** (0.5 * share[best]):.2g}) if {best} was given"
+        yield make_diagnostic(p, "masses", reason, ratio=ratio)
         return
     density = np.median(1.0 / m / s2**1.5)
     if density < 0.05 and 10.0 < np.median(m / s2**1.5) < 3e4:
@@ -207,6 +199,3 @@ def find_free_bodies(mass: FloatArray) -> list[int]:
     equal = (np.abs(d[1:-1] - d[:-2]) <= size) & (np.abs(d[2:] - d[:-2]) <= size)
     off = sum(np.abs(mass[at + i, at + j]) for i, j in ((0, 1), (0, 2), (1, 2)))
     return [int(i) for i in np.flatnonzero(equal & (off <= size))]
-
-
-CHECKS = (diagnose_geometry, diagnose_masses)

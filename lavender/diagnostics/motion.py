@@ -6,14 +6,12 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from lavender.base.arrays import FloatArray, as_array, check_float, get_shape
 from lavender.base.errors import InputError
 from lavender.diagnostics.bodies import MAX_DENSE_VELOCITIES, find_free_bodies
 from lavender.diagnostics.diagnostic import Diagnostic, make_diagnostic
 from lavender.problem import Problem
-from lavender.problem.rows import Rows
 
 G = 9.81  # [m/s^2]
 # [m/s] A larger target would separate bodies by more than 6 cm in a step of 2 ms.
@@ -56,13 +54,10 @@ def diagnose_joint_targets(p: Problem) -> Iterator[Diagnostic]:
     rows = np.flatnonzero(is_linear & is_rigid & (np.abs(target) > MAX_SEPARATION_TARGET))
     if len(rows):
         largest = float(target[rows[np.argmax(np.abs(target[rows]))]])
-        reason = (
-            f"{len(rows)} rows of joints have targets up to {largest:.3g} m/s: are the anchors of both bodies in "
-            "world coordinates, and is the error of the joint divided by dt once?"
-        )
-        yield make_diagnostic(
-            p, "joint targets", reason, np.searchsorted(p.cones.ptr, rows, side="right") - 1, target=largest
-        )
+        reason = f"{len(rows)} rows of joints have targets up to {largest:.3g} m/s: are the anchors of both bodies in "
+        reason += "world coordinates, and is the error of the joint divided by dt once?"
+        blocks = np.searchsorted(p.cones.ptr, rows, side="right") - 1
+        yield make_diagnostic(p, "joint targets", reason, blocks, target=largest)
 
 
 def diagnose_targets(p: Problem) -> Iterator[Diagnostic]:
@@ -79,7 +74,8 @@ def diagnose_targets(p: Problem) -> Iterator[Diagnostic]:
         reason = (
             f"tangents have targets up to {np.abs(target[tangent]).max():.3g} m/s, and none if the {joints} "
         )
-        yield make_diagnostic(p, "targets", reason + "targets of joints come first, in the order of the rows")
+        reason += "targets of joints come first, in the order of the rows"
+        yield make_diagnostic(p, "targets", reason)
         return
     tn = target[normal]
     wild = (tn > MAX_SEPARATION_TARGET) | (tn < -MAX_APPROACH_TARGET)
@@ -100,35 +96,22 @@ def check_state_arguments(
             "velocity and gap are compared with v* and J, which a problem in matrix form does not have: leave them out"
         )
     if velocity is not None and motion is not None:
+        shape = motion[2].shape
         if p.rows is not None and get_shape("velocity", velocity) == (p.rows.n_bodies, 3):
-            velocity = embed_planar_velocities(p.rows, velocity)
-        velocity = as_array("velocity", velocity, motion[2].shape, unit="m/s")
+            out_of_plane = np.reshape([2, 3, 4] + 6 * np.arange(shape[0])[:, None], -1)
+            if motion[2][:, 2:5].any() or p.jacobian[:, out_of_plane].count_nonzero():
+                raise InputError(
+                    f"velocity [m/s] has shape {(shape[0], 3)}; {shape} is needed, because the problem is not in the "
+                    "xy plane: numpy.insert(v, [2, 2, 2], 0.0, axis=1) converts (v_x, v_y, omega_z)"
+                )
+            planar = as_array("velocity", velocity, (shape[0], 3), unit="m/s")
+            velocity = np.insert(planar, [2, 2, 2], 0.0, axis=1)
+        velocity = as_array("velocity", velocity, shape, unit="m/s")
     if gap is not None:
         if dt is None:
             raise InputError("gap [m] is compared with targets [m/s] by the step size: give dt [s], too")
         gap = as_array("gap", gap, (int(np.count_nonzero(p.cones.is_contact)),), unit="m")
     return velocity, gap, 0.0 if dt is None else check_float("dt [s]", dt, above=0.0)
-
-
-def embed_planar_velocities(rows: Rows, velocity: Any) -> FloatArray:
-    """Return the velocities (n, 6) of a problem in the xy plane, given as (v_x, v_y, omega) of each body (n, 3)."""
-    out_of_plane = [2, 3, 4]
-    jac = np.reshape(rows.jac, (-1, 6))
-    inertia = np.array(rows.inv_inertia)
-    inertia[:, 2, 2] = 0.0
-    vectors = (rows.normal, rows.tangent, rows.arm_a, rows.arm_b)
-    if (
-        rows.v_free[:, out_of_plane].any()
-        or jac[:, out_of_plane].any()
-        or inertia.any()
-        or any(x[:, 2].any() for x in vectors)
-    ):
-        n = rows.n_bodies
-        raise InputError(
-            f"velocity [m/s] has shape ({n}, 3); ({n}, 6) is needed, because the problem is not in the xy plane: "
-            "numpy.insert(v, [2, 2, 2], 0.0, axis=1) converts (v_x, v_y, omega_z)"
-        )
-    return np.insert(as_array("velocity", velocity, (rows.n_bodies, 3), unit="m/s"), [2, 2, 2], 0.0, axis=1)
 
 
 def diagnose_state(p: Problem, velocity: Any, gap: Any, dt: float) -> Iterator[Diagnostic]:
@@ -153,11 +136,8 @@ def diagnose_state(p: Problem, velocity: Any, gap: Any, dt: float) -> Iterator[D
         fall = fall[fall > 0.01 * fall.max()]  # Ignore bodies on which no force acts.
         typical = float(np.median(fall)) if len(fall) else 0.0
         if not step.any():
-            yield make_diagnostic(
-                p,
-                "v_free",
-                "v* equals v: are the accelerations of the step, dt a, missing? (or no force acts)",
-            )
+            reason = "v* equals v: are the accelerations of the step, dt a, missing? (or no force acts)"
+            yield make_diagnostic(p, "v_free", reason)
         elif typical > 0.5 * G:
             reason = f"v* differs from v by {typical:.3g} m/s in the median: do accelerations lack dt?"
             yield make_diagnostic(p, "v_free", reason, change=typical)
@@ -165,8 +145,14 @@ def diagnose_state(p: Problem, velocity: Any, gap: Any, dt: float) -> Iterator[D
         return
     target = motion[1][normal]
     comparable = (target != 0.0) & (np.abs(gap) > 1e-9)
-    if velocity is not None:
-        comparable &= ~_find_bounces(target, of_normals(velocity))
+    if (
+        velocity is not None
+    ):  # Targets that are -e times the normal velocities, with one e for all, are bounces.
+        before = of_normals(velocity)
+        e = np.divide(-target, before, out=np.zeros(len(target)), where=before < 0.0)
+        bounces = (e > MIN_RESTITUTION) & (e <= 1.0)
+        if bounces.any():
+            comparable &= ~bounces | (np.abs(e - np.median(e[bounces])) > RESTITUTION_ROUNDING)
     if not comparable.any():
         return
     if np.mean(target[comparable] * gap[comparable] > 0.0) > 0.7:
@@ -177,14 +163,3 @@ def diagnose_state(p: Problem, velocity: Any, gap: Any, dt: float) -> Iterator[D
         reason = f"targets are {share:.2g} times gap/dt in the median; 1 is expected: "
         reason += "are they divided by dt twice?" if share > 1.0 else "are they multiplied by dt once more?"
         yield make_diagnostic(p, "targets", reason, contact[comparable], share=share)
-
-
-def _find_bounces(target: FloatArray, before: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return a mask (c,) of targets that are -e times the normal velocities `before` (c,) [m/s], with one e for all."""
-    approach = before < 0.0
-    e = np.divide(-target, before, out=np.zeros(len(target)), where=approach)
-    bounces = approach & (e > MIN_RESTITUTION) & (e <= 1.0)
-    return bounces & (np.abs(e - np.median(e[bounces])) <= RESTITUTION_ROUNDING) if bounces.any() else bounces
-
-
-CHECKS = (diagnose_joint_targets, diagnose_targets)

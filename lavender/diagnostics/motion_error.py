@@ -74,29 +74,24 @@ class MotionError:
     @property
     def body_name(self) -> str:
         """Name of the body (or generalised velocity) with the largest error, e.g. "body 3"; empty without one."""
-        return self._name_body(self.body)
+        if self._problem is None or self.body < 0:
+            return ""
+        general = self._problem.generalized
+        return f"body {self.body}" if general is None else general.velocity_name(self.body)
 
     @property
     def row_name(self) -> str:
         """Name of the row with the largest error, e.g. "contact 3, normal"; empty without one."""
         return self._problem.row_name(self.row) if self._problem is not None and self.row >= 0 else ""
 
-    def _name_body(self, body: int) -> str:
-        """Return the name of a body or generalised velocity; empty for -1."""
-        if self._problem is None or body < 0:
-            return ""
-        general = self._problem.generalized
-        return f"body {body}" if general is None else general.velocity_name(body)
-
     def __str__(self) -> str:
-        speed_unit = " m/s or rad/s" if self.spin is None else " m/s"
         is_angular = self._problem is not None and self.row >= 0 and self._problem.angular_rows[self.row]
         numbers = (
             ("relative", self.relative, "", ""),
             ("kinetic", self.kinetic, " sqrt(J)", ""),
             ("energy", self.energy if self.kinetic is None else None, " sqrt(J)", ""),
-            ("speed", self.speed, speed_unit, self.body_name),
-            ("spin", self.spin, " rad/s", self._name_body(self.spin_body)),
+            ("speed", self.speed, " m/s or rad/s" if self.spin is None else " m/s", self.body_name),
+            ("spin", self.spin, " rad/s", f"body {self.spin_body}"),
             ("rows", self.rows, " rad/s" if is_angular else " m/s", self.row_name),
         )
         parts = [
@@ -139,24 +134,17 @@ def motion_error(problem: Problem, impulse: Any, reference: Any = None) -> Motio
     """
     check_problem(problem)
     x = problem.make_start(impulse)
-    if reference is None:
-        reference = _solve_reference(problem, x)
+    if reference is None and problem.law == "coulomb":
+        reference = raise_if_interrupted(solve(problem, impulse=x, tol=COULOMB_REFERENCE_TOL)).impulse
+    elif reference is None:
+        if __name__ not in problem.derived.cache:
+            best = raise_if_interrupted(solve(problem, impulse=problem.start(), tol=REFERENCE_TOL)).impulse
+            problem.derived.cache.setdefault(__name__, best)
+        reference = problem.derived.cache[__name__]
     reference = mark_read_only(np.array(problem.make_start(reference, "reference")))
     # Numbers that are not finite are None; `note` names them.
     with np.errstate(over="ignore", invalid="ignore"):
         return _compute_error(problem, x, reference)
-
-
-def _solve_reference(problem: Problem, impulse: FloatArray) -> FloatArray:
-    """Solve the problem to the round-off floor; under Coulomb's law from an impulse (m,) [N s], else once a problem."""
-    if problem.law == "coulomb":
-        return raise_if_interrupted(solve(problem, impulse=impulse, tol=COULOMB_REFERENCE_TOL)).impulse
-    cache = problem.derived.cache
-    if __name__ not in cache:
-        best = raise_if_interrupted(solve(problem, impulse=problem.start(), tol=REFERENCE_TOL)).impulse
-        cache.setdefault(__name__, best)
-    stored: FloatArray = cache[__name__]
-    return stored
 
 
 def _compute_error(problem: Problem, x: FloatArray, reference: FloatArray) -> MotionError:
@@ -184,16 +172,13 @@ def _compute_error(problem: Problem, x: FloatArray, reference: FloatArray) -> Mo
             values["spin_body"], values["spin"] = _find_index_and_max(np.linalg.norm(bodies[:, 3:], axis=1))
         if not problem.is_semidefinite:
             asymmetry = f"not symmetric (by {problem.asymmetry:.1e})"
-            notes.append(
-                f"A is {'not positive semidefinite' if problem.is_symmetric else asymmetry}: no energies"
-            )
+            reason = "not positive semidefinite" if problem.is_symmetric else asymmetry
+            notes.append(f"A is {reason}: no energies")
         else:
-            values["kinetic"], values["energy"] = _compute_energy_norms(problem, delta, velocity)
-            own_velocity = _compute_velocity_change(problem, reference)
-            own = _compute_energy_norms(problem, reference, own_velocity)
-            size, scale = (
-                (values["energy"], own[1]) if values["kinetic"] is None else (values["kinetic"], own[0])
-            )
+            energies = _compute_energy_norms(problem, delta, velocity)
+            own = _compute_energy_norms(problem, reference, _compute_velocity_change(problem, reference))
+            values["kinetic"], values["energy"] = energies
+            size, scale = (x[velocity is None] for x in (energies, own))
             values["relative"] = 0.0 if size == 0.0 else size / scale if scale else math.inf
             if values["relative"] == math.inf and math.isfinite(size):
                 notes.append("no relative error, because the constraints cause almost no motion")
@@ -214,7 +199,7 @@ def _compute_velocity_change(problem: Problem, impulse: FloatArray) -> FloatArra
 
 def _compute_energy_norms(
     problem: Problem, impulse: FloatArray, velocity: FloatArray | None
-) -> tuple[float | None, float]:
+) -> tuple[Any, float]:
     """Compute sqrt(1/2 dv.M dv), None if M is not known, and sqrt(1/2 x.A x) [sqrt J] of an impulse x (m,)."""
     if velocity is None:
         return None, math.sqrt(max(0.5 * float(impulse @ (problem.csr @ impulse)), 0.0))
@@ -226,7 +211,5 @@ def _compute_energy_norms(
 
 def _find_index_and_max(x: FloatArray) -> tuple[int, float]:
     """Return (index, value) of the largest number; (-1, 0) if there is none."""
-    if not len(x):
-        return -1, 0.0
-    i = int(np.argmax(x))
-    return i, float(x[i])
+    i = int(np.argmax(x)) if len(x) else -1
+    return i, float(x[i]) if len(x) else 0.0

@@ -199,8 +199,7 @@ def _decompose_rows(rows: sp.csr_array, tol: float) -> tuple[npt.NDArray[np.bool
                 else:
                     deferred.append(i)
         pending = np.array(deferred, int)
-    y[:, is_new] = (
-        -solve_triangular(lower[:r, :r], dependent_sum[:, :r].T, lower=True, trans=1).T if r else 0.0
-    )
+    if r:
+        y[:, is_new] = -solve_triangular(lower[:r, :r], dependent_sum[:, :r].T, lower=True, trans=1).T
     largest = np.abs(y).max(axis=0)
     return is_new, largest > NULL_VECTOR_TOL * largest.max(initial=0.0)
