@@ -303,7 +303,7 @@ NOT_CALLED = [
     "Solutions.store_late_world", "Problem.on_disk", "Problem.has_operator_of", "Problem.save",
     "Problem.compute_velocity_change", "Residuals.store_residual", "Solution.with_late_fields",
     "Solution.from_fields", "Solution.with_fields",
-    "Solution.convert_from_disk", "Solutions.store_solution", "Solutions.get_start", "CrossCheck.__getitem__",
+    "Solutions.store_solution", "Solutions.get_start", "CrossCheck.__getitem__",
     "Simulation.write_problem", "Simulation.load", "Simulation.record", "Simulation.save", "Simulation.view",
     "Snapshot.load", "Snapshot.save", "Recorder.add", "Recorder.close", "Recorder.leave_out", "Recorder.write_step",
     "read_recorded_state", "load", "load_solution", "read", "record", "save", "from_drake", "from_genesis",

@@ -484,14 +484,15 @@ def residual(
     if impulse.shape != (problem.m,):
         raise InputError(f"impulse has shape {impulse.shape}; ({problem.m},) is needed")
     if problem.cones.has_ellipse:
-        return convert_residual_from_disk(
-            problem, residual(problem.disk, problem.on_disk(impulse), precision, threshold, tol)
-        )
+        of_disk = residual(problem.disk, problem.on_disk(impulse), precision, threshold, tol)
+        stretch = problem.cones.stretch
+        with np.errstate(over="ignore"):
+            error, slack = mark_read_only(stretch * of_disk.error), mark_read_only(of_disk.slack / stretch)
+        return replace(of_disk, error=error, slack=slack, _problem=problem)
     if tol != TOL and not (type(tol) is float and tol >= 0.0):
         tol = check_float("tol", tol, low=0.0)
-    result = make_residual(
-        problem, judge_impulse(problem, impulse).refine(tol)
-    )  # Refined if M is ill-conditioned.
+    judged = judge_impulse(problem, impulse).refine(tol)  # Refined if M is ill-conditioned.
+    result = make_residual(problem, judged)
     if type(threshold) is not float or threshold != DEFAULT_THRESHOLD:
         result = replace(result, threshold=check_float("threshold", threshold, low=0.0))
     if precision != "float64":
@@ -519,14 +520,6 @@ def replace_error(
         worst_row=int(speeds[0].argmax()), error=mark_read_only(error), worst_island=-1,
         above_floor=0.0 if is_rounding and relative <= limit else relative, moved_by="acceleration", **fields,
     )  # fmt: skip
-
-
-def convert_residual_from_disk(problem: Problem, of_disk: Residual) -> Residual:
-    """Convert the residual of `problem.disk` to one of `problem`, which has ellipses."""
-    s = problem.cones.stretch
-    with np.errstate(over="ignore"):
-        error, slack = mark_read_only(s * of_disk.error), mark_read_only(of_disk.slack / s)
-    return replace(of_disk, error=error, slack=slack, _problem=problem)
 
 
 def _apply_float32_floor(problem: Problem, result: Residual, impulse: FloatArray) -> Residual:

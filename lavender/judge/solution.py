@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from enum import Enum
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, check_choice, check_int, format_html_table, mark_read_only
+from lavender.base.arrays import FloatArray, check_choice, check_int, format_html_table
 from lavender.base.errors import SolveFailed, require_packages
 from lavender.base.lazy_import import import_module_lazily
-from lavender.judge.residuals import Residual, residual
-from lavender.problem import Problem
+from lavender.judge.residuals import Residual
 from lavender.problem.derived import late_field
 from lavender_ext.core.checks import make_instance
 
@@ -355,12 +354,6 @@ class Solution:
         return state
 
     @property
-    def is_contradicted(self) -> bool:
-        """Whether the judge's figures contradict `status`."""
-        # Fields that `late` postponed belong to claims that have been checked, so they are not computed here.
-        return self.__dict__.get("claim_check") == CONTRADICTED
-
-    @property
     def success(self) -> bool:
         """Whether relative residual and floor are at most `tol`, or the velocity error at most `velocity_tol`.
 
@@ -373,18 +366,11 @@ class Solution:
         judged = self.residual
         return judged.relative <= self.tol and (judged.roundoff_floor <= self.tol or self.tol == 0.0)
 
-    def convert_from_disk(self, problem: Problem) -> Solution:
-        """Convert the solution of `problem.disk` to one of `problem`, which has ellipses."""
-        s = problem.cones.stretch
-        impulse, proof = mark_read_only(s * self.impulse), self.certificate
-        # Judge the converted impulse again: multiplying by the scale of the ellipse rounds it.
-        found = residual(problem, impulse, "float64", tol=self.tol)
-        return replace(
-            self,
-            impulse=impulse,
-            residual=found,
-            certificate=None if proof is None else mark_read_only(s * proof),
-        )
+    @property
+    def is_contradicted(self) -> bool:
+        """Whether the judge's figures contradict `status`."""
+        # Postponed fields belong to claims that have been checked, so they are not computed here.
+        return self.__dict__.get("claim_check") == CONTRADICTED
 
     def motion_error(self, reference: Any = None) -> Any:
         """Return the error of the motion in units: see `lavender.motion_error`."""

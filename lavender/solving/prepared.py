@@ -34,7 +34,6 @@ from lavender.judge.residuals import (
     Residual,
     choose_start,
     combine_best_islands,
-    convert_residual_from_disk,
     get_zero_impulse_reference,
     residual,
 )
@@ -160,8 +159,7 @@ class Prepared:
             _check_option_names(spec, options)
         self.spec = spec
         self.options = options
-        self._original = problem
-        self.problem = problem.disk if problem.cones._blocks.has_ellipse else problem
+        self.problem = problem
         self._target: tuple[Problem, FloatArray] | None = None  # [m/s] A problem and its targets b + J v*.
         self._lock = Lock()
         self._setup: SetUp | NotSetUp = NotSetUp()
@@ -172,7 +170,7 @@ class Prepared:
         self.setup_time = perf_counter() - start
 
     def __repr__(self) -> str:
-        return f"<Prepared {self.spec.name} for {self._original!r}>"
+        return f"<Prepared {self.spec.name} for {self.problem!r}>"
 
     @property
     def solver(self) -> Any:
@@ -186,7 +184,7 @@ class Prepared:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copy or pickle the arguments only; the copy prepares the solver again, as two solves cannot share a state."""
-        return partial(prepare, **self.options), (self._original, self.spec.name)
+        return partial(prepare, **self.options), (self.problem, self.spec.name)
 
     def solve(
         self,
@@ -227,7 +225,7 @@ class Prepared:
             raise UnknownName("argument of Prepared.solve", name, SOLVE_ARGUMENTS)
         begun = 0.0 if time_limit is None else read_clock()
         limit = math.inf if time_limit is None else check_time_limit(time_limit)
-        original = self._original if problem is None else problem
+        original = self.problem if problem is None else problem
         if b is not None or v_free is not None:
             original = self._update_problem(problem, b, v_free)
         if velocity_tol is not None:
@@ -246,7 +244,10 @@ class Prepared:
                 own = None if limit == math.inf else Deadline(limit, begun)
                 solution, failed_call = solve_small(original, self.spec, impulse, tol, own)
             if solution is not None:
-                self._replace_problem(original)
+                if original is not self.problem:
+                    if not has_same_operator(original, self.problem):
+                        check_accepted(original, self.spec)
+                    self.problem, self._setup = original, NotSetUp()
             else:
                 deadline = None if limit == math.inf else make_deadline(self.spec, limit, begun)
                 solution = self._solve(
@@ -261,7 +262,7 @@ class Prepared:
 
     def _update_problem(self, problem: Problem | None, b: Any, v_free: Any) -> Problem:
         """Return the prepared problem with a new right-hand side b or a new v*, see `solve`."""
-        original = self._original
+        original = self.problem
         if problem is not None:
             raise InputError(
                 "problem is given with b or v_free: give problem.updated(b=...), or leave problem out"
@@ -284,23 +285,23 @@ class Prepared:
             self._target = updated, target
         return updated
 
-    def _solve(self, arguments: SolveArguments, original: Problem) -> Solution:
-        """Prepare, step and finish: solve `original`, without the compiled call for small problems."""
-        if type(original) is not Problem:
-            check_problem(original)
-        deadline, start = arguments.deadline, None
+    def _solve(self, arguments: SolveArguments, given: Problem) -> Solution:
+        """Prepare, step and finish, without the compiled call for small problems; solvers get `given.disk`."""
+        if type(given) is not Problem:
+            check_problem(given)
+        deadline, start, callback = arguments.deadline, None, arguments.callback
         if arguments.impulse is not None:
-            start = original.on_disk(original.make_start(arguments.impulse))
+            start = given.make_start(arguments.impulse)
         setup = self._setup
-        if isinstance(setup, NotSetUp) or setup.is_used or original is not self._original:
-            setup = self._set_up(original, deadline)
-        problem = self.problem
-        has_default_start = start is None and problem.guess is None
+        if isinstance(setup, NotSetUp) or setup.is_used or given is not self.problem:
+            setup = self._set_up(given, deadline)
+        problem = given.disk
+        has_default_start = start is None and given.guess is None
         if start is None:
-            start = problem._start.copy() if problem.guess is None else problem.guess.copy()
-        callback = arguments.callback
-        if callback is not None and problem is not original:
-            callback = _make_callback_in_original_tangents(original, original.cones.stretch, callback)
+            start = given._start.copy() if given.guess is None else given.guess.copy()
+        if problem is not given:
+            start = given.on_disk(start)
+            callback = None if callback is None else partial(_call_in_given_tangents, given, callback)
         loop = Loop(
             problem=problem, solver=None, state=None, impulse=start, tol=arguments.tol, deadline=deadline,
             callback=callback, records=[] if arguments.history else None,
@@ -316,30 +317,27 @@ class Prepared:
                 setup.state.failed_call = arguments.failed_call
                 setup.state.loop = loop if arguments.history else None
         solution = self._run(loop, setup, arguments.max_iter, has_default_start)
-        name = name_start(problem.guess, arguments.impulse)
+        if problem is not given:
+            impulse, proof = mark_read_only(given.cones.stretch * solution.impulse), solution.certificate
+            # The impulse is judged again, because multiplying it by the scale of the ellipses rounds it.
+            judged = residual(given, impulse, "float64", tol=arguments.tol)
+            proof = None if proof is None else mark_read_only(given.cones.stretch * proof)
+            solution = replace(solution, impulse=impulse, residual=judged, certificate=proof)
+        name = name_start(given.guess, arguments.impulse)
         return solution.with_fields(start=name) if name else solution
 
     # -- set-up ----------------------------------------------------------------------------------
 
-    def _replace_problem(self, original: Problem) -> None:
-        """Replace the prepared problem by another one without a set-up."""
-        if original is not self._original:
-            if not has_same_operator(original, self._original):
-                check_accepted(original, self.spec)
-            self._original, self.problem = original, original.disk
-            self._setup = NotSetUp()
-
-    def _set_up(self, original: Problem, deadline: Deadline | None) -> SetUp | NotSetUp:
+    def _set_up(self, given: Problem, deadline: Deadline | None) -> SetUp | NotSetUp:
         """Set the solver up for a problem, unless the deadline has passed; reuse its state for the same structure.
 
         The problem replaces the old one unless an error is raised.
         """
-        begin, spec, last = perf_counter(), self.spec, self._setup
-        problem = original.disk if original.cones._blocks.has_ellipse else original
-        is_other = original is not self._original
+        begin, spec, last, problem = perf_counter(), self.spec, self._setup, given.disk
+        is_other = given is not self.problem
         if is_other:
-            if not has_same_operator(original, self._original):
-                check_accepted(original, spec)
+            if not has_same_operator(given, self.problem):
+                check_accepted(given, spec)
             self.setup_time = 0.0
         if problem.metric.reference_energy < 0.0:
             # Compute the judge's reference before a solver gets the problem.
@@ -351,8 +349,8 @@ class Prepared:
         else:
             try:
                 with limit_forming(deadline) if deadline is not None and deadline.is_set else UNLIMITED:
-                    if isinstance(last, SetUp) and not (
-                        is_other and not same_structure(self.problem, problem)
+                    if isinstance(last, SetUp) and (
+                        not is_other or same_structure(self.problem.disk, problem)
                     ):
                         state = solver.update(last.state, problem)
                     else:
@@ -364,7 +362,7 @@ class Prepared:
                 setup = NotSetUp()
             except BREAKDOWN as error:
                 setup = NotSetUp(failure=format_error(error))
-        self._original, self.problem, self._setup = original, problem, setup
+        self.problem, self._setup = given, setup
         self.setup_time += perf_counter() - begin
         return setup
 
@@ -375,7 +373,7 @@ class Prepared:
             if self.spec.builtin and not self.spec.external and self.problem.m > SMALL_ROWS:
                 import_numerical_modules(*getattr(self.spec.load(), "lazy_modules", ()))
             with suppress(*BREAKDOWN):  # A solve repeats it and reports the error.
-                get_zero_impulse_reference(self.problem)
+                get_zero_impulse_reference(self.problem.disk)
                 if isinstance(setup, SetUp):
                     setup.solver.complete(setup.state)
         self.setup_time += perf_counter() - begin
@@ -393,7 +391,7 @@ class Prepared:
 
     def _run(self, loop: Loop, setup: SetUp | NotSetUp, max_iter: int, has_default_start: bool) -> Solution:
         """Run the solver unless the problem is decided without it, and build the solution."""
-        spec, problem, deadline = self.spec, self.problem, loop.deadline
+        spec, problem, deadline = self.spec, loop.problem, loop.deadline
         setup_time, self.setup_time = self.setup_time, 0.0
         is_foreign = spec.external or not spec.builtin
         start, refutation, proof = loop.impulse.copy(), "", None
@@ -434,7 +432,7 @@ class Prepared:
                 claim = self._solve_feasible_islands(loop, claim, max_iter)
         if claim.judged is not loop.judged:
             claim = replace(claim, judged=loop.judged)
-        solution = finish(
+        return finish(
             FinishedRun(
                 problem, spec, self.options, loop.impulse, claim, tol=loop.tol, setup_time=setup_time,
                 solve_time=loop.time, history=None if loop.records is None else loop.get_history(),
@@ -442,7 +440,6 @@ class Prepared:
                 deadline=deadline or NEVER,
             )
         )  # fmt: skip
-        return solution if self._original is problem else solution.convert_from_disk(self._original)
 
     def _select_best_impulse(
         self, loop: Loop, claim: Claim, start: FloatArray, has_checks: bool
@@ -451,7 +448,7 @@ class Prepared:
 
         `auto` and the checks of sweeps have stored the best impulse of each island, including the start.
         """
-        spec, problem, refutation = self.spec, self.problem, ""
+        spec, problem, refutation = self.spec, loop.problem, ""
         claim = name_lost_row(problem, loop.impulse, claim)
         keeps_best = spec.delegates and not problem.has_singular_program
         checked = has_checks and loop.state.watch.has_best
@@ -467,14 +464,15 @@ class Prepared:
     def _solve_feasible_islands(self, loop: Loop, claim: Claim, max_iter: int) -> Claim:
         """Solve the islands that the certificate of an INFEASIBLE claim does not concern, unless they meet tol."""
         assert claim.certificate is not None
-        count, label = find_islands(self.problem)
+        problem = loop.problem
+        count, label = find_islands(problem)
         if count < 2:
             return claim
-        proof = prove_infeasibility(self.problem, claim.certificate, loop.tol)
+        proof = prove_infeasibility(problem, claim.certificate, loop.tol)
         if proof.reason:
             return claim
-        _, table = residuals_by_island(self.problem.metric, loop.impulse)
-        row_label = np.repeat(label, np.diff(self.problem.cones.ptr))
+        _, table = residuals_by_island(problem.metric, loop.impulse)
+        row_label = np.repeat(label, np.diff(problem.cones.ptr))
         infeasible = np.bincount(row_label, proof.y != 0.0, minlength=count) > 0
         if np.all(infeasible | (table[:, 0] <= loop.tol)):
             return claim
@@ -486,21 +484,17 @@ class Prepared:
         max_iter -= claim.iterations
         if loop.tol == 0.0 or max_iter < 0 or (deadline is not None and deadline.has_passed()):
             return claim
-        b, start = self.problem.b.copy(), loop.impulse.copy()
+        problem, start = loop.problem, loop.impulse.copy()
+        b = problem.b.copy()
         b[rows] = start[rows] = 0.0
         try:
-            others = Prepared(self.problem.updated(b=b), self.spec, self.options)
+            others = Prepared(problem.updated(b=b), self.spec, self.options)
         except InputError:  # The remaining entries of b are below the accepted range.
             return claim
-        solution = others.solve(
-            impulse=start,
-            tol=loop.tol,
-            max_iter=max_iter,
-            time_limit=None if deadline is None else deadline.get_remaining_seconds(MIN_TIME_LIMIT),
-        )
-        loop.impulse[:] = combine_best_islands(
-            self.problem, loop.impulse, (solution.impulse,), loop.tol, by_energy=True
-        )
+        left = None if deadline is None else deadline.get_remaining_seconds(MIN_TIME_LIMIT)
+        solution = others.solve(impulse=start, tol=loop.tol, max_iter=max_iter, time_limit=left)
+        impulses = (solution.impulse,)
+        loop.impulse[:] = combine_best_islands(problem, loop.impulse, impulses, loop.tol, by_energy=True)
         loop.time += solution.setup_time + solution.solve_time
         work = sum_work_counts((claim.work, solution.work))
         return replace(claim, iterations=claim.iterations + solution.iterations, work=work)
@@ -572,15 +566,11 @@ def check_arguments(
     )
 
 
-def _make_callback_in_original_tangents(
-    problem: Problem, stretch: FloatArray, callback: Callback
-) -> Callback:
-    """Return a callback for `problem.disk` that calls `callback` with impulse and residual of `problem`."""
-
-    def call(done: int, impulse: FloatArray, judged: Residual) -> Any:
-        return callback(done, stretch * impulse, convert_residual_from_disk(problem, judged))
-
-    return call
+def _call_in_given_tangents(
+    given: Problem, callback: Callback, done: int, impulse: FloatArray, _: Residual
+) -> Any:
+    """Call the callback of a problem with ellipses with an impulse (m,) [N s] of its `disk`."""
+    return callback(done, given.cones.stretch * impulse, residual(given, given.cones.stretch * impulse))
 
 
 def _make_solver(spec: SolverSpec, options: dict[str, Any]) -> Solver:
