@@ -32,7 +32,7 @@ from lavender.io.npz import Stored, read_npz, write_npz
 from lavender.io.pinocchio import from_pinocchio
 from lavender.io.recorder import Recorder, StepVerdict, read_recorded_state
 from lavender.io.recording import Recording, record
-from lavender.io.stored import HDF5, as_path, read_first_bytes
+from lavender.io.stored import HDF5, as_path, read_bytes
 from lavender.io.velocities import Reconstruction, reconstruct
 from lavender.problem import Problem
 
@@ -85,7 +85,7 @@ def read(path: str | os.PathLike[str]) -> Stored:
     InputError
         The file does not exist, is truncated, inconsistent or of another format; or h5py is needed and not installed.
     """
-    start = read_first_bytes(path)
+    start = read_bytes(path, count=8)
     if start[:2] == b"PK":
         return read_npz(path)
     if start == b"\x89HDF\r\n\x1a\n":

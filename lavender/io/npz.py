@@ -23,17 +23,12 @@ from lavender.io.stored import Arrays, read_arrays, write_arrays
 from lavender.problem import Problem, check_problem
 from lavender.problem.cones import Cones, get_block_kinds
 from lavender.problem.generalized import Generalized
-from lavender.problem.program import QuadraticProgram
 from lavender.problem.rows import Rows
 
 FORMAT_VERSION = 1
 CONES = tuple(f"cones_{f.name}" for f in fields(Cones) if f.name != "rolling")
 ROWS = tuple(f"rows_{f.name}" for f in fields(Rows) if f.name != "copy")
-GENERALIZED = (
-    *(f"general_{name}_{part}" for name in ("jac", "mass") for part in ("data", "indices", "indptr")),
-    "general_v_free",
-)
-CSR = ("A_data", "A_indices", "A_indptr", "A_shape")
+COMPRESSED = ("data", "indices", "indptr")
 FORMS = ("dense", "csr", "rows", "generalized", "program")
 PROGRAM = ("P", "q", "G", "h", "A", "b", "lb", "ub")
 MOTION = ("engine_change", "engine_compliance", "engine_momentum")
@@ -100,26 +95,32 @@ def write_npz(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = 
     arrays: dict[str, Any] = {"lavender_format": np.int64(FORMAT_VERSION)}
     rows, general, qp = problem.rows, problem.generalized, problem.qp
     if qp is None:
-        arrays |= {"b": problem.b} | {
-            name: getattr(problem.cones, name.removeprefix("cones_")) for name in CONES
-        }
+        arrays["b"] = problem.b
+        arrays |= {name: getattr(problem.cones, name.removeprefix("cones_")) for name in CONES}
         if problem.cones.has_rolling:
             arrays["cones_rolling"] = problem.cones.rolling
     if qp is not None:
         operator = "program"
-        arrays |= _list_program_entries(qp)
+        for name, x in qp.arrays.items():
+            if issparse(x):
+                columns = sp.csc_array(x)
+                arrays |= {f"{name}_{part}": getattr(columns, part) for part in COMPRESSED}
+                arrays[f"{name}_shape"] = np.array(x.shape, np.int64)
+            else:
+                arrays[name] = x
     elif rows is not None:
         operator = "rows"
         arrays |= {name: getattr(rows, name.removeprefix("rows_")) for name in ROWS}
     elif general is not None:
         operator = "generalized"
-        for name in GENERALIZED[:-1]:
-            _, matrix, part = name.split("_")
-            arrays[name] = getattr(getattr(general, matrix), part)
+        for name in ("jac", "mass"):
+            arrays |= {f"general_{name}_{part}": getattr(getattr(general, name), part) for part in COMPRESSED}
         arrays["general_v_free"] = general.v_free
     elif issparse(problem.matrix):
         operator, a = "csr", problem.matrix
-        arrays |= dict(zip(CSR, (a.data, a.indices, a.indptr, np.array(a.shape, np.int64)), strict=True))
+        arrays |= {f"A_{part}": getattr(a, part) for part in COMPRESSED} | {
+            "A_shape": np.array(a.shape, np.int64)
+        }
     else:
         operator, arrays["A"] = "dense", problem.matrix
     stored = {"compliance": problem.compliance, "guess": problem.guess, "key": problem.key}
@@ -177,7 +178,10 @@ def _read_own_format(archive: Arrays) -> Stored:
         fields_of_rows: dict[str, Any] = {name.removeprefix("rows_"): archive[name] for name in ROWS}
         parts["rows"] = Rows(**fields_of_rows)
     elif meta["operator"] == "generalized":
-        parts["generalized"] = _build_generalized(archive, meta.get("dof_names"))
+        v_free = archive["general_v_free"]
+        sizes = (("general_jac", b.size), ("general_mass", v_free.size))
+        jac, mass = (_read_compressed(archive, name, rows, v_free.size) for name, rows in sizes)
+        parts["generalized"] = Generalized(jac, mass, v_free, meta.get("dof_names"))
     else:
         parts["matrix"] = _read_matrix(archive)
     entries = [*CONES, *(["cones_rolling"] if "cones_rolling" in archive else [])]
@@ -215,11 +219,11 @@ def _read_meta(archive: Arrays) -> dict[str, Any]:
             f"entry 'meta' cannot be read as JSON ({error}); JSON text in bytes is needed, as "
             "lavender.io.save writes it: save the problem again"
         ) from None
-    if not isinstance(meta, dict):
-        raise InputError(f"entry 'meta' holds a {type(meta).__name__}; a JSON object is needed")
     needed = ("operator", "friction", "name", "names")
-    if missing := [name for name in needed if name not in meta]:
-        raise InputError(f"entry 'meta' has no {', '.join(missing)}; {', '.join(needed)} are needed")
+    if missing := [name for name in needed if not isinstance(meta, dict) or name not in meta]:
+        raise InputError(
+            f"entry 'meta' has no {', '.join(missing)}; a JSON object with {', '.join(needed)} is needed"
+        )
     if meta["operator"] not in FORMS:
         raise InputError(
             f"entry 'meta' has the operator {meta['operator']!r}; one of {', '.join(FORMS)} is needed"
@@ -227,33 +231,7 @@ def _read_meta(archive: Arrays) -> dict[str, Any]:
     return meta
 
 
-def _build_generalized(archive: Arrays, names: list[str] | None) -> Generalized:
-    """Build the generalised form from its entries."""
-    v_free = archive["general_v_free"]
-    n, m = v_free.size, archive["b"].size
-
-    def read(name: str, rows: int) -> sp.csr_array:
-        indptr, indices, data = (archive[f"general_{name}_{part}"] for part in ("indptr", "indices", "data"))
-        return build_checked_csr(indptr, indices, data, rows, n)
-
-    jac, mass = read("jac", m), read("mass", n)
-    return Generalized(jac, mass, v_free, names)
-
-
 # -- quadratic programs ------------------------------------------------------------------------
-
-
-def _list_program_entries(qp: QuadraticProgram) -> Arrays:
-    """Return the entries of a program, with matrices in compressed columns."""
-    entries = Arrays()
-    for name, x in qp.arrays.items():
-        if issparse(x):
-            columns = sp.csc_array(x)
-            entries |= {f"{name}_{part}": getattr(columns, part) for part in ("data", "indices", "indptr")}
-            entries[f"{name}_shape"] = np.array(x.shape, np.int64)
-        else:
-            entries[name] = x
-    return entries
 
 
 def _read_program(archive: Arrays, **more: Any) -> Problem:
@@ -265,8 +243,7 @@ def _read_program(archive: Arrays, **more: Any) -> Problem:
             m, shape = archive[side].size, tuple(archive[f"{name}_shape"].ravel().tolist())
             if shape != (m, n):
                 raise InputError(f"{name}_shape is {shape}; ({m}, {n}) is needed, as {side} has {m} entries")
-            indptr, indices, data = (archive[f"{name}_{part}"] for part in ("indptr", "indices", "data"))
-            arrays[name] = build_checked_csr(indptr, indices, data, n, m).T
+            arrays[name] = _read_compressed(archive, name, n, m).T
     arrays.setdefault("P", sp.csr_array((n, n)))
     return Problem.from_qp(**arrays, **more)
 
@@ -276,19 +253,11 @@ def _read_program(archive: Arrays, **more: Any) -> Problem:
 
 def _read_box_format(archive: Arrays, name: str) -> Stored:
     """Read the box format: w = A l - b, lo <= l <= hi complementary to w; friction cones become contacts."""
-    b = archive["b"]
-    if b.ndim != 1:
-        raise InputError(f"b has shape {b.shape}; one dimension is needed")
-    cones = _build_box_cones(archive, len(b))
-    problem = Problem(b, cones, _read_matrix(archive), name=name)
+    b = as_array("entry 'b'", archive["b"], (None,))
+    problem = Problem(b, _build_box_cones(archive, len(b)), _read_matrix(archive), name=name)
     compare = archive.read_scalar("compare") if "compare" in archive else ""
-    return Stored(
-        problem,
-        "box",
-        impulse=_read_vector(archive, "l_ref", problem),
-        slack=_read_vector(archive, "w_ref", problem),
-        compare=str(compare),
-    )
+    impulse, slack = (_read_vector(archive, name, problem) for name in ("l_ref", "w_ref"))
+    return Stored(problem, "box", impulse, slack, str(compare))
 
 
 def _build_box_cones(archive: Arrays, m: int) -> Cones:
@@ -296,16 +265,14 @@ def _build_box_cones(archive: Arrays, m: int) -> Cones:
     lower, upper = (as_array(f"entry {name!r}", archive[name], (m,), finite=False) for name in ("lo", "hi"))
     if "cone_start" not in archive or archive["cone_start"].size == 0:
         return Cones.bounded(lower, upper)
-    integers = {name: archive[name] for name in ("cone_start", "cone_dim")}
-    count = integers["cone_start"].size
-    start, size = (
-        as_array(f"entry {name!r}", x, (count,), dtype=np.int32).astype(np.int64)
-        for name, x in integers.items()
+    count = archive["cone_start"].size
+    start, size, mu = (
+        as_array(f"entry {name!r}", archive[name], (count,), dtype=dtype)
+        for name, dtype in (("cone_start", np.int32), ("cone_dim", np.int32), ("cone_mu", np.float64))
     )
-    mu = as_array("entry 'cone_mu'", archive["cone_mu"], (count,))
     order = np.argsort(start)
     start, size, mu = start[order], size[order], mu[order]
-    end = start + size
+    end = start.astype(np.int64) + size
     if size.min() < 1 or size.max() > 3 or start.min() < 0 or end.max() > m or np.any(end[:-1] > start[1:]):
         raise InputError(
             f"cones have sizes {size.min()} to {size.max()}, from row {start.min()} to {end.max() - 1}; cone_start "
@@ -319,13 +286,9 @@ def _build_box_cones(archive: Arrays, m: int) -> Cones:
     at = np.searchsorted(first, start)
     contact[at], friction[at] = True, mu
     return Cones(
-        ptr=np.append(first, m),
-        kind=get_block_kinds(contact),
-        lower=lower,
-        upper=upper,
-        mu=friction,
+        ptr=np.append(first, m), kind=get_block_kinds(contact), lower=lower, upper=upper, mu=friction,
         patch_radius=np.zeros(len(first)),
-    )
+    )  # fmt: skip
 
 
 def _read_vector(archive: Arrays, name: str, problem: Problem) -> FloatArray | None:
@@ -340,34 +303,33 @@ def _read_matrix(archive: Arrays) -> Any:
     shape = tuple(archive["A_shape"].ravel().tolist())
     if shape != (m, m):
         raise InputError(f"A_shape is {shape}; ({m}, {m}) is needed, as b has {m} rows")
-    return build_checked_csr(archive["A_indptr"], archive["A_indices"], archive["A_data"], m, m)
+    return _read_compressed(archive, "A", m, m)
+
+
+def _read_compressed(archive: Arrays, name: str, m: int, n: int) -> sp.csr_array:
+    """Build a matrix (m, n) from the entries of its compressed rows, with checked indices."""
+    data, indices, indptr = (archive[f"{name}_{part}"] for part in COMPRESSED)
+    return build_checked_csr(indptr, indices, data, m, n)
 
 
 def build_checked_csr(
     indptr: np.ndarray, indices: np.ndarray, data: np.ndarray, m: int, n: int
 ) -> sp.csr_array:
-    """Build a CSR matrix (m, n) from arrays of a file, with checked indices; `data` may be longer than needed."""
+    """Build a CSR matrix (m, n) from arrays of a file, with checked indices; arrays may be longer than needed."""
     for name, x, kinds in (("pointers", indptr, "iu"), ("indices", indices, "iu"), ("values", data, "buif")):
         if x.ndim != 1 or x.dtype.kind not in kinds:
             raise InputError(
                 f"the {name} of a compressed matrix have dtype {x.dtype} and shape {x.shape}; "
                 f"one dimension of {'whole ' if kinds == 'iu' else ''}numbers is needed"
             )
-    if len(indptr) != m + 1 or indptr[0] != 0 or np.any(indptr[1:] < indptr[:-1]):
+    used = int(indptr[-1]) if len(indptr) else 0
+    try:
+        if np.any(indptr[1:] < indptr[:-1]):  # SciPy does not test it if there are no entries.
+            raise ValueError("pointers decrease")
+        matrix = sp.csr_array((data[:used].astype(float), indices[:used], indptr), shape=(m, n))
+        matrix.check_format(full_check=True)
+    except ValueError as error:
         raise InputError(
-            f"the pointers of a compressed matrix are {indptr.tolist()!s:.60}; {m + 1} numbers that start with 0 and "
-            f"do not decrease are needed: the first entry of each of its {m} rows, and the number of entries"
-        )
-    used = int(indptr[-1])
-    if used > len(indices) or used > len(data):
-        raise InputError(
-            f"the pointers of a compressed matrix announce {used} entries, but there are {len(indices)} "
-            f"indices and {len(data)} values; equal numbers are needed"
-        )
-    if used and (indices[:used].min() < 0 or indices[:used].max() >= n):
-        raise InputError(
-            f"a compressed matrix has column indices from {indices[:used].min()} to {indices[:used].max()}; "
-            f"0 to {n - 1} is needed, because it has {n} columns"
-        )
-    parts = (data[:used].astype(np.float64), indices[:used].astype(np.int64), indptr.astype(np.int64))
-    return sp.csr_array(parts, shape=(m, n))
+            f"pointers, indices and values of a compressed matrix ({m}, {n}) do not fit: {error}"
+        ) from None
+    return matrix

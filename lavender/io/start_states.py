@@ -23,7 +23,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray, as_array, check_int
 from lavender.base.errors import InputError
 from lavender.io.mujoco_memory import import_mujoco
-from lavender.io.stored import SUFFIXES, as_path, read_arrays, read_first_bytes
+from lavender.io.stored import SUFFIXES, as_path, read_arrays, read_bytes
 
 CONTROLS = ("zero", "random", "hold")
 Control = str | Callable[[Any, Any, int], Any] | Any
@@ -94,7 +94,7 @@ def load_controls(control: Control) -> Control:
         return control
     needed = f"one of {', '.join(CONTROLS)}, or a .npy file of one array, is needed"
     try:
-        read_first_bytes(control)  # Raises an error if `control` is not a regular file.
+        read_bytes(control, count=8)  # Raises an error if `control` is not a regular file.
         # A memory map cannot be longer than the file, whatever size the header declares.
         result = np.load(control, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import json
 import math
 import os
 import stat
 import zipfile
-import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from threading import get_native_id
-from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -25,15 +22,6 @@ HDF5 = (".hdf5", ".h5", ".hdf")
 SUFFIXES = (".npz", *HDF5)  # Suffixes of problem files.
 ENGINE = "engine.jsonl"  # File of the engine's own results, in the folder of recorded problems.
 STATES_FOLDER = "states"  # Folder of the states before recorded steps, in the folder of recorded problems.
-
-# The name of a temporary file contains this many characters of the final name; names may have 255 bytes, and a
-# character up to four.
-TEMPORARY_NAME_CHARACTERS = 40
-#: Exceptions that zipfile and NumPy raise for damaged archives.
-READ_ERRORS = (
-    zipfile.BadZipFile, zlib.error, TokenError, EOFError, OSError, RuntimeError, ValueError, SyntaxError, TypeError,
-    OverflowError, MemoryError,
-)  # fmt: skip
 
 
 def prepare_step_folder(path: str | os.PathLike[str], replace: bool = False, continued: bool = False) -> Path:
@@ -61,16 +49,10 @@ def prepare_step_folder(path: str | os.PathLike[str], replace: bool = False, con
 
 def resolve_destination(path: str | os.PathLike[str]) -> Path:
     """Return the path at which a file is written: the target of symbolic links, a regular file or a new one."""
-    path = as_path(path)
-    try:
-        target = Path(os.path.realpath(path))
-        if target.exists() and not target.is_file():
-            raise InputError(f"cannot write {path}: it is no regular file; give the name of a file")
-    except (OSError, ValueError) as error:
-        raise (
-            error if isinstance(error, InputError) else InputError(f"cannot write {path}: {error}")
-        ) from None
-    return target
+    target = os.path.realpath(as_path(path))
+    if os.path.exists(target) and not os.path.isfile(target):
+        raise InputError(f"cannot write {path}: it is no regular file; give the name of a file")
+    return Path(target)
 
 
 def check_writable(path: str | os.PathLike[str], folder: bool = False) -> Path:
@@ -81,8 +63,9 @@ def check_writable(path: str | os.PathLike[str], folder: bool = False) -> Path:
         parent = parent.parent
     if not parent.is_dir():
         raise InputError(f"cannot write {path}: {parent} is not a folder")
-    existing = [path] if not folder and path.exists() else []
-    if not all(os.access(x, os.W_OK) for x in (parent, *existing)):
+    if not os.access(parent, os.W_OK) or (
+        not folder and os.path.exists(path) and not os.access(path, os.W_OK)
+    ):
         raise InputError(f"cannot write {path}: you have no permission to write there")
     return path
 
@@ -104,8 +87,7 @@ def write_atomically(path: str | os.PathLike[str], write: Callable[[Path], Any])
     link, the target of the link is replaced. The permissions of an existing file are kept.
     """
     target = resolve_destination(path)
-    short = target.name[:TEMPORARY_NAME_CHARACTERS]
-    temporary = target.with_name(f".{short}.{os.getpid()}.{get_native_id()}.part")
+    temporary = target.with_name(f".{os.getpid()}.{get_native_id()}.part")
     try:
         write(temporary)
         # A new file has no permissions to keep, and some file systems have none.
@@ -113,12 +95,7 @@ def write_atomically(path: str | os.PathLike[str], write: Callable[[Path], Any])
             temporary.chmod(stat.S_IMODE(target.stat().st_mode))
         os.replace(temporary, target)
     except OSError as error:
-        reason = error.strerror or error
-        if isinstance(error, FileNotFoundError) and not target.parent.is_dir():
-            reason = f"the folder {target.parent} does not exist"
-        elif error.errno in (errno.ENOSPC, errno.EDQUOT):
-            reason = f"{reason}; free disk space"
-        raise InputError(f"cannot write {path}: {reason}") from None
+        raise InputError(f"cannot write {path}: {error.strerror or error}") from None
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -162,13 +139,13 @@ def load_or_make_file(path: Path, is_current: Callable[[bytes], bool], make: Cal
 def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, Any]) -> None:
     """Write an archive of arrays (.npz) with `write_atomically`; their names may equal names of arguments of NumPy."""
 
-    def write_to(temporary: Path) -> None:
+    def write(temporary: Path) -> None:
         with zipfile.ZipFile(temporary, "x", zipfile.ZIP_DEFLATED) as archive:
             for name, array in arrays.items():
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as stream:
                     np.lib.format.write_array(stream, np.asanyarray(array), allow_pickle=False)
 
-    write_atomically(path, write_to)
+    write_atomically(path, write)
 
 
 class Arrays(dict[str, np.ndarray]):
@@ -196,7 +173,7 @@ def read_arrays(path: str | os.PathLike[str]) -> Arrays:
                 arrays[name] = archive[name]
                 if not isinstance(arrays[name], np.ndarray):
                     raise ValueError("it is not an array")
-    except READ_ERRORS as error:
+    except Exception as error:  # Damaged archives raise exceptions of zipfile, zlib, tokenize and others.
         entry = f"entry {name!r} of {path}" if name else f"{path}"
         raise InputError(f"{entry} cannot be read: {error}; an .npz archive of arrays is needed") from None
     return arrays
@@ -204,27 +181,25 @@ def read_arrays(path: str | os.PathLike[str]) -> Arrays:
 
 def check_figure_path(path: str | os.PathLike[str]) -> Path:
     """Return the path of a figure, with .png if it has no suffix; InputError if matplotlib cannot write the format."""
-    path = as_path(path)
-    path = path if path.suffix else path.with_name(path.name + ".png")
     from matplotlib.backend_bases import FigureCanvasBase
 
-    known = FigureCanvasBase.get_supported_filetypes()
-    if path.suffix[1:].lower() not in known:
-        formats = ", ".join(sorted(known))
-        raise InputError(f"cannot write the figure {str(path)!r}: its suffix must be of {formats}")
+    path = as_path(path)
+    path = path if path.suffix else path.with_name(path.name + ".png")
+    known = ", ".join(sorted(FigureCanvasBase.get_supported_filetypes()))
+    if path.suffix[1:].lower() not in known.split(", "):
+        raise InputError(f"cannot write the figure {str(path)!r}: its suffix must be of {known}")
     return path
 
 
 def write_figure(canvas: Any, path: str | os.PathLike[str], **options: Any) -> None:
     """Write a figure of matplotlib with `write_atomically`; the suffix selects the format (default: png)."""
-    path = check_figure_path(path)
     from matplotlib import rc_context
 
+    path = check_figure_path(path)
+    options["format"] = path.suffix[1:].lower()
     try:
         with rc_context({"pdf.fonttype": 42}):  # Embed TrueType fonts, since publishers reject Type 3 fonts.
-            write_atomically(
-                path, lambda part: canvas.savefig(part, format=path.suffix[1:].lower(), **options)
-            )
+            write_atomically(path, lambda part: canvas.savefig(part, **options))
     except (ValueError, OverflowError) as error:
         if isinstance(error, InputError):
             raise
@@ -240,8 +215,8 @@ def as_path(path: str | os.PathLike[str]) -> Path:
     return Path(path)
 
 
-def read_first_bytes(path: str | os.PathLike[str], count: int = 8, role: str = "") -> bytes:
-    """Return the first `count` bytes of a file, or all bytes if `count` is -1; messages name it by its `role`."""
+def read_bytes(path: str | os.PathLike[str], role: str = "", count: int = -1) -> bytes:
+    """Return the first `count` bytes of a file, or all of them; messages name the file by its `role`."""
     path = as_path(path)
     try:
         with open(path, "rb") as stream:
@@ -249,11 +224,6 @@ def read_first_bytes(path: str | os.PathLike[str], count: int = 8, role: str = "
     except (OSError, ValueError) as error:
         named = f"{role} {str(path)!r}" if role else path
         raise InputError(f"cannot read {named}: {getattr(error, 'strerror', None) or error}") from None
-
-
-def read_whole_file(path: str | os.PathLike[str], role: str) -> bytes:
-    """Return all bytes of a file; it raises the errors of `read_first_bytes`."""
-    return read_first_bytes(path, -1, role)
 
 
 def pack_header(magic: bytes, header: Mapping[str, Any]) -> bytes:

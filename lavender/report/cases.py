@@ -21,7 +21,7 @@ import numpy as np
 from lavender import io, suite
 from lavender.base.arrays import FloatArray, check_bool, check_sequence
 from lavender.base.errors import InputError, SolverUnavailable
-from lavender.io.stored import ENGINE, STATES_FOLDER, SUFFIXES, read_whole_file
+from lavender.io.stored import ENGINE, STATES_FOLDER, SUFFIXES, read_bytes
 from lavender.judge.residuals import DEFAULT_THRESHOLD, Residual, residual
 from lavender.problem import Problem, check_problem
 from lavender.problem.derived import cached_property
@@ -221,7 +221,7 @@ def read_engine_lines(folder: Path) -> list[dict[str, Any]]:
     """
     lines: list[Any] = []
     if (folder / ENGINE).is_file():
-        text = read_whole_file(folder / ENGINE, "the engine's answers").decode(errors="replace")
+        text = read_bytes(folder / ENGINE, "the engine's answers").decode(errors="replace")
         for line in text.splitlines():
             with contextlib.suppress(ValueError, RecursionError):
                 lines.append(json.loads(line))

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from lavender.base.errors import InputError, require_packages
-from lavender.io.stored import as_path, make_folder, read_whole_file
+from lavender.io.stored import as_path, make_folder, read_bytes
 from lavender.judge.solution import CONFIRMED
 from lavender.report.text import format_tolerance
 
@@ -175,7 +175,7 @@ def read(path: str | Path) -> DataFrame:
 
     path = as_path(path)
     path = path / "records.jsonl" if path.is_dir() else path
-    content = read_whole_file(path, "records")
+    content = read_bytes(path, "records")
     dropped = len(content) - content.rfind(b"\n") - 1
     # Editors of some systems begin a file, and so each part of joined files, with a byte order mark.
     whole = content[: content.rfind(b"\n") + 1].replace(b"\xef\xbb\xbf", b"")

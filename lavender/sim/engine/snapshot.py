@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.errors import InputError
-from lavender.io.stored import pack_header, read_whole_file, unpack_header, write_atomically
+from lavender.io.stored import pack_header, read_bytes, unpack_header, write_atomically
 from lavender.sim.engine.check import check_snapshot_fields
 from lavender_ext.engine.arrays import compute_buffer_lengths
 
@@ -76,7 +76,7 @@ class Snapshot:
         InputError
             The file is not a snapshot, is damaged, or has another version.
         """
-        data = read_whole_file(path, "the snapshot")
+        data = read_bytes(path, "the snapshot")
         if not data.startswith(MAGIC):
             raise InputError(
                 f"{str(path)!r} does not begin as a snapshot of lavender; a file that Snapshot.save wrote is needed"
