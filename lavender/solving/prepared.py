@@ -285,23 +285,23 @@ class Prepared:
             self._target = updated, target
         return updated
 
-    def _solve(self, arguments: SolveArguments, given: Problem) -> Solution:
-        """Prepare, step and finish, without the compiled call for small problems; solvers get `given.disk`."""
-        if type(given) is not Problem:
-            check_problem(given)
+    def _solve(self, arguments: SolveArguments, original: Problem) -> Solution:
+        """Prepare, step and finish, without the compiled call for small problems; solvers get `original.disk`."""
+        if type(original) is not Problem:
+            check_problem(original)
         deadline, start, callback = arguments.deadline, None, arguments.callback
         if arguments.impulse is not None:
-            start = given.make_start(arguments.impulse)
+            start = original.make_start(arguments.impulse)
         setup = self._setup
-        if isinstance(setup, NotSetUp) or setup.is_used or given is not self.problem:
-            setup = self._set_up(given, deadline)
-        problem = given.disk
-        has_default_start = start is None and given.guess is None
+        if isinstance(setup, NotSetUp) or setup.is_used or original is not self.problem:
+            setup = self._set_up(original, deadline)
+        problem = original.disk
+        has_default_start = start is None and original.guess is None
         if start is None:
-            start = given._start.copy() if given.guess is None else given.guess.copy()
-        if problem is not given:
-            start = given.on_disk(start)
-            callback = None if callback is None else partial(_call_in_given_tangents, given, callback)
+            start = original._start.copy() if original.guess is None else original.guess.copy()
+        if problem is not original:
+            start = original.on_disk(start)
+            callback = None if callback is None else partial(_call_in_original_tangents, original, callback)
         loop = Loop(
             problem=problem, solver=None, state=None, impulse=start, tol=arguments.tol, deadline=deadline,
             callback=callback, records=[] if arguments.history else None,
@@ -317,27 +317,27 @@ class Prepared:
                 setup.state.failed_call = arguments.failed_call
                 setup.state.loop = loop if arguments.history else None
         solution = self._run(loop, setup, arguments.max_iter, has_default_start)
-        if problem is not given:
-            impulse, proof = mark_read_only(given.cones.stretch * solution.impulse), solution.certificate
+        if problem is not original:
+            impulse, proof = mark_read_only(original.cones.stretch * solution.impulse), solution.certificate
             # The impulse is judged again, because multiplying it by the scale of the ellipses rounds it.
-            judged = residual(given, impulse, "float64", tol=arguments.tol)
-            proof = None if proof is None else mark_read_only(given.cones.stretch * proof)
+            judged = residual(original, impulse, "float64", tol=arguments.tol)
+            proof = None if proof is None else mark_read_only(original.cones.stretch * proof)
             solution = replace(solution, impulse=impulse, residual=judged, certificate=proof)
-        name = name_start(given.guess, arguments.impulse)
+        name = name_start(original.guess, arguments.impulse)
         return solution.with_fields(start=name) if name else solution
 
     # -- set-up ----------------------------------------------------------------------------------
 
-    def _set_up(self, given: Problem, deadline: Deadline | None) -> SetUp | NotSetUp:
+    def _set_up(self, original: Problem, deadline: Deadline | None) -> SetUp | NotSetUp:
         """Set the solver up for a problem, unless the deadline has passed; reuse its state for the same structure.
 
         The problem replaces the old one unless an error is raised.
         """
-        begin, spec, last, problem = perf_counter(), self.spec, self._setup, given.disk
-        is_other = given is not self.problem
+        begin, spec, last, problem = perf_counter(), self.spec, self._setup, original.disk
+        is_other = original is not self.problem
         if is_other:
-            if not has_same_operator(given, self.problem):
-                check_accepted(given, spec)
+            if not has_same_operator(original, self.problem):
+                check_accepted(original, spec)
             self.setup_time = 0.0
         if problem.metric.reference_energy < 0.0:
             # Compute the judge's reference before a solver gets the problem.
@@ -362,7 +362,7 @@ class Prepared:
                 setup = NotSetUp()
             except BREAKDOWN as error:
                 setup = NotSetUp(failure=format_error(error))
-        self.problem, self._setup = given, setup
+        self.problem, self._setup = original, setup
         self.setup_time += perf_counter() - begin
         return setup
 
@@ -566,11 +566,12 @@ def check_arguments(
     )
 
 
-def _call_in_given_tangents(
-    given: Problem, callback: Callback, done: int, impulse: FloatArray, _: Residual
+def _call_in_original_tangents(
+    original: Problem, callback: Callback, done: int, impulse: FloatArray, _: Residual
 ) -> Any:
     """Call the callback of a problem with ellipses with an impulse (m,) [N s] of its `disk`."""
-    return callback(done, given.cones.stretch * impulse, residual(given, given.cones.stretch * impulse))
+    impulse = original.cones.stretch * impulse
+    return callback(done, impulse, residual(original, impulse, "float64"))
 
 
 def _make_solver(spec: SolverSpec, options: dict[str, Any]) -> Solver:
