@@ -1,13 +1,11 @@
-"""Random quadratic programs and LCPs, their KKT errors in 50 digits, and calls of backends without this package."""
+"""Random quadratic programs and LCPs, their KKT errors in long double, and calls of backends without this package."""
 
 import warnings
 
-import mpmath
 import numpy as np
 
 import lavender as lv
 
-DIGITS = 50
 TOL = 1e-6
 KINDS = "definite", "singular", "repeated", "placeholder"
 MAX_RATIO = 10.0  # An answer may be this many times as far from the KKT conditions as the backend's own.
@@ -82,47 +80,34 @@ def draw_lcp(seed):
 
 
 def compute_kkt_error(program, x, y=None, z=None, z_box=None):
-    """Compute the largest violation of the KKT conditions in 50 digits; infinite without an answer.
+    """Compute the largest violation of the KKT conditions in long double; infinite without an answer.
 
     Rows are relative to their largest term, stationarity to its largest term, and complementarity to the largest
     product of a term and a multiplier, all to at least 1. Numbers of the drawn programs are near 1.
     """
     n = len(program["q"])
-    parts = [np.zeros(0) if v is None else np.asarray(v, float).ravel() for v in (x, y, z, z_box)]
-    if len(parts[0]) != n or not all(np.isfinite(v).all() for v in parts):
+    A, G = (program.get(name, np.zeros((0, n))).astype(np.longdouble) for name in "AG")
+    parts = ([] if v is None else np.ravel(v) for v in (x, y, z, z_box))
+    x, y, z, box = (np.array(part, np.longdouble) for part in parts)
+    box = box if len(box) else np.zeros(n)
+    if len(x) != n or len(y) < len(A) or len(z) < len(G) or not all(np.isfinite(v).all() for v in (x, y, z, box)):
         return np.inf
-    with mpmath.workdps(DIGITS):
-        x, y, z, box = ([mpmath.mpf(float(v)) for v in part] for part in parts)
-        box = box or [mpmath.mpf(0)] * n
+    y, z = y[: len(A)], z[: len(G)]  # Some backends return a zero without rows.
 
-        def rows(matrix, v):
-            return [mpmath.fdot(map(float, row), v) for row in matrix]
+    def largest(*vectors):
+        return max([1.0, *(np.abs(v[np.isfinite(v)]).max(initial=0.0) for v in vectors)])
 
-        def largest(*vectors):
-            return max([mpmath.mpf(1), *(abs(v) for vector in vectors for v in vector if mpmath.isfinite(v))])
-
-        A, G = (program.get(name, np.zeros((0, n))) for name in "AG")
-        if len(y) < len(A) or len(z) < len(G):
-            return np.inf
-        y, z = y[: len(A)], z[: len(G)]  # Some backends return a zero without rows.
-        b, h, low, high = (
-            [mpmath.mpf(float(v)) for v in program.get(name, missing)]
-            for name, missing in (("b", ()), ("h", ()), ("lb", np.full(n, -np.inf)), ("ub", np.full(n, np.inf)))
-        )
-        terms = rows(program["P"], x), map(float, program["q"]), rows(A.T, y), rows(G.T, z), box
-        terms = [list(map(mpmath.mpf, term)) for term in terms]
-        force = largest(*terms)
-        errors = [abs(mpmath.fsum(line)) / force for line in zip(*terms, strict=True)]
-        ax, gx = rows(A, x), rows(G, x)
-        size = largest(ax, b, gx, h, x)
-        errors += [abs(r - c) / size for r, c in zip(ax, b, strict=True)]
-        sides = [(r - c, w) for r, c, w in zip(gx, h, z, strict=True)]
-        sides += [(c - v, max(-w, 0)) for c, v, w in zip(low, x, box, strict=True)]
-        sides += [(v - c, max(w, 0)) for c, v, w in zip(high, x, box, strict=True)]
-        for gap, w in sides:
-            errors += [max(gap, 0) / size, max(-w, 0) / force]
-            errors.append(abs(gap * w) / (size * force) if mpmath.isfinite(gap) else abs(w) / force)
-        return float(max(errors))
+    ends = {"b": np.zeros(0), "h": np.zeros(0), "lb": np.full(n, -np.inf), "ub": np.full(n, np.inf)}
+    b, h, low, high = (np.asarray(program.get(name, missing)) for name, missing in ends.items())
+    terms = program["P"] @ x, program["q"], A.T @ y, G.T @ z, box
+    ax, gx = A @ x, G @ x
+    force, size = largest(*terms), largest(ax, b, gx, h, x)
+    gap = np.concatenate([gx - h, low - x, x - high])
+    w = np.concatenate([z, np.maximum(-box, 0.0), np.maximum(box, 0.0)])
+    is_finite = np.isfinite(gap)
+    product = np.where(is_finite, np.abs(np.where(is_finite, gap, 0.0) * w) / size, np.abs(w)) / force
+    errors = np.abs(sum(terms)) / force, np.abs(ax - b) / size, np.maximum(gap, 0.0) / size, -w / force, product
+    return float(max(np.max(part, initial=0.0) for part in errors))
 
 
 def call_alone(program, name, tol=TOL):

@@ -4,6 +4,7 @@ from dataclasses import replace
 from itertools import product
 
 import numpy as np
+from random_problems import random_bodies_and_contacts
 
 import lavender as lv
 
@@ -76,24 +77,9 @@ def drawn(seed, kind, law="coulomb", operator="dense", count=3):
 
 
 def _of_bodies(rng, cones, law):
-    c, n = cones.n_blocks, 4
-    normal = rng.standard_normal((c, 3))
-    normal /= np.linalg.norm(normal, axis=1)[:, None]
-    tangent = np.cross(normal, rng.standard_normal((c, 3)))
-    tangent /= np.linalg.norm(tangent, axis=1)[:, None]
-    pairs = np.array([(-1, 0), (0, 1), (1, 2), (2, 3), (3, -1)])
-    root = rng.standard_normal((n, 3, 3))
-    rows = lv.Rows(
-        inv_mass=rng.uniform(0.5, 2.0, n), inv_inertia=root @ root.transpose(0, 2, 1) + np.eye(3),
-        v_free=rng.standard_normal((n, 6)), jac=rng.standard_normal((2, 12)), joint_ptr=[0, 2], joint_body=[(0, 2)],
-        normal=normal, tangent=tangent, arm_a=rng.standard_normal((c, 3)), arm_b=rng.standard_normal((c, 3)),
-        contact_body=pairs[np.arange(c) % len(pairs)],
-    )  # fmt: skip
-    joint = lv.Cones(
-        np.array([0, 2], np.int32), np.zeros(1, np.int32), np.full(2, -0.5), np.full(2, np.inf), np.zeros(1),
-        np.zeros(1),
-    )  # fmt: skip
-    cones = joint + cones
+    rows = random_bodies_and_contacts(rng, bodies=4, joints=1, contacts=cones.n_blocks)
+    k = len(rows.jac)
+    cones = lv.Cones([0, k], [lv.ROW], np.full(k, -0.5), np.full(k, np.inf), [0.0], [0.0]) + cones
     m = cones.n_rows
     b = rng.standard_normal(m)
     b[cones.normal_rows] += rng.choice([-0.5, 1.5], len(cones.normal_rows), p=[0.25, 0.75])

@@ -13,7 +13,6 @@ import pytest
 from calls import robot
 from mujoco_scene import scene
 from stacks import stack
-from worked import python
 
 import lavender as lv
 from lavender import cli
@@ -93,19 +92,6 @@ def test_solve_prints_one_line_and_writes_the_answer(lavender, path, tmp_path):
         np.testing.assert_array_equal(answer["impulse"], exact.impulse)
         assert answer["relative"] == exact.residual.relative
         assert str(answer["status"]) == "CONVERGED"
-
-
-def test_help_is_quick_and_names_every_command():
-    code = "import sys, lavender.cli as c\ntry: c.main(['--help'])\nfinally: print(*sys.modules, file=sys.stderr)"
-    done = python("-c", code)
-    for name in ("report", "check", "solve", "solvers"):
-        assert name in done.stdout
-    # What takes time to load is loaded by the command that needs it.
-    assert (
-        set(done.stderr.split())
-        & {"matplotlib", "h5py", "qpsolvers", "pandas", "rich.table", "jinja2", "lavender.report", "lavender.audit"}
-        == set()
-    )
 
 
 def test_solve_command_with_output_equal_to_the_problem_ends_with_2(lavender, path):

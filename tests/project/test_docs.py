@@ -229,19 +229,6 @@ def test_written_pages_are_current(generate):
         assert current, f"docs/{name} is not current: run `python docs/generate.py --pages`"
 
 
-def test_the_chapter_names_functions_that_exist():
-    text = (ROOT / "docs" / "chapter-answers.md").read_text(encoding="utf-8")
-    for function, file in (
-        ("prepare_substep", "engine/substep.pyx"),
-        ("finish_substep", "engine/substep.pyx"),
-        ("relax_contact", "core/contact.pxd"),
-    ):
-        assert f" {function}(" in (ROOT / "lavender_ext" / file).read_text(encoding="utf-8")
-        assert file in text
-    for file in re.findall(r"`((?:lavender_ext|tests)/[\w/]+\.\w+)`", text):
-        assert (ROOT / file).is_file(), file
-
-
 def test_every_test_that_a_page_names_exists():
     sources = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("*.py"))
     known = {path.stem for path in (ROOT / "tests").rglob("test_*.py")} | set(re.findall(r"def (test_\w+)", sources))

@@ -1,6 +1,5 @@
 """Threads: a problem is shared freely, a prepared solver serves one of them at a time and says so."""
 
-import sys
 import sysconfig
 import threading
 import time
@@ -8,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from random_problems import random_contact_problem, random_lcp
+from random_problems import random_lcp
 from worked import python
 
 import lavender as lv
@@ -40,18 +39,6 @@ def test_prepared_solver_in_a_second_thread_raises():
     assert solver.solve(tol=1e-6, max_iter=10_000).success  # free again
 
 
-def at_once(function, n=8):
-    """Results of n threads that begin together."""
-    gate = threading.Barrier(n)
-
-    def run():
-        gate.wait(600)
-        return function()
-
-    with ThreadPoolExecutor(n) as pool:
-        return [future.result() for future in [pool.submit(run) for _ in range(n)]]
-
-
 @pytest.mark.skipif(not sysconfig.get_config_var("Py_GIL_DISABLED"), reason="this Python has a GIL")
 def test_kernels_do_not_enable_the_gil():
     modules = [".".join(p.relative_to(KERNELS.parent).with_suffix("").parts) for p in KERNELS.rglob("*.pyx")]
@@ -63,22 +50,6 @@ for name in {modules}:
     assert not sys._is_gil_enabled(), name
 """
     python("-W", "error", "-c", code)
-
-
-@pytest.fixture
-def often():
-    """Threads change as often as they can."""
-    before = sys.getswitchinterval()
-    sys.setswitchinterval(1e-6)
-    yield
-    sys.setswitchinterval(before)
-
-
-def test_derived_arrays_are_one_object_for_all_threads(often):
-    for seed in range(20):
-        problem = random_contact_problem(seed)
-        for name in ("data", "csr", "csr_data", "jacobian"):
-            assert len({id(x) for x in at_once(lambda p=problem, n=name: getattr(p, n))}) == 1
 
 
 def test_an_error_of_one_thread_stops_the_others():

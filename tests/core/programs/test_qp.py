@@ -207,6 +207,7 @@ def test_solve_qp_of_an_infeasible_program_has_the_residual_of_its_impulse():
         (np.diag([1.0, 0.0]), [1.0, -1.0], {"G": [[1.0, 0.0]], "h": [1.0]}),
         (np.ones((2, 2)), [1.0, -1.0], {"A": [[0.0, 0.0]], "b": [0.0]}),
         (np.zeros((2, 2)), [8.0, -28.0], {"lb": [-0.5, 0.5], "ub": [0.25, np.inf]}),
+        *((np.zeros((2, 2)), [-1.0, 0.0], {"G": -np.eye(2), "h": h}) for h in ([-2.0, -1.0], [-0.5, 3.0])),
     ],
 )
 @pytest.mark.parametrize("tol", [1e-3, 1e-6, 1e-9])
@@ -219,6 +220,7 @@ def test_solve_qp_of_an_unbounded_program_returns_a_ray(hessian, q, rows, tol):
     np.testing.assert_allclose(hessian @ d, 0.0, atol=1e-6)
     assert np.dot(q, d) < -0.5
     assert rows.get("lb") is None or d.min() >= -1e-6
+    assert "G" not in rows or ((rows["G"] @ answer.x <= np.array(rows["h"]) + 1e-9) & (rows["G"] @ d <= 1e-12)).all()
 
 
 @pytest.mark.parametrize("solver", ["auto", "osqp"])

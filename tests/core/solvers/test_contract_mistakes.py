@@ -3,7 +3,7 @@
 `FAULTS` also have the check that must fail, and words of its sentence.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -21,6 +21,7 @@ class State:
     b: np.ndarray
     cones: lv.Cones
     done: int = 0
+    step: dict[int, float] = field(default_factory=dict)  # of friction components, by their first row [kg]
 
 
 class Sweeps:
@@ -115,8 +116,9 @@ class Sweeps:
                 continue
             x[first] = max(0.0, x[first] - (A[first] @ x - b[first]) / A[first, first])
             for rows, bound in self.components(c, i):
-                step = 1.0 / np.linalg.eigvalsh(A[np.ix_(rows, rows)]).max()
-                y = x[rows] - step * (A[rows] @ x - b[rows])
+                if rows[0] not in state.step:
+                    state.step[rows[0]] = 1.0 / np.linalg.eigvalsh(A[np.ix_(rows, rows)]).max()
+                y = x[rows] - state.step[rows[0]] * (A[rows] @ x - b[rows])
                 norm = np.linalg.norm(y)
                 if m == "discs are squares":
                     x[rows] = np.clip(y, -bound * x[first], bound * x[first])
@@ -170,24 +172,29 @@ MISTAKES = (
 )  # fmt: skip
 
 
-def find_unmet(mistake, monkeypatch):
+@pytest.fixture
+def find_unmet(register, monkeypatch):
     """Return the first check that the solver with a mistake does not meet, and the sentence of its failure."""
-    monkeypatch.setattr(Sweeps, "mistake", mistake)
-    lv.register(SPEC, replace=True)
-    for check in contract.list_checks(SPEC):
-        if failure := find_failure(SPEC, check).text:
-            return f"{check.name}: {failure}"
-    return ""
+
+    def find(mistake):
+        monkeypatch.setattr(Sweeps, "mistake", mistake)
+        register(SPEC)
+        for check in contract.list_checks(SPEC):
+            if failure := find_failure(SPEC, check).text:
+                return f"{check.name}: {failure}"
+        return ""
+
+    return find
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_contract_finds_a_solver_with_one_mistake(mistake, monkeypatch):
-    failure = find_unmet(mistake, monkeypatch)
+def test_contract_finds_a_solver_with_one_mistake(mistake, find_unmet):
+    failure = find_unmet(mistake)
     assert failure and "raised in" not in failure, failure
 
 
-def test_contract_is_met_by_the_solver_without_a_mistake(monkeypatch):
-    assert find_unmet("", monkeypatch) == ""
+def test_contract_is_met_by_the_solver_without_a_mistake(find_unmet):
+    assert find_unmet("") == ""
 
 
 class StopsAtTwo(Sweeps):

@@ -2,7 +2,9 @@
 
 import dataclasses
 import gc
+import os
 import signal
+import sys
 import threading
 import time
 import weakref
@@ -111,3 +113,21 @@ def test_text_of_a_solution_names_its_start(name, arguments):
         assert "from the given impulses," in str(solve(stored, name, impulse=given, **arguments))
     starts = [solution.start for solution in lv.solve_many([problem, stored], name, impulses=[given, None], tol=1e-6)]
     assert starts == ["the given impulses", "problem.guess"]
+
+
+@pytest.mark.parametrize("name", ["pgs", "newton"])
+def test_solve_of_new_problem_computes_each_check_and_array_once(name):
+    calls, folder, before = [], os.path.dirname(lv.__file__), sys.getprofile()
+
+    def record(frame, event, _):
+        if event == "call" and frame.f_code.co_filename.startswith(folder):
+            calls.append(frame.f_code.co_name)
+
+    lv.solve(TINY, name)
+    sys.setprofile(record)
+    try:
+        lv.solve(lv.Problem.lcp(TINY.matrix, TINY.b), name)
+    finally:
+        sys.setprofile(before)
+    once = ("check_accepted", "check_arguments", "get_zero_impulse_reference", "_compressed", "finish")
+    assert {function: calls.count(function) for function in once} == dict.fromkeys(once, 1)

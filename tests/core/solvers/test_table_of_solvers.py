@@ -1,50 +1,9 @@
-"""A built-in solver is a file and a line of the table: nothing else lists solvers, and every command finds it."""
+"""A built-in solver is a file and a line of the table: every command finds it."""
 
-import ast
 import os
 import textwrap
 
-import pytest
 from worked import ROOT, python
-
-from lavender.solvers import registry
-
-#: A literal with more names than half of the table is a list of all solvers.
-MAX_NAMES = 6
-#: Lists that a new solver need not join, with the reason.
-EXPERIMENTS = {
-    "lavender/report/figures.py": "solvers with the first colours; all others follow",
-    "tests/export/test_build.py": "methods of the C library",
-    "tests/report/test_report_tables.py": "invented times of a table",
-    "tests/suite/test_stalled.py": "numbers of sweeps that were measured",
-}
-
-
-def find_lists_of_solvers():
-    """Yield (file, line, number of names) of the literal collections with more than `MAX_NAMES` built-in solvers."""
-    own = {name for name, spec in registry.specs().items() if spec.builtin and not spec.external}
-    files = [
-        *ROOT.glob(".ci/*"),
-        *(p for f in ("lavender", "tests", "benchmarks") for p in ROOT.joinpath(f).rglob("*.py")),
-    ]
-    for path in sorted(files):
-        if path.is_dir() or (path.name == "__init__.py" and path.parent.name == "solvers"):
-            continue
-        text = path.read_text(encoding="utf-8", errors="replace")
-        if path.suffix != ".py" and "python" not in text.partition("\n")[0]:
-            continue
-        for node in ast.walk(ast.parse(text)):
-            parts = getattr(node, "elts", None) or getattr(node, "keys", None) or []
-            constants = [x for part in parts if part is not None for x in ast.walk(part) if isinstance(x, ast.Constant)]
-            names = {x.value for x in constants if isinstance(x.value, str)} & own
-            if len(names) > MAX_NAMES:
-                yield path.relative_to(ROOT).as_posix(), node.lineno, len(names)
-
-
-def test_no_literal_lists_all_solvers_except_the_table():
-    found = [x for x in find_lists_of_solvers() if x[0] not in EXPERIMENTS]
-    assert not found, f"ask lavender.available or a field of SolverSpec instead: {found}"
-
 
 TOY = """
 '''Projected Richardson iteration: lambda <- clip(lambda - omega w, lower, upper), omega = 1 / max_i sum_j |A_ij|.'''
@@ -100,59 +59,45 @@ package.__path__.append(sys.argv[1])
 package._TABLE = (*package._TABLE, "toy")
 import lavender as lv
 """
-USES = {
-    "imports": """
+#: Imports of all modules, and what finds a solver: lists, the contract, a report, the check, the command and a page.
+USES = """
 import importlib, pkgutil
 
 for module in pkgutil.walk_packages(lv.__path__, "lavender."):
     if not module.name.endswith("__main__") and module.name not in ("lavender.torch", "lavender.jax"):
         importlib.import_module(module.name)
-""",
-    "available": """
+
 assert lv.available(external=False)[-1] == "toy" and lv.get("toy").builtin and not lv.get("toy").distribution
-""",
-    "contract": """
+
 from lavender.contract import check_solver
 found = {check.name: failure.text for check, failure in check_solver("toy")}
 assert len(found) >= 6 and not any(found.values()), found
-""",
-    "report": """
+
 lines = lv.report.run(["stack(n=8)"], ["toy", "pgs"], lv.report.Plan(tolerances=(1e-2,), budgets=(4,), repeats=1))
 report = lv.report.Report(lines)
 assert {"toy", "pgs"} <= set(lv.report.select_runs(lines)["solver"])
 lv.report.write(lines, sys.argv[2])
 assert "toy" in open(sys.argv[2] + "/index.html").read()
-""",
-    "check": """
+
 table = lv.cross_check(lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0]))
 assert table.ok and table["toy"].verdict == "agrees", str(table)
-""",
-    "solvers": """
+
 import contextlib, io
 from lavender.cli import main
 out = io.StringIO()
 with contextlib.redirect_stdout(out):
     assert main(["solvers"]) == 0
 assert "damped projected Richardson iteration" in " ".join(out.getvalue().split()), out.getvalue()
-""",
-    "pages": """
+
 sys.path.insert(0, "docs")
 import generate
 text = generate.solver_overview()
 assert "| `toy` | linear, lcp | matrix |" in text and "| `toy` | `damping` |" in text, text
-""",
-}
+"""
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """A folder with the file of the toy solver."""
-    folder = tmp_path_factory.mktemp("solvers")
-    (folder / "toy.py").write_text(textwrap.dedent(TOY), encoding="utf-8")
-    return folder
-
-
-@pytest.mark.parametrize("use", USES)
-def test_a_file_and_a_line_of_the_table_are_sufficient_for(use, folder, tmp_path):
+def test_a_file_and_a_line_of_the_table_are_sufficient_for_every_use(tmp_path):
+    (tmp_path / "solvers").mkdir()
+    (tmp_path / "solvers" / "toy.py").write_text(textwrap.dedent(TOY), encoding="utf-8")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
-    python("-c", PRELUDE + USES[use], folder, tmp_path / "out", env=environment, cwd=ROOT)
+    python("-c", PRELUDE + USES, tmp_path / "solvers", tmp_path / "out", env=environment, cwd=ROOT)
