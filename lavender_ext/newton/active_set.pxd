@@ -39,19 +39,13 @@ cdef inline double exchange_weight() noexcept nogil:
     return 1e-9
 
 
-cdef inline void store_active_bounds(const elements_t* e, const double* z, const double* hz, int32_t* bound) noexcept nogil:
-    """Store the bound that is active on each row: -1, 0 or 1."""
-    cdef int32_t j
+cdef inline int32_t store_active_bounds(active_set_t* x, const elements_t* e) noexcept nogil:
+    """Store the bound that is active on each row, -1, 0 or 1; return the number of rows whose bound has changed."""
+    cdef int32_t j, bound, changed = 0
     for j in range(e.m):
-        bound[j] = classify_active_bound(z[j] - hz[j] + e.g[j], e.lower[j], e.upper[j])
-
-
-cdef inline int32_t count_active_bound_changes(const elements_t* e, const double* z, const double* hz,
-                                               const int32_t* bound) noexcept nogil:
-    """Return the number of rows whose active bound differs from the stored one."""
-    cdef int32_t j, changed = 0
-    for j in range(e.m):
-        changed += classify_active_bound(z[j] - hz[j] + e.g[j], e.lower[j], e.upper[j]) != bound[j]
+        bound = classify_active_bound(x.z[j] - x.hz[j] + e.g[j], e.lower[j], e.upper[j])
+        changed += bound != x.bound[j]
+        x.bound[j] = bound
     return changed
 
 
@@ -62,6 +56,7 @@ cdef inline void begin_active_set(newton_t* n, const double* z) noexcept nogil:
     copy_vector(n, x.best_z, z)
     multiply_system_matrix(&n.s, x.z, x.hz)
     x.best = convex_residual(n, x.z, x.hz)
+    store_active_bounds(x, n.s.e)
     x.is_scored = x.first_changes = x.exchanges = x.stalled = 0
     x.fewest_changes = UNLIMITED
     push_phase(n, ACTIVE_SET)
@@ -74,7 +69,6 @@ cdef inline bint exchange_rows(newton_t* n) noexcept nogil:
     cdef bint finite
     for j in range(n.s.e.m):
         n.slack[j] = x.hz[j] - n.s.e.g[j]
-    store_active_bounds(n.s.e, x.z, x.hz, x.bound)
     evaluate_system_natural_map(&n.s, x.z, n.slack, CONE, exchange_weight(), n.f)
     factor_newton_system(&n.s, NATURAL, exchange_weight())
     for j in range(n.s.e.m):
@@ -133,7 +127,7 @@ cdef inline void step_active_set(newton_t* n) noexcept nogil:
     if residual < x.best:
         x.best, x.is_scored = residual, 0
         copy_vector(n, x.best_z, x.z)
-    changed = count_active_bound_changes(n.s.e, x.z, x.hz, x.bound)
+    changed = store_active_bounds(x, n.s.e)
     x.stalled = 0 if changed < x.fewest_changes else x.stalled + 1
     x.fewest_changes = changed if changed < x.fewest_changes else x.fewest_changes
     # With the same active rows, further exchanges only remove the effect of eps; they continue while that lowers the residual.

@@ -7,7 +7,7 @@ from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.arena cimport arena_t, take_integers
-from lavender_ext.core.block_types cimport COULOMB, blocks_t
+from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport get_block_bodies, generalized_t, rows_t
 from lavender_ext.factor.graph cimport order_bodies_and_list_block_rows, pattern_workspace_size
 from lavender_ext.factor.linear cimport BLOCKS, NO_FACTOR
@@ -72,23 +72,6 @@ cdef inline int64_t order_elements(const scaled_t* s, pattern_t* a, const rows_t
     return order_bodies(a)
 
 
-cdef inline bint needs_lu(const newton_t* s, const blocks_t* p) noexcept nogil:
-    """Return whether N may lack symmetry: under Coulomb's law with friction."""
-    return p.law == COULOMB and s.sc.e.n < s.sc.e.m
-
-
-cdef inline int32_t group_elements_by_bodies(elements_t* e, int32_t* group) noexcept nogil:
-    """List the groups of consecutive elements between the same two bodies in group (n + 1); return the number of groups."""
-    cdef int32_t k, h = 0
-    for k in range(e.n):
-        if k == 0 or e.node[2 * k] != e.node[2 * k - 2] or e.node[2 * k + 1] != e.node[2 * k - 1]:
-            group[h] = k
-            h += 1
-    group[h] = e.n
-    e.group, e.n_groups = group, h
-    return h
-
-
 cdef inline void remove_fixed_rows_and_columns(const scaled_t* s, const int32_t* swapped, const int32_t* column, int32_t size,
                               double* panel) noexcept nogil:
     """Compress a panel (rows, 12) in place: keep the rows that are not fixed, and `size` columns of each body.
@@ -138,9 +121,15 @@ cdef inline void form_velocity_panel(const blocks_t* p, const generalized_t* g, 
 cdef inline void use_panel(newton_t* s, const pattern_t* a, double* panel, const int32_t* column, int32_t size,
                            double* y) noexcept nogil:
     """Use the panel (rows, 12) with these columns of each body; y (n size) is scratch. The factor is bound separately."""
-    if s.sc.e.m:
+    cdef elements_t* e = &s.sc.e
+    cdef int32_t k, h = 0
+    if e.m:
         remove_fixed_rows_and_columns(&s.sc, a.swapped, column, size, panel)
     s.s.form, s.s.symmetric, s.s.y = BODIES, 1, y
-    s.sc.e.s, s.sc.e.panel, s.sc.e.node, s.sc.e.slot = size, panel, a.node, a.slot
-    group_elements_by_bodies(&s.sc.e, a.group)
+    e.s, e.panel, e.node, e.slot, e.group = size, panel, a.node, a.slot, a.group
+    for k in range(e.n):
+        if k == 0 or e.node[2 * k] != e.node[2 * k - 2] or e.node[2 * k + 1] != e.node[2 * k - 1]:
+            a.group[h] = k
+            h += 1
+    a.group[h], e.n_groups = e.n, h
     s.linear.kind, s.linear.n, s.linear.factored = BLOCKS, s.linear.blocks.factor.n, NO_FACTOR

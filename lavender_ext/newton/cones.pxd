@@ -174,16 +174,6 @@ cdef inline bint has_upper_bound(const elements_t* e, int32_t j) noexcept nogil:
     return e.upper[j] < 1.0 / 0.0
 
 
-cdef inline void compute_cone_dual_from_slack(const elements_t* e, int32_t i, int32_t g, const double* hz,
-                                              double* c) noexcept nogil:
-    """Compute u with G^T u = H z - g on a contact with one cone."""
-    cdef int32_t j = e.ptr[i], q = e.first[g] - 1, k
-    cdef double a = e.reach[g]
-    c[0] = (hz[j] - e.g[j]) / normal_factor(a)
-    for k in range(1, cone_size(e, g)):
-        c[k] = (hz[q + k] - e.g[q + k]) / tangent_factor(a)
-
-
 cdef struct cone_weight_t:      # G^-1 (T^-2 + delta)^-1 G^-T = x [1 h][1 h]^T + [0 0; 0 c]
     double x                    # entry of the normal (x above)
     double h[4]                 # (n - 1)

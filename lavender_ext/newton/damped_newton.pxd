@@ -25,7 +25,7 @@ from lavender_ext.core.block_types cimport CONE
 from lavender_ext.core.line_search cimport is_reduction_sufficient
 from lavender_ext.core.validate cimport all_finite, norm_inf
 from lavender_ext.newton.run cimport (DAMPED_NEWTON, DAMPED_STRETCHES, MAX_INNER_STEPS, N_PROXIMAL, UNLIMITED,
-                                      begin_separate_best, copy_vector, damped_newton_t, end_separate_best, is_at_roundoff,
+                                      copy_vector, damped_newton_t, end_separate_best, is_at_roundoff,
                                       is_budget_spent, is_finished, judge_and_keep_best_point, newton_t, pop_phase, push_phase,
                                       stretches_t)
 from lavender_ext.newton.system cimport (NATURAL, evaluate_system_natural_map, factor_newton_system, multiply_system_matrix,
@@ -64,15 +64,6 @@ cdef inline void push_damped_newton(newton_t* n, int32_t limit) noexcept nogil:
     push_phase(n, DAMPED_NEWTON)
 
 
-cdef inline double compute_trial_residual_norm(newton_t* n, const damped_newton_t* x, double t) noexcept nogil:
-    """Return |F_c| at z + t dz, which is written to `trial`."""
-    cdef int32_t j
-    for j in range(n.s.e.m):
-        n.trial[j] = n.u[j] + t * n.dz[j]
-        n.slack[j] = n.hz[j] + t * n.hdz[j] - n.s.e.g[j] + x.alpha * (n.trial[j] - n.c[j])
-    return evaluate_system_natural_map(&n.s, n.trial, n.slack, x.law, 0.0, n.f)
-
-
 cdef inline bint take_inner_newton_step(newton_t* n, damped_newton_t* x) noexcept nogil:
     """Take a Newton step of the inner problem from z in n.u; return False if the inner problem ends."""
     cdef system_t* s = &n.s
@@ -103,7 +94,10 @@ cdef inline bint take_inner_newton_step(newton_t* n, damped_newton_t* x) noexcep
     for k in range(x.inner_steps - LINE_SEARCH_MEMORY if x.inner_steps > LINE_SEARCH_MEMORY else 0, x.inner_steps):
         bound = x.history[k] if x.history[k] > bound else bound
     for _ in range(MAX_STEP_HALVINGS):
-        value = compute_trial_residual_norm(n, x, t)
+        for j in range(m):
+            n.trial[j] = n.u[j] + t * n.dz[j]
+            n.slack[j] = n.hz[j] + t * n.hdz[j] - s.e.g[j] + x.alpha * (n.trial[j] - n.c[j])
+        value = evaluate_system_natural_map(s, n.trial, n.slack, x.law, 0.0, n.f)
         if value < best:
             best, at = value, t
         if is_reduction_sufficient(value, t, bound):
@@ -215,7 +209,7 @@ cdef inline void continue_damped_newton_stretches(newton_t* n) noexcept nogil:
             return
         x.is_running = 1
         x.stretches += 1
-        begin_separate_best(n)
+        n.best = 1.0 / 0.0      # A best point of its own, which is compared with earlier points only at the end.
         push_damped_newton(n, x.length)
         return
     x.is_running = 0

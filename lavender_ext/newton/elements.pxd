@@ -15,8 +15,6 @@ condition of N is that of J squared once, not twice, and linearly dependent rows
 from libc.math cimport fabs
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.block_types cimport friction_components_t
-
 
 cdef struct elements_t:
     int32_t n                   # elements
@@ -45,18 +43,10 @@ cdef inline bint is_row(const elements_t* e, int32_t i) noexcept nogil:
     return e.part[i] == e.part[i + 1]
 
 
-cdef inline void load_components(const elements_t* e, int32_t i, friction_components_t* q) noexcept nogil:
-    """Load the friction components of element i, with coefficients in the scaled unknown."""
-    cdef int32_t g, at = e.part[i]
-    q.n = e.part[i + 1] - at
-    for g in range(q.n):
-        q.first[g], q.size[g], q.friction_coefficient[g] = e.first[at + g] - e.ptr[i], e.size[at + g], e.reach[at + g]
+cdef inline void invert_and_multiply(double* a, const double* p, double* inv, double* v, int32_t n) noexcept nogil:
+    """Write the inverse of a (n, n) to inv, by Gauss-Jordan elimination with row exchanges, and inv p to v.
 
-
-cdef inline void invert_small_matrix(double* a, double* inv, int32_t n) noexcept nogil:
-    """Write the inverse of a (n, n) to inv, by Gauss-Jordan elimination with row exchanges; a is overwritten.
-
-    A pivot of 0 leaves zeros in its column.
+    A pivot of 0 leaves zeros in its column. a is overwritten.
     """
     cdef int32_t i, j, k, best
     cdef double x
@@ -89,13 +79,6 @@ cdef inline void invert_small_matrix(double* a, double* inv, int32_t n) noexcept
                     for j in range(n):
                         a[i * n + j] -= x * a[k * n + j]
                         inv[i * n + j] -= x * inv[k * n + j]
-
-
-cdef inline void invert_and_multiply(double* a, const double* p, double* inv, double* v, int32_t n) noexcept nogil:
-    """Write the inverse of a (n, n) to inv and inv p to v; a is overwritten."""
-    cdef int32_t i, j, k
-    cdef double x
-    invert_small_matrix(a, inv, n)
     for i in range(n):
         for j in range(n):
             x = 0.0

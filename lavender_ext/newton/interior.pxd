@@ -12,8 +12,8 @@ from libc.stdint cimport int32_t
 from lavender_ext.newton.cones cimport (SCALING_V, add_cone_transpose, compute_combined_cone_rhs, cone_gap, cone_size,
                                         cone_weight_t, distance_to_boundary, dual_normal, has_lower_bound,
                                         has_upper_bound, limit_cone_step, limit_step_to_nonnegative, load_cone_variable,
-                                        load_cone_dual, compute_cone_dual_from_slack,
-                                        normal_factor, compute_cone_scaling, scaling_of, compute_affine_cone_step, store_cone_dual)
+                                        load_cone_dual, normal_factor, compute_cone_scaling, scaling_of,
+                                        compute_affine_cone_step, store_cone_dual, tangent_factor)
 from lavender_ext.newton.elements cimport elements_t, is_row
 
 
@@ -40,7 +40,7 @@ cdef inline double place_inside_cones(const elements_t* e, const interior_t* p, 
     All z are shifted along the axes of their cones by one amount, and all u by another (Vandenberghe 2010, section
     7.3). The shift of u beyond its worst violation is `dual` times that of z, since most rows carry load at the solution.
     """
-    cdef int32_t i, j, g, n
+    cdef int32_t i, j, k, q, g, n
     cdef const double* hz = p.hz
     cdef double* z = p.z
     cdef double* u1 = p.u1
@@ -86,7 +86,10 @@ cdef inline double place_inside_cones(const elements_t* e, const interior_t* p, 
             load_cone_variable(e, i, g, z, c)
             x = -cone_gap(c, n) / normal_factor(e.reach[g])
             worst_z = x if x > worst_z else worst_z
-            compute_cone_dual_from_slack(e, i, g, hz, c)
+            q = e.first[g] - 1
+            c[0] = (hz[j] - e.g[j]) / normal_factor(e.reach[g])     # u with G^T u = H z - g on a contact with one cone
+            for k in range(1, n):
+                c[k] = (hz[q + k] - e.g[q + k]) / tangent_factor(e.reach[g])
             x = -cone_gap(c, n)
             worst_u = x if x > worst_u else worst_u
             store_cone_dual(e, i, g, c, u1, u2)
@@ -107,15 +110,6 @@ cdef inline double place_inside_cones(const elements_t* e, const interior_t* p, 
         for g in range(e.part[i], e.part[i + 1]):
             dual_normal(e, i, g, u1, u2)[0] += worst_u
     return degree
-
-
-cdef inline bint has_row_with_compliance(const elements_t* e, int32_t i) noexcept nogil:
-    """Return whether a row of element i has compliance."""
-    cdef int32_t j
-    for j in range(e.ptr[i], e.ptr[i + 1]):
-        if e.theta[j] != 0.0:
-            return True
-    return False
 
 
 cdef inline void add_compliance(const elements_t* e, int32_t i, double* v, double* bt) noexcept nogil:
@@ -155,7 +149,7 @@ cdef inline void compute_scaling(const elements_t* e, const interior_t* p, doubl
     cdef const double* u1 = p.u1
     cdef const double* u2 = p.u2
     cdef double delta = p.delta
-    cdef bint more
+    cdef bint more, is_soft
     cdef double x, y, r, total = 0.0
     cdef double s[4]
     cdef double u[4]
@@ -204,9 +198,11 @@ cdef inline void compute_scaling(const elements_t* e, const interior_t* p, doubl
             for l in range(nr):
                 v[q + k * nr + l] += x * a[k] * a[l]
         r = sqrt(x)
+        is_soft = False
         for k in range(nr):
             bt[q + k] = r * a[k]
-        if has_row_with_compliance(e, i):
+            is_soft |= e.theta[j + k] != 0.0
+        if is_soft:
             add_compliance(e, i, v + q, bt + q)
     gap[0] = total
 

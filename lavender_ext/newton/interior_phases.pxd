@@ -59,34 +59,6 @@ cdef inline double roundoff_residual() noexcept nogil:
     return 1e-6
 
 
-cdef inline double slip_residual() noexcept nogil:
-    """Return the residual of the convex law below which an interior point's z is judged under Coulomb's law."""
-    return 1e-5
-
-
-cdef inline double early_slip_residual() noexcept nogil:
-    """Return the residual of the convex law below which fast sliding is counted; larger ones count contacts that will stick."""
-    return 0.03
-
-
-cdef inline double early_slip_speed() noexcept nogil:
-    """Return the shift of a normal above which sliding is fast, relative to the largest entry of g."""
-    return 1e-2
-
-
-cdef inline double max_early_sliding_fraction() noexcept nogil:
-    """Return the fraction of contacts that slide fast above which an interior point of the convex law ends under Coulomb's law.
-
-    Below `early_slip_residual`, piles that Euler steps from it solve have up to 2 %; balls in motion 15 % and more.
-    """
-    return 0.1
-
-
-cdef inline double short_step() noexcept nogil:
-    """Return the step length of an interior point below which a step counts as short."""
-    return 0.05
-
-
 cdef inline double smallest_gap_ratio() noexcept nogil:
     """Return the gap, relative to its maximum, below which an interior point ends because rounding dominates its scaling."""
     return 1e-24
@@ -274,10 +246,12 @@ cdef inline void step_interior_point(newton_t* n) noexcept nogil:
             return
         # Under Coulomb's law the phase ends if the convex problem is solved and contacts slip, or if many of them will.
         if n.stack[0] == PLAN_COULOMB:
-            if residual < early_slip_residual() and not k.is_counted:
+            # Contacts whose normals shift by 1e-2 of the largest entry of g slide fast: up to 2 % of piles that Euler steps from
+            # here solve, 15 % and more of balls in motion. At larger residuals, contacts that will stick count, too.
+            if residual < 0.03 and not k.is_counted:
                 k.is_counted = 1
-                n.mostly_slides = compute_sliding_fraction(n, n.ip.z, early_slip_speed()) > max_early_sliding_fraction()
-            if n.mostly_slides or (residual < slip_residual() and residual < 0.01 * judge_and_keep_best_point(n, n.ip.z)):
+                n.mostly_slides = compute_sliding_fraction(n, n.ip.z, 1e-2) > 0.1
+            if n.mostly_slides or (residual < 1e-5 and residual < 0.01 * judge_and_keep_best_point(n, n.ip.z)):
                 end_interior_steps(n, False)
                 return
         if k.bounded_rows and residual < k.trial_residual:
@@ -331,7 +305,9 @@ cdef inline void step_interior_with_newton(newton_t* n) noexcept nogil:
             k.trial_residual = 0.1 * residual
             k.trial_runs = 1
             if k.augmented:
-                begin_augmented_newton(n, n.ip.z)
+                copy_vector(n, n.augmented.z, n.ip.z)
+                n.augmented.best, n.augmented.failed, n.augmented.steps_left = residual, 0, AUGMENTED_TRIAL_STEPS
+                push_phase(n, AUGMENTED_NEWTON)
             else:
                 begin_damped_newton(n, n.ip.z, COULOMB, residual, TRIAL_INNER_STEPS)
                 push_damped_newton(n, 1)
@@ -341,20 +317,10 @@ cdef inline void step_interior_with_newton(newton_t* n) noexcept nogil:
         if is_at_roundoff(n):
             pop_phase(n)
             return
-    k.stalled = k.stalled + 1 if n.ip.length < short_step() else 0
+    k.stalled = k.stalled + 1 if n.ip.length < 0.05 else 0      # short steps
     if (k.stalled >= MAX_SHORT_STEPS or (k.idle > MAX_IDLE_INTERIOR_STEPS and k.lowest < 1e-5)
             or n.ip.gap < smallest_gap_ratio() * n.ip.max_gap):
         pop_phase(n)
-
-
-cdef inline void begin_augmented_newton(newton_t* n, const double* z) noexcept nogil:
-    """Begin Newton steps on the augmented system from z."""
-    cdef augmented_newton_t* x = &n.augmented
-    copy_vector(n, x.z, z)
-    x.best = judge_and_keep_best_point(n, z)
-    x.failed = 0
-    x.steps_left = AUGMENTED_TRIAL_STEPS
-    push_phase(n, AUGMENTED_NEWTON)
 
 
 cdef inline void step_augmented_newton(newton_t* n) noexcept nogil:

@@ -14,16 +14,18 @@ from libc.stdint cimport int32_t
 from lavender_ext.core.block cimport euclidean_norm
 from lavender_ext.core.block_projection cimport classify_active_bound, evaluate_natural_map
 from lavender_ext.core.block_types cimport CONE, friction_components_t
-from lavender_ext.newton.elements cimport load_components, elements_t, invert_and_multiply, is_row
+from lavender_ext.newton.elements cimport elements_t, invert_and_multiply, is_row
 
 
 cdef inline void evaluate_contact_natural_map(const elements_t* e, int32_t i, int32_t law, const double* z, const double* s,
-                                              double* f,
-                                 double* p) noexcept nogil:
+                                              double* f, double* p) noexcept nogil:
     """Compute F (nr) and P (nr, nr) of one contact, with Pi in the metric of d."""
+    cdef int32_t g, at = e.part[i]
     cdef double out[6]
-    cdef friction_components_t q
-    load_components(e, i, &q)
+    cdef friction_components_t q                        # with coefficients in the scaled unknown
+    q.n = e.part[i + 1] - at
+    for g in range(q.n):
+        q.first[g], q.size[g], q.friction_coefficient[g] = e.first[at + g] - e.ptr[i], e.size[at + g], e.reach[at + g]
     evaluate_natural_map(law, &q, e.ptr[i + 1] - e.ptr[i], z, s, out, f, p)
 
 

@@ -129,11 +129,6 @@ cdef inline double curve_tolerance() noexcept nogil:
     return 0.2
 
 
-cdef inline double first_step_length() noexcept nogil:
-    """Return the first h, the change of the fastest coordinate in one step."""
-    return 0.3
-
-
 cdef inline double path_compliance() noexcept nogil:
     """Return the first compliance eps of the smoothed path, relative to d. If the path cannot start, eps is divided by ten."""
     return 1e-9
@@ -181,8 +176,7 @@ cdef inline void evaluate_smoothed_row_map(const elements_t* e, int32_t j, doubl
 
 
 cdef inline void evaluate_smoothed_contact_map(const elements_t* e, int32_t i, const double* z, const double* s, double tau,
-                                               double wide,
-                                smooth_t* out) noexcept nogil:
+                                               double wide, smooth_t* out) noexcept nogil:
     """Compute (1) of one contact and its derivatives, I - P without cancellation; `wide` is c tau."""
     cdef int32_t nr = e.ptr[i + 1] - e.ptr[i], first, n, k, l, g
     cdef double y = z[0] - s[0], normal = smooth_max(y, tau), dn = smooth_max_slope(y, tau)
@@ -318,13 +312,6 @@ cdef inline double find_fastest_coordinate(const newton_t* n, const double* dy, 
     return worst
 
 
-cdef inline double find_largest_coordinate_change(const newton_t* n, const double* dy, double dl, double tau) noexcept nogil:
-    """Return the largest change of a coordinate or direction by (dy, dl)."""
-    cdef int32_t which
-    cdef double turned, worst = find_fastest_coordinate(n, dy, dl, tau, &which, &turned)
-    return worst if not worst < turned else turned
-
-
 # -- steps -----------------------------------------------------------------------------------------------------
 
 
@@ -341,7 +328,7 @@ cdef inline void begin_path(newton_t* n) noexcept nogil:
     x.tolerance = curve_tolerance()
     x.eps = path_compliance()
     x.trial_residual = 1e-2
-    x.h = first_step_length()
+    x.h = 0.3                   # change of the fastest coordinate in the first step
     x.last = n.s.factorisations + MAX_PATH_FACTORISATIONS
     x.stage = x.factors = x.raises = x.n_saved = x.steps_since_return = x.halvings = 0
     if 0.0 < x.size < 1.0 / 0.0:
@@ -367,9 +354,9 @@ cdef inline bint compute_path_directions(newton_t* n, const double* z, double ta
 
 
 cdef inline double eliminate_parameter_change(newton_t* n, double tau, double* change) noexcept nogil:
-    """Return dl of (3) and replace a in n.dz by dz = a + b dl; write the largest change of a coordinate."""
+    """Return dl of (3) and replace a in n.dz by dz = a + b dl; write the largest change of a coordinate or direction."""
     cdef path_t* x = &n.path
-    cdef int32_t j
+    cdef int32_t j, which
     cdef double turned, dl = 0.0
     if x.parameter != LOG_TAU:
         dl = -compute_coordinate_rate(n, x.parameter, n.t2, 0.0, tau, &turned) / compute_coordinate_rate(n, x.parameter, n.psi,
@@ -377,7 +364,8 @@ cdef inline double eliminate_parameter_change(newton_t* n, double tau, double* c
     for j in range(n.s.e.m):
         n.dz[j] += x.b[j] * dl
         n.t2[j] += n.psi[j] * dl
-    change[0] = find_largest_coordinate_change(n, n.t2, dl, tau)
+    change[0] = find_fastest_coordinate(n, n.t2, dl, tau, &which, &turned)
+    change[0] = change[0] if not change[0] < turned else turned
     return dl
 
 

@@ -19,17 +19,13 @@ from lavender_ext.newton.elements cimport elements_t
 from lavender_ext.newton.run cimport newton_t
 from lavender_ext.newton.scaling cimport form_scaled_matrix, scaled_t
 from lavender_ext.newton.system cimport DENSE, SPARSE
+from lavender_ext.velocity_newton.flow cimport combined_product_cost
 
 
 cdef enum:
     ANY_FORM = -1
     MAX_ALWAYS_DENSE_ROWS = 150     # Up to this many rows, a dense factor is faster than a sparse factor.
     MAX_DENSE_ROWS = 6000       # A matrix with more rows is not stored as a full matrix; at this size one takes 288 MB.
-
-
-cdef inline double pivot_tolerance() noexcept nogil:
-    """Return the fraction of its diagonal entry up to which a pivot of a sparse matrix is lost."""
-    return 1e-13
 
 
 cdef inline bint is_dense_faster(double entries, double rows, bint cones) noexcept nogil:
@@ -163,21 +159,13 @@ cdef inline void form_row_system(newton_t* n, const csr_t* a, int32_t wide) noex
             n.s.symmetric = form_scaled_matrix(&n.sc, a, n.problem.p.n_rows, n.linear.swap, <double*>n.s.h)
         n.has_matrix = True
         return
-    n.linear.rows.factor.wide, n.linear.tiny, n.linear.shift = wide, pivot_tolerance(), 0.0
+    # A pivot of up to 1e-13 of its diagonal entry is lost.
+    n.linear.rows.factor.wide, n.linear.tiny, n.linear.shift = wide, 1e-13, 0.0
     list_unfixed_entries(&n.sc, n.problem.p.n_rows, a, n.linear.swap, &n.s.a)
     n.s.symmetric = copy_coupled_entries(&n.s.coupled, n.sc.e.m, &n.s.a, n.linear.swap)
 
 
 # -- J and M -----------------------------------------------------------------------------------------------------------
-
-
-cdef inline double velocity_steps_per_row_step() noexcept nogil:
-    """Return the work over rows [multiply-adds] up to which it replaces one multiply-add of a step over velocities.
-
-    Under Coulomb's law, steps over velocities (`velocity_newton`) are 3 to 10 times as many. On random problems of 3 to 900
-    rows, steps over rows take less time up to a ratio of 3, and more time from 4 on.
-    """
-    return 3.0
 
 
 cdef inline bint has_row_with_two_bounds(const blocks_t* p, const generalized_t* g) noexcept nogil:
@@ -209,12 +197,9 @@ cdef inline bint are_generalized_rows_faster(const view_t* v) noexcept nogil:
     for b in range(g.n_panels):
         nc = g.pcol[b + 1] - g.pcol[b]
         work += (g.prow[b + 1] - g.prow[b]) * nc * nc
-    return m * m * m / 3.0 <= velocity_steps_per_row_step() * work
-
-
-cdef inline double combined_product_cost() noexcept nogil:
-    """Return the time [ns] of a multiply-add of `combine_rows` on rows that exceed the caches."""
-    return 0.3
+    # Steps over velocities are 3 to 10 times as many under Coulomb's law. On random problems of 3 to 900 rows, steps over rows
+    # take less time up to 3 times the work, and more time from 4 on.
+    return m * m * m / 3.0 <= 3.0 * work
 
 
 cdef inline bint form_generalized_matrix(newton_t* n, int32_t wide, double* transpose, int32_t* at,

@@ -16,7 +16,7 @@ from lavender_ext.judge.best cimport (
     store_better_islands,
 )
 from lavender_ext.judge.measure cimport residual_above_floor, relative_floor_of_score, judge_view, relative_residual_of_score
-from lavender_ext.judge.score cimport make_empty_score, relative_residual, score_t, take_smallest_island_reference
+from lavender_ext.judge.score cimport make_empty_score, relative_residual, score_t
 from lavender_ext.newton.interior cimport interior_t
 from lavender_ext.newton.natural_map cimport compute_convex_residual
 from lavender_ext.newton.scaling cimport bind_element_indices, bind_element_values, scale_elements, scaled_t
@@ -54,17 +54,12 @@ cdef enum:
     MAX_INNER_STEPS = 20        # Newton steps of one proximal iteration; more rarely end it.
 
 
-cdef inline double max_roundoff_residual() noexcept nogil:
-    """Return the relative residual above which rounding cannot be the only cause, so that the round-off limit is not computed."""
-    return 1e-5
-
-
 cdef struct problem_t:          # the problem as the judge reads it
     blocks_t p
     const csr_t* a              # the matrix, or NULL
     const rows_t* r             # bodies, or NULL
     const generalized_t* g      # J and M, or NULL
-    double e0                   # reference of the solver's own estimates, sqrt J; with islands the smallest of theirs
+    double e0                   # sqrt J; of islands the smallest reference, so that no own estimate is too low for one
     double v0                   # m/s
     double* w                   # (rows)
     double* error               # (rows)
@@ -230,14 +225,8 @@ cdef struct newton_t:           # bound to its workspace; it must not move
 # -- workspace -------------------------------------------------------------------------------------------------------
 
 
-cdef inline void set_problem(newton_t* n, const blocks_t* p, const csr_t* a, const rows_t* r,
-                             const generalized_t* g) noexcept nogil:
-    """Set the problem that is judged, given by one of a, r, g."""
-    n.problem.p, n.problem.a, n.problem.r, n.problem.g = p[0], a, r, g
-
-
 cdef inline void bind_judge_arrays(newton_t* n, arena_t* a) noexcept nogil:
-    """Take the judge's arrays for the problem of `set_problem`."""
+    """Take the judge's arrays for the problem that is judged."""
     cdef const problem_t* o = &n.problem
     cdef int64_t m = o.p.n_rows
     cdef double* best
@@ -251,7 +240,7 @@ cdef inline void bind_judge_arrays(newton_t* n, arena_t* a) noexcept nogil:
 
 
 cdef inline void bind_indices(newton_t* n, arena_t* a) noexcept nogil:
-    """Take the integer arrays for the problem of `set_problem`."""
+    """Take the integer arrays for the problem that is judged."""
     cdef int64_t m = n.problem.p.n_rows
     bind_element_indices(&n.sc, m, a)
     n.active.bound, n.linear.swap, n.s.free = take_integers(a, m), take_integers(a, m), take_integers(a, m)
@@ -272,22 +261,14 @@ cdef inline void bind_vectors(newton_t* n, int64_t m, arena_t* a) noexcept nogil
         at[i][0] = take_doubles(a, m)
 
 
-cdef inline void bind_coulomb_vectors(newton_t* n, int64_t m, arena_t* a) noexcept nogil:
-    """Take the vectors (m) of paths and of Euler steps, which set them before they read them."""
-    cdef path_t* p = &n.path
-    cdef flow_t* f = &n.flow
-    p.z, p.t, p.b = take_doubles(a, m), take_doubles(a, m), take_doubles(a, m)
-    p.saved_z[0], p.saved_z[1] = take_doubles(a, m), take_doubles(a, m)
-    p.saved_t[0], p.saved_t[1] = take_doubles(a, m), take_doubles(a, m)
-    f.z, f.hz, f.centre, f.saved_z = take_doubles(a, m), take_doubles(a, m), take_doubles(a, m), take_doubles(a, m)
-
-
 cdef inline void bind_values(newton_t* n, int64_t small, bint clear, arena_t* a) noexcept nogil:
     """Take the judge's arrays, the elements, the vectors, and small matrices of `small` entries in all.
 
     With `clear` those that must begin with zeros are set to 0. The caller then calls `scale_problem` and sets `form`,
     `symmetric` and the fields of the form.
     """
+    cdef path_t* p = &n.path
+    cdef flow_t* f = &n.flow
     cdef int64_t m = n.problem.p.n_rows, first
     bind_judge_arrays(n, a)
     first = a.n_real
@@ -297,8 +278,11 @@ cdef inline void bind_values(newton_t* n, int64_t small, bint clear, arena_t* a)
                                                 take_doubles(a, small), take_doubles(a, small))
     if clear:
         memset(a.real + first, 0, (a.n_real - first) * sizeof(double))
-    if n.problem.p.law == COULOMB:
-        bind_coulomb_vectors(n, m, a)
+    if n.problem.p.law == COULOMB:                      # Paths and Euler steps set their vectors before they read them.
+        p.z, p.t, p.b = take_doubles(a, m), take_doubles(a, m), take_doubles(a, m)
+        p.saved_z[0], p.saved_z[1] = take_doubles(a, m), take_doubles(a, m)
+        p.saved_t[0], p.saved_t[1] = take_doubles(a, m), take_doubles(a, m)
+        f.z, f.hz, f.centre, f.saved_z = take_doubles(a, m), take_doubles(a, m), take_doubles(a, m), take_doubles(a, m)
 
 
 cdef inline void scale_problem(newton_t* n, const view_t* v) noexcept nogil:
@@ -368,15 +352,6 @@ cdef inline const double* write_certificate(newton_t* n) noexcept nogil:
 # -- residuals -------------------------------------------------------------------------------------------------------
 
 
-cdef inline void set_reference(problem_t* o, double e0, double v0) noexcept nogil:
-    """Set the reference of the solver's own estimates.
-
-    With islands it is the smallest of their references, so that no estimate is too low for an island.
-    """
-    o.e0, o.v0 = e0, v0
-    take_smallest_island_reference(&o.p, &o.e0, &o.v0)
-
-
 cdef inline double judge_point(newton_t* n, const double* z, bint floor) noexcept nogil:
     """Return the judge's relative residual of z; with `floor` write the part above the round-off limit to n.above_floor."""
     cdef score_t s = make_empty_score()
@@ -430,7 +405,7 @@ cdef inline bint is_finished(const newton_t* n) noexcept nogil:
 
 cdef inline bint is_at_roundoff(newton_t* n) noexcept nogil:
     """Return whether rounding explains the excess of the best point's residual over tol, in each island."""
-    if n.best > max_roundoff_residual():
+    if n.best > 1e-5:                                   # Rounding cannot be the only cause of a larger residual.
         return False
     judge_point(n, n.best_z, True)
     return n.above_floor <= n.tol
@@ -444,13 +419,8 @@ cdef inline bint is_over(newton_t* n) noexcept nogil:
 # -- the best point --------------------------------------------------------------------------------------------------
 
 
-cdef inline void begin_separate_best(newton_t* n) noexcept nogil:
-    """Begin a phase with a best point of its own, which is compared with earlier points only at its end."""
-    n.best = 1.0 / 0.0
-
-
 cdef inline double end_separate_best(newton_t* n) noexcept nogil:
-    """End a phase of `begin_separate_best`, and keep the better of its best point and the best impulse of all.
+    """End a phase that began with an infinite `best`, and keep the better of its best point and the best impulse of all.
 
     Return the lowest residual of the phase.
     """

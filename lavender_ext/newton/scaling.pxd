@@ -172,11 +172,6 @@ cdef inline void index_unfixed_elements(scaled_t* s, const view_t* v) noexcept n
     s.whole = m == p.n_rows
 
 
-cdef inline double cone_coefficient(const scaled_t* s, const blocks_t* p, int32_t i, int32_t at) noexcept nogil:
-    """Return the friction coefficient of element i at its row `at` in the scaled unknown."""
-    return get_component_coefficient(p, s.block[i], s.keep[at]) * (1.0 / s.scale[at]) / (1.0 / s.scale[s.e.ptr[i]])
-
-
 cdef inline bint write_fixed_impulses(scaled_t* s, const view_t* v) noexcept nogil:
     """Write the impulses of the fixed rows; return whether any of them is not 0."""
     cdef const blocks_t* p = &v.p
@@ -220,7 +215,9 @@ cdef inline void scale_elements(scaled_t* s, const view_t* v, double* w, double*
             (<double*>s.e.g)[q] = (p.b[j] - x) * s.scale[q]
     for i in range(s.e.n):
         for g in range(s.e.part[i], s.e.part[i + 1]):
-            (<double*>s.e.reach)[g] = cone_coefficient(s, p, i, s.e.first[g])
+            q = s.e.first[g]
+            x = get_component_coefficient(p, s.block[i], s.keep[q])
+            (<double*>s.e.reach)[g] = x * (1.0 / s.scale[q]) / (1.0 / s.scale[s.e.ptr[i]])
 
 
 cdef inline bint form_scaled_matrix(const scaled_t* s, const csr_t* a, int32_t rows, int32_t* place, double* h) noexcept nogil:

@@ -17,22 +17,23 @@ from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles, take_int
 from lavender_ext.core.arrays cimport get_data_pointer
 from lavender_ext.core.method cimport (CERTIFICATE, MORE, NEEDS_WORKSPACE, SPENT, UNFIT, info_t, Method, method_t, options_t,
                                        require_workspace, workspace_t)
-from lavender_ext.core.block_types cimport CONE
+from lavender_ext.core.block_types cimport CONE, COULOMB
 from lavender_ext.core.csr cimport measure_asymmetry_and_bandwidth
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport rows_t, view_t
 from lavender_ext.factor.factors cimport block_matrix_t, has_wide, interrupt_t
 from lavender_ext.factor.linear cimport (FALLBACK, PythonCalls, analyse_blocks, bind_block_factor_indices,
                                          bind_block_factor_values, fallback_t)
-from lavender_ext.newton.bodies cimport (bind_pattern, form_panel, form_velocity_panel, needs_lu, order_bodies, order_elements,
+from lavender_ext.judge.score cimport take_smallest_island_reference
+from lavender_ext.newton.bodies cimport (bind_pattern, form_panel, form_velocity_panel, order_bodies, order_elements,
                                          pattern_t, use_panel)
 from lavender_ext.newton.elements cimport elements_t
 from lavender_ext.newton.interior cimport compute_scaling
 from lavender_ext.newton.interior_phases cimport compute_fraction_near_sliding
 from lavender_ext.newton.path cimport path_compliance
 from lavender_ext.newton.plan cimport start_newton_solve, step_newton_solve
-from lavender_ext.newton.run cimport (N_COUNTED, bind_indices, bind_values, newton_t, scale_problem, set_problem, set_reference,
-                                      write_certificate, write_impulse)
+from lavender_ext.newton.run cimport (N_COUNTED, bind_indices, bind_values, newton_t, scale_problem, write_certificate,
+                                      write_impulse)
 from lavender_ext.newton.rows cimport (ANY_FORM, MAX_ALWAYS_DENSE_ROWS, analyse_row_system, bind_row_values,
                                        form_generalized_matrix, form_row_system, has_dense_rows, is_dense_faster)
 from lavender_ext.newton.scaling cimport bind_element_indices, index_unfixed_elements, is_problem_supported
@@ -108,7 +109,7 @@ cdef inline newton_t* state_of(const workspace_t* r) noexcept nogil:
 
 cdef inline void set_judged_problem(newton_t* n, const view_t* v) noexcept nogil:
     """Set the problem that is judged: bodies, or J and M, if H is formed from their A."""
-    set_problem(n, &v.p, v.a, v.r, v.g)
+    n.problem.p, n.problem.a, n.problem.r, n.problem.g = v.p, v.a, v.r, v.g
     if v.r != NULL or v.g != NULL:
         n.problem.a = NULL
 
@@ -116,7 +117,8 @@ cdef inline void set_judged_problem(newton_t* n, const view_t* v) noexcept nogil
 cdef inline int32_t begin(newton_t* n, const options_t* o, const double* lam) noexcept nogil:
     """Start from lam (m). The workspace must be bound before."""
     n.tol, n.budget = o.tol, o.budget
-    set_reference(&n.problem, o.e0, o.v0)
+    n.problem.e0, n.problem.v0 = o.e0, o.v0
+    take_smallest_island_reference(&n.problem.p, &n.problem.e0, &n.problem.v0)
     n.island_best.reference_energy = o.e0
     start_newton_solve(n, lam)
     return MORE
@@ -269,10 +271,11 @@ cdef inline void bind_body_values(state_t* s, const view_t* v, const options_t* 
     """Take all values after the analysis: the panel (rows, 12), y (6 n_bodies) and root (10 n_bodies), and the factor."""
     cdef newton_t* n = &s.n
     cdef const host_t* host = <const host_t*>o.host
+    cdef bint lu = host.lu if host != NULL else v.p.law == COULOMB and n.sc.e.n < n.sc.e.m    # N may lack symmetry.
     bind_values(n, n.sc.small, a.real != NULL, a)
     panel[0], root[0] = take_doubles(a, 12 * <int64_t>v.p.n_rows), take_doubles(a, 10 * <int64_t>s.a.n if host == NULL else 0)
     y[0] = take_doubles(a, 6 * <int64_t>s.a.n)
-    bind_block_factor_values(&n.linear.blocks, host.lu if host != NULL else needs_lu(n, &v.p), o.wide if a.real != NULL else 0, a)
+    bind_block_factor_values(&n.linear.blocks, lu, o.wide if a.real != NULL else 0, a)
 
 
 cdef inline int32_t analyse_bodies(state_t* s, const view_t* v, const options_t* o, workspace_t* r) noexcept nogil:

@@ -46,24 +46,6 @@ cdef inline double compute_proximal_weight() noexcept nogil:
     return 1e-10
 
 
-cdef inline double unreachable_fraction() noexcept nogil:
-    """Return the fraction of |z|^2 below which g counts as unreachable by H.
-
-    The first point is then the least-squares solution. Fractions of 1e-4 to 0.1 take the same steps.
-    """
-    return 0.01
-
-
-cdef inline double first_dual_fraction() noexcept nogil:
-    """Return the first duals as a fraction of the first impulses; all fractions from 0.001 to 1 take about as many steps."""
-    return 0.01
-
-
-cdef inline double step_damping() noexcept nogil:
-    """Return the fraction of the step to the boundary that an interior point takes (Mehrotra 1992: just below 1)."""
-    return 0.995
-
-
 cdef inline bint has_only_free_rows(const elements_t* e) noexcept nogil:
     """Return whether every element is a row without bounds."""
     cdef int32_t i
@@ -108,10 +90,10 @@ cdef inline void begin_interior_point(newton_t* n, double delta, double derivati
         for j in range(m):
             size += p.z[j] * p.z[j]
             reached += n.trial[j] * n.trial[j]
-        if reached < unreachable_fraction() * size:
+        if reached < 0.01 * size:                       # Fractions of 1e-4 to 0.1 take the same steps.
             copy_vector(n, p.z, n.trial)
             multiply_system_matrix(s, p.z, p.hz)
-    p.degree = place_inside_cones(s.e, p, first_dual_fraction())
+    p.degree = place_inside_cones(s.e, p, 0.01)         # Fractions from 0.001 to 1 take about as many steps.
     multiply_system_matrix(s, p.z, p.hz)
 
 
@@ -244,8 +226,8 @@ cdef inline bint take_interior_point_step(newton_t* n) noexcept nogil:
     solve_newton_system(s, what, n.r, n.dz)
     if not all_finite(n.dz, e.m):
         return False
-    # Step and errors.
-    p.length = take_combined_step(e, p, n.dz, n.da, sigma * mu, step_damping(), n.t1, n.t2)
+    # Step, just short of the boundary (Mehrotra 1992), and errors.
+    p.length = take_combined_step(e, p, n.dz, n.da, sigma * mu, 0.995, n.t1, n.t2)
     p.min_gap = p.gap if p.gap < p.min_gap else p.min_gap
     p.gap = mu
     p.max_gap = mu if mu > p.max_gap else p.max_gap

@@ -223,19 +223,6 @@ cdef inline int32_t factor_dense(system_t* s, int32_t what, double eps) noexcept
     return factor_linear_system_matrix(s.linear) == 0
 
 
-cdef inline void solve_dense(system_t* s, double* x) noexcept nogil:
-    """Overwrite x with the solution by the last dense factor. It is infinite for a singular matrix: the caller rejects it."""
-    cdef int32_t j
-    if s.n_free < 0:
-        solve_linear_system(s.linear, x)
-        return
-    for j in range(s.n_free):
-        s.q[j] = x[s.free[j]]
-    solve_linear_system(s.linear, s.q)
-    for j in range(s.n_free):
-        x[s.free[j]] = s.q[j]
-
-
 # -- (1) to (3) ------------------------------------------------------------------------------------------------
 
 
@@ -276,12 +263,18 @@ cdef inline void apply_body_inverse(system_t* s, const double* x, double* out) n
 
 
 cdef inline void solve_over_rows(system_t* s, double* x) noexcept nogil:
-    """Solve over the rows of A with the last factor, in place."""
+    """Solve over the rows of A with the last factor, in place. x is infinite for a singular matrix: the caller rejects it."""
     cdef int32_t j
     if s.augmented:
         s.others.solve(s.others.at, x)
+    elif s.form == DENSE and s.n_free < 0:
+        solve_linear_system(s.linear, x)
     elif s.form == DENSE:
-        solve_dense(s, x)
+        for j in range(s.n_free):
+            s.q[j] = x[s.free[j]]
+        solve_linear_system(s.linear, s.q)
+        for j in range(s.n_free):
+            x[s.free[j]] = s.q[j]
     else:
         memcpy(s.y, x, s.e.m * sizeof(double))
         if not solve_linear_system_checked(s.linear, s.y, x, s.q):

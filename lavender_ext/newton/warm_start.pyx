@@ -69,20 +69,16 @@ cdef void measure_as_engine(const blocks_t* p, const rows_t* r, const warm_t* s,
 
 cdef inline void store_score_in_trace(const blocks_t* p, const rows_t* r, warm_t* s, double energy) noexcept nogil:
     """Store the work, energy and max |e_n| of a judged impulse in the trace, in place of an earlier one after the same work."""
-    cdef int32_t i
-    cdef double x, big = 0.0, work = s.sweeps + s.factorisations
+    cdef double violation, work = s.sweeps + s.factorisations
     cdef double* out
     if s.n_traced > 0 and s.trace[3 * s.n_traced - 3] == work:
         s.n_traced -= 1
     if s.n_traced == MAX_TRACED_SCORES:
         return
-    for i in range(r.n_joints, p.n_blocks):
-        x = fabs(s.error[p.ptr[i]])
-        big = x if x > big else big
     out = s.trace + 3 * s.n_traced
     out[0] = work
     out[1] = energy
-    out[2] = big
+    measure_as_engine(p, r, s, &out[2], &violation)
     s.n_traced += 1
 
 
@@ -185,11 +181,6 @@ cdef inline int32_t solve_joints(const blocks_t* p, const rows_t* r, warm_t* s, 
     return UNDECIDED
 
 
-cdef inline double body_row_cost() noexcept nogil:
-    """Return the time [ns] of a sweep over bodies per row: "sweep row" and 24 times "sweep body cone" of the rates."""
-    return 58.0
-
-
 cdef inline int32_t sweep_contacts(const blocks_t* p, const rows_t* r, warm_t* s, double tol, double e0, double v0,
                                    double* lam, double* v) noexcept nogil:
     """Sweep over the contacts by (2), lam (m) [N s] in place; return the result code."""
@@ -199,7 +190,8 @@ cdef inline int32_t sweep_contacts(const blocks_t* p, const rows_t* r, warm_t* s
         while n < next_:
             sweep_bodies_in_sequence(p, r, lam, v)
             n += 1
-            if has_passed(s.deadline, body_row_cost() * p.n_rows):
+            # [ns] per row: "sweep row" and 24 times "sweep body cone" of the rates
+            if has_passed(s.deadline, 58.0 * p.n_rows):
                 return UNDECIDED
         s.sweeps = n
         before = now

@@ -36,7 +36,7 @@ cdef struct descent_t:          # state of the Newton steps under one law
     int32_t needs_matrix        # N must be formed again
     int32_t response_is_known   # lambda and V belong to the present s
     int32_t is_rigid            # some proximal term exceeds rounding
-    int32_t is_stiff            # N is not updated by changes of V (`min_theta_for_updates`)
+    int32_t is_stiff            # N is not updated by changes of V (theta below 1e-7 d)
     int32_t center_moved        # the centre has moved since the last step
     double softness             # rho as a fraction of d
     double best_error           # error of `best`, in multiples of the limits
@@ -155,32 +155,25 @@ cdef inline int32_t end_block_of_run(const flow_t* f, int32_t a) noexcept nogil:
 # -- lambda(s) and V -------------------------------------------------------------------------------------
 
 
-cdef inline bint is_at_apex(const double* y, int32_t n) noexcept nogil:
-    """Return whether y (n) = 0: a contact at rest that carries no impulse."""
-    cdef int32_t k
-    for k in range(n):
-        if y[k] != 0.0:
-            return False
-    return True
-
-
 cdef inline void compute_contact_impulse(const flow_t* f, int32_t i, double* lam, double* v) noexcept nogil:
     """Project z (in lam) of contact i by (1), in place, and write V."""
     cdef int32_t j = f.p.ptr[i], n = f.p.ptr[i + 1] - j, k, l
     cdef const double* root = f.sqrt_theta + j
     cdef const double* soft = f.inv_theta + j
     cdef friction_components_t q
+    cdef bint is_at_apex = True                         # a contact at rest that carries no impulse
     cdef double y[6]
     cdef double out[6]
     cdef double inv_sqrt_theta[6]
     for k in range(n):
         inv_sqrt_theta[k] = root[k] * soft[k]
         y[k] = root[k] * lam[k]
+        is_at_apex = is_at_apex and y[k] == 0.0
     get_friction_components(&f.p, i, &q)
     for k in range(q.n):
         q.friction_coefficient[k] = q.friction_coefficient[k] * root[q.first[k]] * inv_sqrt_theta[0]
     project_contact(f.p.law, &q, y, out, v)
-    if is_at_apex(y, n):
+    if is_at_apex:
         for k in range(n):
             v[k * n + k] = 1.0
     for k in range(n):

@@ -228,12 +228,3 @@ cdef inline void bind_iterate(flow_t* f, const requirements_t* need, arena_t* a)
     f.used_y, f.strip = take_doubles(a, need.panel_values), take_doubles(a, STRIP_ROWS * need.panel_columns)
     f.sum, f.y_transpose = take_doubles(a, 2 * need.rows), take_doubles(a, <int64_t>need.row_matrix_values)
     f.a = NULL
-
-
-cdef inline void set_required_residual(flow_t* f, double tol, int32_t steps, double reference_energy,
-                                       double reference_velocity) noexcept nogil:
-    """Set the required relative residual and the reference of a problem with one island; reset the counts."""
-    f.tol, f.reference_energy, f.reference_velocity = tol, reference_energy, reference_velocity
-    f.steps = steps
-    f.paused.island = -1
-    f.factorisations = f.rounds = f.evaluations = 0

@@ -10,7 +10,7 @@ from lavender_ext.core.method cimport MORE, NEEDS_WORKSPACE, SPENT, UNFIT, requi
 from lavender_ext.core.view cimport view_t
 from lavender_ext.velocity_newton.flow cimport flow_t
 from lavender_ext.velocity_newton.islands cimport (bind_iterate, bind_structure, find_islands_and_factor_patterns, requirements_t,
-                                                   set_required_residual, structure_t)
+                                                   structure_t)
 from lavender_ext.velocity_newton.newton cimport form_kept_matrix, solve_islands
 from lavender_ext.velocity_newton.sparse cimport initial_entries_per_row
 
@@ -81,8 +81,9 @@ cdef inline int32_t start_islands(const view_t* v, const options_t* o, workspace
     s.f.wide, s.f.deadline = o.wide, o.deadline
     s.f.p.b, s.f.p.islands, s.f.g = v.p.b, v.p.islands, v.g      # Another b may have been given since the analysis.
     form_kept_matrix(&s.f)
-    set_required_residual(&s.f, o.tol, 0, o.e0, o.v0)
-    s.done = 0
+    s.f.tol, s.f.reference_energy, s.f.reference_velocity = o.tol, o.e0, o.v0       # The reference is that of one island.
+    s.f.paused.island = -1
+    s.done = s.f.steps = s.f.factorisations = s.f.rounds = s.f.evaluations = 0
     return MORE
 
 

@@ -62,14 +62,6 @@ cdef enum:
     MAX_COULOMB_ROUNDS = 12     # Problems that need more rounds are solved faster by other methods.
 
 
-cdef inline double min_theta_for_updates() noexcept nogil:
-    """Return the smallest theta, as a fraction of d, for which N is updated by changes of V.
-
-    If a row with V = 1 / theta becomes fixed, its part of N cancels, up to rounding of 2^-53 d / theta relative to I.
-    """
-    return 1e-7
-
-
 # -- line searches ----------------------------------------------------------------------------------------------
 
 
@@ -83,16 +75,6 @@ cdef inline void evaluate_on_line(const flow_t* f, int32_t island, double t) noe
         for k in range(first_row_of_run(f, a), end_row_of_run(f, a)):
             w[k] = s[k] + t * q[k]
     compute_island_impulses(f, island, w, f.trial)
-
-
-cdef inline void accept_trial(flow_t* f) noexcept nogil:
-    """Make the point that `evaluate_on_line` evaluated last the iterate."""
-    cdef double* x = f.s
-    f.s = f.w
-    f.w = x
-    x = f.lam
-    f.lam = f.trial
-    f.trial = x
 
 
 cdef inline double directional_derivative(flow_t* f, int32_t island, double py, double pp, double t) noexcept nogil:
@@ -151,28 +133,12 @@ cdef inline double halve_step_until_residual_falls(flow_t* f, int32_t island, do
 # -- one island --------------------------------------------------------------------------------------------------
 
 
-cdef inline void move_proximal_centre(const flow_t* f, int32_t island) noexcept nogil:
-    """Move the centre of the proximal terms to lambda."""
-    copy_rows(f, island, f.lam, f.center)
-
-
-cdef inline void set_theta_to_maximum(double* theta, int32_t first, int32_t end) noexcept nogil:
-    """Set theta of rows [first, end) to the largest theta among these rows."""
-    cdef double big = 0.0
-    cdef int32_t k
-    for k in range(first, end):
-        if theta[k] > big:
-            big = theta[k]
-    for k in range(first, end):
-        theta[k] = big
-
-
 cdef inline void set_proximal_terms(flow_t* f, int32_t island, double softness) noexcept nogil:
     """Compute theta' of (2) with rho = softness d on rows whose own compliance is below `min_relative_compliance` d.
 
     All rows of one friction component get the largest theta' among them.
     """
-    cdef int32_t a, i, j, k, g, end, last
+    cdef int32_t a, i, j, k, g, end, last, first
     cdef friction_components_t q
     cdef const double* compliance = f.g.compliance
     cdef const double* d = f.p.d
@@ -199,14 +165,19 @@ cdef inline void set_proximal_terms(flow_t* f, int32_t island, double softness) 
                 get_friction_components(&f.p, i, &q)
                 for g in range(q.n):
                     if q.size[g] > 1:
-                        set_theta_to_maximum(theta, j + q.first[g], j + q.first[g] + q.size[g])
+                        first, x = j + q.first[g], 0.0
+                        for k in range(first, first + q.size[g]):
+                            x = max(x, theta[k])
+                        for k in range(first, first + q.size[g]):
+                            theta[k] = x
                 for k in range(j, end):
                     f.sqrt_theta[k] = sqrt(theta[k])
         end = end_row_of_run(f, a)
         for k in range(first_row_of_run(f, a), end):
             rho[k] = theta[k] - compliance[k]
             soft[k] = 1.0 / theta[k]
-            is_stiff |= theta[k] < min_theta_for_updates() * d[k]
+            # If a row with V = 1 / theta becomes fixed, its part of N cancels, up to rounding of 2^-53 d / theta relative to I.
+            is_stiff |= theta[k] < 1e-7 * d[k]
             is_rigid |= rho[k] > 1e-13 * theta[k]
     f.descent.is_stiff, f.descent.is_rigid = is_stiff, is_rigid
 
@@ -366,7 +337,7 @@ cdef inline int32_t descend_island(flow_t* f, int32_t island, double goal) noexc
             return end_descent(f, island, moves, is_far, STUCK)
         if rigid and (size <= 0.1 * energy and size <= 0.1 * compute_proximal_energy_error(f, island) or size == 0.0):
             # The softened problem is solved well enough: move its centre.
-            move_proximal_centre(f, island)
+            copy_rows(f, island, f.lam, f.center)
             x.center_moved = 1
             if x.error_at_last_center >= 0.0 and energy > 0.3 * x.error_at_last_center and x.softness > 1e-9:
                 x.softness = 0.1 * x.softness
@@ -407,35 +378,23 @@ cdef inline int32_t descend_island(flow_t* f, int32_t island, double goal) noexc
             f.y[c] += t * f.step[c]
         f.is_zero = False
         x.slack_is_fresh = 0
-        accept_trial(f)                                 # Both searches evaluated the accepted point last.
+        f.s, f.w, f.lam, f.trial = f.w, f.s, f.trial, f.lam     # Both searches evaluated the accepted point last.
         x.response_is_known = 1
-
-
-cdef inline double compute_normal_shift(const flow_t* f, int32_t i) noexcept nogil:
-    """Return phi of (3) for block i from w, whose normal row must exclude phi."""
-    cdef int32_t g
-    cdef double out = 0.0
-    cdef friction_components_t q
-    get_friction_components(&f.p, i, &q)
-    for g in range(q.n):
-        out += q.friction_coefficient[g] * euclidean_norm(f.w + f.p.ptr[i] + q.first[g], q.size[g])
-    return out
 
 
 cdef inline void compute_normal_shifts(const flow_t* f, int32_t island, const double* lam) noexcept nogil:
     """Compute phi (3) from the slack of lam. phi must be 0 before the call."""
-    cdef int32_t a, i
+    cdef int32_t a, i, j, g
     cdef double velocity
+    cdef friction_components_t q
     measure_impulse_errors(f, island, lam, multiply_y_transpose(f, island, lam, f.u), &velocity)
     for a in range(f.iptr[island], f.iptr[island + 1]):
         for i in range(first_block_of_run(f, a), end_block_of_run(f, a)):
             if not has_bounded_rows_only(&f.p, i):
-                f.phi[f.p.ptr[i]] = compute_normal_shift(f, i)
-
-
-cdef inline void clear_normal_shift(const flow_t* f, int32_t island) noexcept nogil:
-    """Set phi = 0."""
-    clear_rows(f, island, f.phi)
+                j = f.p.ptr[i]
+                get_friction_components(&f.p, i, &q)
+                for g in range(q.n):
+                    f.phi[j] += q.friction_coefficient[g] * euclidean_norm(f.w + j + q.first[g], q.size[g])
 
 
 cdef inline void restart_island_from_impulse(flow_t* f, int32_t island, const double* lam) noexcept nogil:
@@ -443,7 +402,7 @@ cdef inline void restart_island_from_impulse(flow_t* f, int32_t island, const do
     cdef int32_t a, c
     copy_rows(f, island, lam, f.lam)
     copy_rows(f, island, lam, f.best)                   # `best` must contain an impulse even if all later errors overflow.
-    move_proximal_centre(f, island)
+    copy_rows(f, island, lam, f.center)
     f.is_zero = not multiply_y_transpose(f, island, lam, f.u)
     for a in range(f.n_unknowns):
         c = f.unknowns[a]
@@ -488,7 +447,7 @@ cdef inline int32_t solve_coulomb(flow_t* f, int32_t island, double* impulse) no
             if n == LOST or n == BROKEN:
                 return n
             copy_rows(f, island, f.phi if n == MORE else f.best, f.start)
-            clear_normal_shift(f, island)
+            clear_rows(f, island, f.phi)
         moves = multiply_y_transpose(f, island, f.best, f.u)
         is_lower = n != LOST and keep_impulse_if_better(f, island, f.best, moves, impulse)
         if x.stage == COULOMB_STAGE and is_lower and n != MORE:
@@ -508,23 +467,18 @@ cdef inline int32_t solve_coulomb(flow_t* f, int32_t island, double* impulse) no
     return STUCK
 
 
-cdef inline void set_error_limits(flow_t* f, int32_t island) noexcept nogil:
-    """Set the largest errors with which the island's relative residual is at most tol.
+cdef inline void choose_island_unknowns(flow_t* f, int32_t island) noexcept nogil:
+    """Set the limits of an island's errors, and choose its unknowns, velocities or rows; no column of A is formed yet.
 
     Both limits are 0 if the rows of the island are compared with their own terms.
     """
+    cdef int32_t a, k
     cdef const double* own
     cdef double energy = f.reference_energy, velocity = f.reference_velocity
     if f.p.islands != NULL:
         own = f.p.islands.reference + 2 * f.p.islands.label[first_block_of_run(f, f.iptr[island])]
         energy, velocity = max(own[0], 0.0), max(own[1], 0.0)
     f.energy_limit, f.velocity_limit = f.tol * energy, f.tol * velocity
-
-
-cdef inline void choose_island_unknowns(flow_t* f, int32_t island) noexcept nogil:
-    """Choose the unknowns of an island, velocities or rows; no column of A is formed yet."""
-    cdef int32_t a, k
-    set_error_limits(f, island)
     f.is_over_rows = f.over_rows[island]
     f.unknowns, f.n_unknowns = f.icols + f.cptr[island], f.cptr[island + 1] - f.cptr[island]
     if not f.is_over_rows:
@@ -586,7 +540,7 @@ cdef inline int32_t solve_island(flow_t* f, int32_t island, double* impulse) noe
             return REACHED
         restart_island_from_impulse(f, island, impulse)
         copy_rows(f, island, impulse, f.start)
-        clear_normal_shift(f, island)
+        clear_rows(f, island, f.phi)
         f.paused.stage, f.paused.rounds = NEXT_ROUND, 0
         f.paused.best_error = f.paused.island_error = 1.0 / 0.0
         if f.law != COULOMB and f.tol > 0.0 and f.energy_limit > 0.0 and is_zero_island_impulse(f, island):
