@@ -69,7 +69,7 @@ CASES = (
     "pyramid(k=6, friction=cone)",
     "granular(n=4, friction=cone)",
 )
-PLAN = Plan(TOLERANCES, budgets=(4, 16, 64), repeats=2, time_limit=0.1, warm=False, orders=())
+PLAN = Plan(TOLERANCES, budgets=(4, 16, 64), repeats=2, time_limit=0.1, warm=False)
 # Beside the solvers of lavender: one backend of each kind (splitting, interior point, cones).
 BACKENDS = ("osqp", "scs", "piqp", "clarabel", "clarabel_cone")
 NEAR = 1.25  # times the fastest: differences below say nothing on a machine that does other work

@@ -240,7 +240,7 @@ add({"problem": CONTACT, "impulse": np.zeros(CONTACT.m), "velocity": CONTACT.row
     | {"gap": np.zeros(len(CONTACT.rows.normal)), "dt": 0.01}, lv.diagnose)  # fmt: skip
 add({"problem": STEP, "impulse": np.zeros(3), "tol": 1e-9}, lv.explain_slip)
 add({"tolerances": (1e-3,), "budgets": (4,), "repeats": 1, "time_limit": 1.0, "sequence_time_limit": 1.0,
-     "orders": ("given",), "warm": True, "campaign": True}, report.Plan)  # fmt: skip
+     "warm": True, "campaign": True}, report.Plan)  # fmt: skip
 add({"sources": ["stack(n=2)"], "sequences": False, "problems": [LCP], "name": "walk", "scene": "pyramid", "at": 3,
      "text": "@hard", "case": "stack", "n": 3, "mass_ratio": 2.0, "friction": "none", "sliding": 0.5},
     report.resolve_sources, report.make_sequence, suite.stack, suite.engine_step,

@@ -100,7 +100,7 @@ def make_audit_page(audit: Any, folder: Path | None) -> Page:
     if folder is not None and counts.n:
         from markupsafe import Markup
 
-        tables = [counts.make_sizes_table(), counts.make_rows_table()]
+        tables = [*counts.make_sizes_table(), *counts.make_rows_table()]
         if audit.worst:
             rows: list[Any] = [
                 [
@@ -111,16 +111,14 @@ def make_audit_page(audit: Any, folder: Path | None) -> Page:
                 for i, w in enumerate(audit.worst, 1)
             ]
             command = f"lavender check {folder.parent / 'worst' / 'worst_1.npz'}"
-            tables.append([make_table(rows, title="Look at the worst steps"), {"code": command}])
-        flat = [block for some in tables for block in (some if isinstance(some, list) else [some])]
-        blocks.append({"pair": [[Markup(counts.draw_errors(folder))], flat]})
+            tables += [make_table(rows, title="Look at the worst steps"), {"code": command}]
+        blocks.append({"pair": [[Markup(counts.draw_errors(folder))], tables]})
     sections = (
         ("The same states", audit.comparison, "Both models solve the same steps from the same states."),
         ("What the engine claims", audit.claims, "A wrong claim hides an error; a missing claim costs iterations."),
-        ("Quantiles of the errors", audit.errors, ""), ("Verdicts", audit.verdicts, ""),
+        ("Quantiles of the errors", audit.errors, ""),
         ("Rows and contacts of a step", audit.judged_sizes.table, ""),
         ("Worlds that diverged", audit.diverged, "The last step, and whether every solve until then was exact."),
-        ("Worst rows of steps that stopped early", audit.worst_rows, ""),
     )  # fmt: skip
     blocks += [fold_table(title, frame, note) for title, frame, note in sections if len(frame)]
     blocks.append({"folded": [{"note": ERROR_DEFINITION}], "title": "How errors are defined", "open": False})
@@ -380,7 +378,7 @@ class AuditCounts:
         small = f"{format_number(self.n)} steps by the error of their worst row"
         return [make_table(rows, title="How wrong", small=small, classes="full"), {"bar": bar, "alt": alt}]
 
-    def make_rows_table(self) -> Any:
+    def make_rows_table(self) -> list[Any]:
         """Make the table of the rows with the largest errors, on a logarithmic scale with the limit."""
         from markupsafe import Markup
 
@@ -406,7 +404,7 @@ class AuditCounts:
         heads = ["row", ("steps¹", "wide", ""), "largest", ("", "bar", "")]
         note = "Dashed: the limit. ¹ stopped before convergence with this worst row."
         small = f"largest error of each, {format_count(len(where), 'row')} in all"
-        return make_table(rows, heads, title="Which row", small=small, note=note, classes="full")
+        return [make_table(rows, heads, title="Which row", small=small, note=note, classes="full")]
 
 
 # If a smaller fraction of the judged steps has contact, `tune` recommends no setting and an audit warns: mean times,
@@ -449,9 +447,8 @@ class StepSizes:
         import pandas as pd
 
         rows = [
-            (name, f"{np.median(counts):g}", counts.max(),
-             format_percent(int(np.count_nonzero(counts)), len(counts), 1))
-            for name, counts in (("rows", self.rows), ("contacts", self.contacts)) if len(counts)
+            (name, f"{x['median']:g}", x["maximum"], f"{100.0 * x['share']:.1f} %")
+            for name in ("rows", "contacts") if (x := self.as_dict[name])["median"] is not None
         ]  # fmt: skip
         return pd.DataFrame(rows, columns=["in a step", "median", "maximum", "steps with any"])
 

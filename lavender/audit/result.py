@@ -200,20 +200,14 @@ class Audit:
         return len(self.divergences)
 
     @property
-    def _errors_above_floor(self) -> FloatArray:
-        """Velocity errors of the steps judged that are not at their floor [m/s]."""
-        return self.numbers[0][self.is_judged & (self.verdict > AUDIT_VERDICTS.index(AT_FLOOR))]
-
-    @property
     def max_velocity_error(self) -> float:
         """Largest velocity error that rounding does not explain, of the steps judged [m/s]."""
-        return float(np.max(self._errors_above_floor, initial=0.0))
+        return AuditCounts(self).largest
 
     @property
     def n_above_limit(self) -> int:
         """Number of steps with a velocity error above `error_limit` that rounding does not explain."""
-        limit = np.inf if self.error_limit is None else self.error_limit
-        return int(np.count_nonzero(self._errors_above_floor > limit))
+        return 0 if self.error_limit is None else AuditCounts(self).above
 
     @property
     def judged_sizes(self) -> StepSizes:
@@ -348,18 +342,6 @@ class Audit:
         return _make_frame(columns if len(columns) > 1 else {})
 
     @property
-    def verdicts(self) -> pd.DataFrame:
-        """Number of steps and of worlds with each verdict; shares are fractions of the steps judged."""
-        rows = []
-        for i, word in enumerate(AUDIT_VERDICTS):
-            here = self.verdict == i
-            n = int(here.sum())
-            if n:
-                share = format_percent(n, self.n_judged, 1) if i != NOT_JUDGED else ""
-                rows.append((word, n, share, int(np.count_nonzero(here.any(axis=1)))))
-        return _make_frame(["verdict", "steps", "share", "worlds"], rows)
-
-    @property
     def worst_rows(self) -> pd.DataFrame:
         """The worst rows of steps that stopped before convergence or are wrong, most frequent first."""
         ranked = sorted(self.where.items(), key=lambda entry: -entry[1][0])
@@ -486,30 +468,19 @@ class Audit:
     @property
     def page(self) -> ResultPage:
         """Page with the result in sentences, figures and tables, as `lavender audit` writes it."""
-        short = [
-            self.comparison,
-            self.claims,
-            self._tabulate_classes(),
-            self.worst_rows.head(3),
-            self.worst_steps,
-        ]
-        last = format_provenance(self.provenance)
-        return ResultPage(partial(make_audit_page, self), self.totals, short, self.is_stopped, last)
-
-    def _tabulate_classes(self) -> pd.DataFrame:
-        """Build the table of the numbers of steps by the size of their error, for a terminal."""
         counts = AuditCounts(self)
         rows = [(name, n, format_percent(n, max(counts.n, 1))) for name, n in counts.classes]
-        return _make_frame(["error of the worst row", "steps", "share"], rows)
+        classes = _make_frame(["error of the worst row", "steps", "share"], rows)
+        short = [self.comparison, self.claims, classes, self.worst_rows.head(3), self.worst_steps]
+        last = format_provenance(self.provenance)
+        return ResultPage(partial(make_audit_page, self), self.totals, short, self.is_stopped, last)
 
 
 def _make_frame(columns: Any, rows: Sequence[Any] | None = None) -> pd.DataFrame:
     """Build a DataFrame from a dict of columns, or from heads and rows; empty without rows."""
     import pandas as pd
 
-    if rows is None:
-        return pd.DataFrame(columns)
-    return pd.DataFrame(rows, columns=columns)
+    return pd.DataFrame(columns) if rows is None else pd.DataFrame(rows, columns=columns)
 
 
 def _select_worst(candidates: list[Worst], keep: int | None) -> list[Worst]:

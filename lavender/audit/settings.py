@@ -34,12 +34,6 @@ class MujocoSetting:
         )
 
     @property
-    def name(self) -> str:
-        """`option_line`, after "MuJoCo's defaults" if the setting is that; or "the model's own setting"."""
-        line = self.option_line or "the model's own setting"
-        return f"MuJoCo's defaults: {line}" if self.is_default else line
-
-    @property
     def short_name(self) -> str:
         """Options without the syntax of MJCF, for tables; or "MuJoCo's defaults"."""
         values = ((name, f"{x:g}" if isinstance(x, float) else str(x)) for name, x in self.options)

@@ -53,14 +53,9 @@ from lavender.io.stored import check_writable
 @quiet_option
 @click.pass_context
 def audit(
-    context: click.Context,
-    /,
-    model: Path,
-    out: Path,
-    quiet: bool,
-    save_states: tuple[str, Path] | None,
+    context: click.Context, /, model: Path, out: Path, quiet: bool, save_states: tuple[str, Path] | None,
     **options: Any,
-) -> None:
+) -> None:  # fmt: skip
     """Judge every step of many worlds of a MuJoCo model.
 
     MODEL is an MJCF file, or an .mjb file of a model that was changed after loading. For kamino, newton-mujoco and

@@ -50,16 +50,9 @@ NARROW_CHECK_OMITS = (
 )
 @click.pass_context
 def check(
-    context: click.Context,
-    files: tuple[str, ...],
-    solvers: tuple[str, ...] | None,
-    reference: str,
-    tol: float,
-    time_limit: float | None,
-    precision: str | None,
-    threshold: float,
-    as_json: bool,
-) -> None:
+    context: click.Context, files: tuple[str, ...], solvers: tuple[str, ...] | None, reference: str, tol: float,
+    time_limit: float | None, precision: str | None, threshold: float, as_json: bool,
+) -> None:  # fmt: skip
     """Compare solvers with a reference solver and with the judge.
 
     The judge checks the claim of each solver. For a case of the suite whose exact solution is known, the distance of

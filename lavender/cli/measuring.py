@@ -106,12 +106,12 @@ def _make_plan(context: click.Context, files: Sequence[str]) -> tuple[Plan, dict
     from lavender.report import CampaignPlan, Plan
 
     options = context.params
-    names = ("tolerances", "budgets", "orders")
+    names = ("tolerances", "budgets")
     values = {name: options[name] for name in names if options[name] is not None}
     values |= {"tolerances": ()} if options["sweeps"] else {}
     if is_campaign(context):
         workers = options["workers"] if is_option_set(context, "workers") else -1
-        return CampaignPlan(**{"orders": (), **values}), {"workers": workers, "backend": options["backend"]}
+        return CampaignPlan(**values), {"workers": workers, "backend": options["backend"]}
     if options["sequence"] and not files:
         raise InputError("--sequence needs a folder of problem files, one for each step")
     if options["sequence_time_limit"] is not None:

@@ -71,13 +71,6 @@ def _is_solver(word: str) -> bool:
     return word not in suite.FAMILIES and not set(word) & set("(*?[/\\.") and not Path(word).exists()
 
 
-def _is_order(word: str) -> bool:
-    """Return whether a word names a sweep order."""
-    from lavender.problem.ordering import SWEEP_ORDERS
-
-    return word.partition(":")[0] in SWEEP_ORDERS
-
-
 class ListCommand(click.Command):
     """Command that takes lists with blanks, `--budgets 4 8`, as well as with commas, `--budgets 4,8`."""
 
@@ -85,7 +78,6 @@ class ListCommand(click.Command):
     TESTS: Mapping[str, Callable[[str], bool]] = {
         **dict.fromkeys(("--tolerances", "--budgets", "--time-budgets"), _is_number),
         "--solvers": _is_solver,
-        "--orders": _is_order,
     }
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -175,7 +167,6 @@ def describe_solvers(solvers: Sequence[str] | None) -> dict[str, bool]:
     specs = [registry.get(name) for name in solvers or ()]
     return {
         "without_budgets": bool(specs) and not any(s.resumable and not s.exact for s in specs),
-        "without_orders": bool(specs) and not any(s.order and not s.exact for s in specs),
     }
 
 
@@ -225,12 +216,11 @@ OPTIONS_WITHOUT_EFFECT: dict[str, tuple[str, tuple[str, ...]]] = {
     "is_campaign": ("with --workers, which measures no times and ends by iterations",
                     ("repeats", "time_limit", "sequence_time_limit", "time_budgets", "sequence")),
     "sweeps": ("with --sweeps, which measures fixed numbers of sweeps",
-               ("tolerances", "orders", "repeats", "time_budgets", "workers", "backend")),
+               ("tolerances", "repeats", "time_budgets", "workers", "backend")),
     "without_model": ("without a MODEL.xml", RECORDING_NAMES),
     "without_random": ("without --controls random", ("seed",)),
     "without_record": ("without --record", ("replace",)),
     "without_budgets": ("on solvers that cannot stop after any iteration", ("budgets",)),
-    "without_orders": ("on solvers that take no order", ("orders",)),
     "other_engine": ("with another --engine than mujoco", ("workers", "backend", "precision")),
 }  # fmt: skip
 
@@ -242,8 +232,6 @@ PLAN_OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
                   "help": "Relative residuals to reach."}),
     ("--budgets", {"type": ListType(int), "default": "4,8,16,32,64", "show_default": True,
                    "help": "Numbers of iterations to run exactly."}),
-    ("--orders", {"type": ListType(str), "default": None,
-                  "help": "Sweep orders to compare with 'given', at the middle budget; random:3 uses seed 3."}),
     ("--repeats", {"type": int, "default": 3, "show_default": True,
                    "help": "Repetitions of each solve; minimum and median are recorded."}),
     ("--time-limit", {"type": float, "default": None, "metavar": "S",

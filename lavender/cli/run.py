@@ -50,20 +50,10 @@ from lavender.io.stored import check_figure_path, check_writable
 @click.option("--film", type=PATH, help="Write a film of the run (.gif).")
 @click.pass_context
 def run(
-    context: click.Context,
-    /,
-    scene: str,
-    steps: int,
-    parameters: tuple[str, ...],
-    residual: bool,
-    plot: Path | None,
-    trace: Path | None,
-    record: Path | None,
-    replace: bool,
-    film: Path | None,
-    velocity_tol: float | None,
+    context: click.Context, /, scene: str, steps: int, parameters: tuple[str, ...], residual: bool, plot: Path | None,
+    trace: Path | None, record: Path | None, replace: bool, film: Path | None, velocity_tol: float | None,
     **scene_options: Any,
-) -> None:
+) -> None:  # fmt: skip
     """Simulate a scene of the gallery.
 
     With --record, its steps are written as a sequence for `lavender report`.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
 from pathlib import Path
 
 import lavender_ext
@@ -78,11 +77,6 @@ def write(out: Path, *, replace: bool = False) -> list[Path]:
         f"{hashlib.sha256(contents[name].encode()).hexdigest()}  {name}\n" for name in sorted(contents)
     )
     contents["SHA256SUMS"] = sums
-    return _write_files(out, contents, replace)
-
-
-def _write_files(out: Path, contents: Mapping[str, str], replace: bool) -> list[Path]:
-    """Write files by their names below a folder; none if one exists with other contents and `replace` is false."""
     files = {out / name: text.encode() for name, text in contents.items()}
     for path, data in files.items():
         if path.exists() and not replace and path.read_bytes() != data:

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import groupby
+from itertools import chain, count, groupby
 from pathlib import Path
 from typing import Any
 
@@ -288,15 +288,10 @@ def _list_recorded_steps(folder: Path, items: list[Item]) -> list[Item]:
     so names must differ as file names, too.
     """
     found: list[Item] = []
+    used = {make_file_name(item.sequence).lower() for item in items if item.sequence}
     for name, group in groupby(list_steps_in_folder(folder), key=lambda item: item.sequence):
-        names = {make_file_name(item.sequence).lower() for item in (*items, *found) if item.sequence}
-        unique, n = name, 1
-        if name and make_file_name(name).lower() in names:
-            with_parent = f"{folder.resolve().parent.name}/{name}"
-            name = name if make_file_name(with_parent).lower() in names else with_parent
-            while make_file_name(unique := f"{name} #{n}" if n > 1 else name).lower() in names:
-                n += 1
-        found += [replace(s, name=f"{unique}[{s.step}]", sequence=unique) if unique else s for s in group]
+        name = name and _take_free_name([name, f"{folder.resolve().parent.name}/{name}"], used)
+        found += [replace(s, name=f"{name}[{s.step}]", sequence=name) if name else s for s in group]
     missing, name = map(_make_item_of_file, _read_unrecorded_steps(folder)), found[-1].sequence
     named = name or folder.resolve().name
     return [*found, *(replace(item, name=f"{named}, {item.name}", sequence=name) for item in missing)]
@@ -370,39 +365,35 @@ def _make_names_differ(items: list[Item]) -> list[Item]:
         n = next((i for i, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), len(first))
         for item, parts in zip(same, folders, strict=True):
             item.name = escape_unprintable("/".join([*parts[n:], item.name]))
-    used_names: set[str] = set()
+    used = set[str]()
     for item in items:
-        name, n = item.name, 1
-        while make_file_name(item.name).lower() in used_names:
-            n += 1
-            item.name = f"{name} #{n}"
-        used_names.add(make_file_name(item.name).lower())
+        item.name = _take_free_name([item.name], used)
     return items
+
+
+def _take_free_name(names: list[str], used: set[str]) -> str:
+    """Return one of `names`, or the first with a number, that is not `used` as a file name; add it to them."""
+    numbered = (f"{names[0]} #{n}" for n in count(2))
+    name = next(x for x in chain(names, numbered) if make_file_name(x).lower() not in used)
+    used.add(make_file_name(name).lower())
+    return name
 
 
 def describe_case(item: Item, run: str) -> Row:
     """Load the problem of an item and return the row that describes it."""
     p, answer = item.problem, item.load_stored()
-    case = make_case(p)
+    case, guess = make_case(p), ""
+    if p.guess is not None and p.qp is None:
+        is_stored = answer is not None and np.array_equal(p.guess, answer)
+        is_answer = is_stored or residual(p, p.guess).relative <= DEFAULT_SOLVE_TOL
+        guess = "answer" if is_answer else "start"
     stored = math.nan if answer is None or answer.shape != (p.m,) else case.judge_impulse(answer)
     return {
         **CASE_COLUMNS, **case.describe(), "kind": "case", "run": run, "case": item.name,
         "source": item.source, "sha": hash_problem(p),
         "sequence": item.sequence, "step": item.step, "identity": "", "stored": stored,
-        "guess": _classify_guess(item, answer), "diagnostics": case.list_diagnostics(),
+        "guess": guess, "diagnostics": case.list_diagnostics(),
     }  # fmt: skip
-
-
-def _classify_guess(item: Item, stored: FloatArray | None) -> str:
-    """Return the kind of the problem's guess: "" without one or in a program, "start" or "answer".
-
-    A guess is an answer if it is the stored answer, or if its residual is at most `DEFAULT_SOLVE_TOL`.
-    """
-    guess = item.problem.guess
-    if guess is None or item.problem.qp is not None:
-        return ""
-    is_stored = stored is not None and np.array_equal(guess, stored)
-    return "answer" if is_stored or residual(item.problem, guess).relative <= DEFAULT_SOLVE_TOL else "start"
 
 
 def hash_problem(problem: Problem) -> str:

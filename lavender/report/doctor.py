@@ -73,6 +73,10 @@ def collect_installation_facts() -> dict[str, Any]:
         n: "same" if h == HASHES.get(n) else f"{HASHES.get(n)} expected, {h} found"
         for n, h in run_self_test().items()
     }
+    installed = {
+        name: ", ".join(f"{p} {v}" for p, v in get_versions(get(name).requires, base=()).items())
+        for name, reason in backends.items() if not reason
+    }  # fmt: skip
     affinity = getattr(os, "sched_getaffinity", None)
     return {
         "lavender": __version__,
@@ -88,7 +92,7 @@ def collect_installation_facts() -> dict[str, Any]:
         "build": describe_build() | machine.get_processor_clock(),
         "load": machine.get_load_average(),
         "extension": Path(str(serial.__file__)).name,
-        "backends": {name: reason or get_backend_versions(name) for name, reason in backends.items()},
+        "backends": {name: reason or installed[name] or "installed" for name, reason in backends.items()},
         "plug_ins": {
             name: get_versions([s.distribution], base=()) for name, s in specs().items() if s.distribution
         },
@@ -96,12 +100,6 @@ def collect_installation_facts() -> dict[str, Any]:
         "same_bits": all(x == "same" for x in parts.values()),
         "seconds": round(perf_counter() - start_time, 2),
     }
-
-
-def get_backend_versions(solver: str) -> str:
-    """Return the versions of the packages that a backend needs."""
-    package_versions = get_versions(get(solver).requires, base=())
-    return ", ".join(f"{name} {v}" for name, v in package_versions.items()) or "installed"
 
 
 def simulate_positions(scene: str, n: int) -> Any:

@@ -131,7 +131,7 @@ def draw_error_against_time(
     """
     is_program = report.cases.at[case, "law"] == "program"
     column, show = ("relative", format_residual) if is_program else ("velocity", format_speed)
-    frame = report.frame[(report.frame["case"] == case) & (report.frame["order"] == "given")]
+    frame = report.frame[report.frame["case"] == case]
     kept = report.ranked_runs[report.ranked_runs["case"] == case]
     starts = dict(zip(kept["solver"].astype(str), kept["start"].astype(str), strict=True))
     lines = {}

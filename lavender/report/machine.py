@@ -59,16 +59,9 @@ def get_versions(packages: Iterable[str] = (), base: Iterable[str] = BASE_PACKAG
         try:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
-            found |= {
-                dist: metadata.version(dist) for dist in _map_modules_to_distributions().get(name, ())[:1]
-            }
+            owners = metadata.packages_distributions().get(name, ())[:1]
+            found |= {dist: metadata.version(dist) for dist in owners}
     return found
-
-
-@cache
-def _map_modules_to_distributions() -> Mapping[str, list[str]]:
-    """Return {module: distributions}; it reads the file lists of all installed packages."""
-    return metadata.packages_distributions()
 
 
 def describe_run(plan: Mapping[str, Any], packages: Iterable[str] = ()) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from itertools import product
+from itertools import groupby, product
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
@@ -60,6 +60,9 @@ UNGUARDED_TIME_RATIO = 0.05
 MAX_REPEATED_STEPS = 20
 # The error of the motion is computed for about this number of steps of a sequence, evenly distributed.
 MAX_MOTION_STEPS = 20
+# Columns that depend on the speed and the load of the machine.
+NO_TIMES = ("carry_time", "setup_time", "solve_time", "calibration_time", "load")
+
 Watch = Callable[["Event"], Any]
 
 
@@ -83,12 +86,6 @@ def carry_impulses(before: Problem, impulse: FloatArray, problem: Problem) -> Fl
         raise InputError(f"before is a {type(before).__name__}; the problem of the previous step is needed")
     start = problem._carry(before, before.make_start(impulse))[0]
     return problem.start() if start is None else start
-
-
-def remove_times(row: Row, time_limit: float) -> Row:
-    """Return the row without times and with the plan's `time_limit` [s], so that it is equal on all machines."""
-    names = ("carry_time", "setup_time", "solve_time", "calibration_time", "load")
-    return add_times({**row, **dict.fromkeys(names, math.nan), "time_limit": time_limit}, ())
 
 
 def select_solver_names(names: str | Sequence[str] | None) -> list[str]:
@@ -220,12 +217,13 @@ class Runner:
         if backend:
             self.distribute_pairs(items, workers, backend)
         else:
-            for name, group in _group_sequences(items):
-                if name:
-                    self.measure_sequence(group)
+            for _, group in groupby(items, key=lambda item: item.sequence or id(item)):
+                steps = list(group)
+                if steps[0].sequence:
+                    self.measure_sequence(steps)
                 else:
-                    self.measure_case(group[0])
-                for item in group:
+                    self.measure_case(steps[0])
+                for item in steps:
                     item.release_problem()
         self.add_row(self.this)
         self.report_progress("", "")
@@ -245,7 +243,10 @@ class Runner:
         rows: dict[int, list[Row]] = {}
         try:
             for number, new in map_unordered(measure_in_worker, calls, workers, backend) if calls else ():
-                self.store_new(new)
+                for row in new:
+                    is_stored = row["kind"] == "run" and get_key(row) in self.known
+                    if self.store is not None and not is_stored:
+                        self.store.add(row)
                 rows[number] = new
                 self.done += 1
                 _, case, _, name, *_ = calls[number]
@@ -260,13 +261,6 @@ class Runner:
                 "command again, with fewer workers if memory is short"
             )
 
-    def store_new(self, rows: list[Row]) -> None:
-        """Store the rows that a worker returned, except the runs that are stored already."""
-        for row in rows:
-            is_stored = row["kind"] == "run" and get_key(row) in self.known
-            if self.store is not None and not is_stored:
-                self.store.add(row)
-
     def load_case(self, item: Item) -> Row | None:
         """Load and describe a case. Return None, and add the reason to the rows, if it does not load."""
         try:
@@ -274,7 +268,10 @@ class Runner:
             if case is None or case["sha"] != hash_problem(item.problem):
                 case = describe_case(item, self.this["run"])
         except Exception as error:  # A reader may raise any exception; only its own case is lost.
-            self.add_skip(item.name, "", describe_load_error(item.source, error), item.sequence)
+            is_expected = isinstance(error, (LavenderError, OSError))
+            text = str(error) if is_expected else f"{type(error).__name__}: {error}"
+            text = text if text.startswith(item.source) else f"{item.source}: {text}"
+            self.add_skip(item.name, "", f"did not load: {text}", item.sequence)
             self.report_progress(item.name, "")
             return None
         if not item.sequence:
@@ -409,7 +406,7 @@ class Runner:
             self.report_progress(case["case"], spec.name, row, reused)
             return row
 
-        self.plan.measure_solver(case, problem, spec, measure_or_reuse)
+        self.plan.measure_solver(case, spec, measure_or_reuse)
 
     def measure_task(self, problem: Problem, task: Task, spec: SolverSpec, impulse: Any) -> tuple[Row, Any]:
         """Solve a task; return its row and impulses (m,) [N s]."""
@@ -418,32 +415,16 @@ class Runner:
         row, found = measure_task(problem, task, impulse)
         if found is not None:
             row["solution_hash"] = hashlib.sha256(found.tobytes()).hexdigest()[:16]
-        return remove_times(row, self.plan.time_limit) if self.plan.campaign else row, found
+        if self.plan.campaign:  # Without times, and with the plan's limit, rows are equal on all machines.
+            same = dict.fromkeys(NO_TIMES, math.nan) | {"time_limit": self.plan.time_limit}
+            row = add_times(row | same, ())
+        return row, found
 
 
 def _get_elapsed_time(row: Row) -> float:
     """Return the time [s] that a run took, from its row, so that a resumed pass ends at the same step."""
     carry_time = row["carry_time"] if row["carry_time"] > 0.0 else 0.0
     return float(sum(row["times"]) + carry_time if row["times"] else row["time_limit"])
-
-
-def _group_sequences(items: list[Item]) -> list[tuple[str, list[Item]]]:
-    """Group consecutive items of the same sequence; each item without a sequence is a group with the name ""."""
-    out: list[tuple[str, list[Item]]] = []
-    for item in items:
-        if item.sequence and out and out[-1][0] == item.sequence:
-            out[-1][1].append(item)
-        else:
-            out.append((item.sequence, [item]))
-    return out
-
-
-def describe_load_error(source: str, error: Exception) -> str:
-    """Return the reason why a case is left out, with the type of an unexpected error."""
-    text = str(error)
-    if not isinstance(error, (LavenderError, OSError)):
-        text = f"{type(error).__name__}: {text}"
-    return f"did not load: {text}" if text.startswith(source) else f"did not load: {source}: {text}"
 
 
 # -- pairs of a campaign, in workers -----------------------------------------------------------------------

@@ -34,11 +34,11 @@ ERROR = (
     "ERROR"  # A run whose solver raised an exception has this status; other runs have a status of `Status`.
 )
 #: Columns that are equal in two lines about the same measurement; the later line counts.
-KEY = ("run", "case", "sha", "solver", "start", "mode", "tol", "max_iter", "time_limit", "order")
+KEY = ("run", "case", "sha", "solver", "start", "mode", "tol", "max_iter", "time_limit")
 #: Columns of runs with their defaults, which are the values of a run without an answer and determine the types.
 RUN_COLUMNS: Row = {
     "run": "", "case": "", "sha": "", "solver": "", "start": "cold", "mode": "tol", "tol": math.nan, "max_iter": 0,
-    "time_limit": math.nan, "order": "given", "step": -1, "status": "", "relative": math.inf,
+    "time_limit": math.nan, "step": -1, "status": "", "relative": math.inf,
     "error_energy": math.inf, "velocity": math.inf, "roundoff_floor": math.nan, "energy_change": math.nan,
     "energy_gain": math.nan, "motion_error": math.nan, "worst_row": -1, "worst_name": "", "success": False,
     "claims": False, "claim_check": CONFIRMED, "status_conflict": "", "iterations": 0, "work": "{}", "form": "",

@@ -46,7 +46,7 @@ class SweepStudy:
     def __init__(self, report: Contents, limit: float) -> None:
         self.report, self.limit = report, limit
         runs = report.frame
-        runs = runs[(runs["mode"] == "budget") & (runs["step"] > 0) & (runs["order"] == "given")]
+        runs = runs[(runs["mode"] == "budget") & (runs["step"] > 0)]
         self.runs = runs.astype(dict.fromkeys(("solver", "start", "case", "sequence"), str))
         errors = self.runs.groupby(["start", "solver", "max_iter"])["velocity"].max().unstack()
         complete = self.runs.groupby(["start", "solver", "max_iter"])["case"].nunique().unstack()
@@ -56,7 +56,8 @@ class SweepStudy:
         self.errors = errors.loc[self.start].dropna(how="all")
         self.cold = errors.loc["cold"] if "cold" in errors.index else self.errors.iloc[:0]
         self.budgets = list(map(int, self.errors.columns))
-        order = sorted(self.errors.index, key=lambda s: (*_place_plain(s), s))
+        plain = list_plain_sweeps()
+        order = sorted(self.errors.index, key=lambda s: (plain.index(s) if s in plain else len(plain), s))
         self.groups: list[list[str]] = []  # Solvers with equal errors are one group.
         for solver in order:
             same = next((g for g in self.groups if self._are_equal(g[0], solver)), None)
@@ -65,9 +66,11 @@ class SweepStudy:
             else:
                 same.append(solver)
         enough = [g for g in self.groups if self._find_smallest(g[0])]
-        names = list_plain_sweeps()
-        plain = [g for g in enough if g[0] in names]
-        best = min(plain or enough, key=lambda g: self._find_smallest(g[0]) or 0, default=self.groups[0])
+        best = min(
+            [g for g in enough if g[0] in plain] or enough,
+            key=lambda g: self._find_smallest(g[0]) or 0,
+            default=self.groups[0],
+        )
         self.groups.remove(best)
         self.groups.insert(0, best)
         self.first = best[0]
@@ -96,11 +99,6 @@ class SweepStudy:
         """Command, sequences and their size."""
         names = list(dict.fromkeys(self.runs["sequence"]))
         return f"lavender report --sweeps · {', '.join(names[:3])} · {format_count(self.n_steps, 'recorded step')}"
-
-    @property
-    def unit(self) -> str:
-        """Unit of the largest error of the first solver."""
-        return "m/s"
 
     @property
     def verdict(self) -> str:
@@ -289,9 +287,3 @@ class SweepStudy:
         small = f"{'warm starts; ' * (self.start == 'carried')}dark: within the limit of {format_speed(self.limit)}"
         return make_table(rows, heads, title="Largest velocity error after each number of sweeps", small=small,
                           note=notes.strip(), classes="matrix sweeps")  # fmt: skip
-
-
-def _place_plain(solver: str) -> tuple[bool, int]:
-    """Return a sort key that puts the methods of most engines first."""
-    plain = list_plain_sweeps()
-    return solver not in plain, plain.index(solver) if solver in plain else 0

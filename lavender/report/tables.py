@@ -71,14 +71,13 @@ STRUCTURE_ORDER = (
 
 
 def select_ranked_runs(frame: Frame) -> Frame:
-    """Return the runs that rankings count: to a tolerance, if there are any, in the order "given"."""
+    """Return the runs that rankings count: to a tolerance, if there are any."""
     mode = "tol" if (frame["mode"] == "tol").any() else "budget"
     return select_starts(frame[frame["mode"] == mode])
 
 
-def select_starts(frame: Frame) -> Frame:
+def select_starts(runs: Frame) -> Frame:
     """Return the runs from the start that counts: cold, or carried over the steps of a sequence."""
-    runs = frame[frame["order"] == "given"]
     single = runs["step"] < 0
     carries = runs["solver"].isin(runs.loc[runs["start"] == "carried", "solver"].unique())
     start = runs["start"].astype(str)
@@ -210,28 +209,24 @@ def _complete_answer(folder: Path, answer: Row) -> Row | None:
     """Return an answer with the judge's numbers on its impulse; None without a residual or a readable impulse."""
     from lavender.io.recorder import describe_answer
 
-    path, judged = folder / Path(str(answer.get("file"))).name, Row()
+    path = folder / Path(str(answer.get("file"))).name
+    is_left_out = "left_out" in answer
+    if is_left_out:
+        file = answer.get("file", answer["left_out"])
+        answer = dict.fromkeys(ANSWER_NUMBERS) | {"file": file, "verdict": LEFT_OUT}
     with contextlib.suppress(ValueError, KeyError, TypeError, LavenderError, OSError):
-        impulse = io.load_solution(path) if path.is_file() else None
+        impulse = None if is_left_out or not path.is_file() else io.load_solution(path)
         # Files of earlier versions do not hold the acceleration of a step with forces without digits.
         if impulse is not None and not answer.get("lost_digits"):
-            judged = describe_answer(
-                io.load(path), impulse, float(answer.get("threshold", DEFAULT_THRESHOLD))
-            )
+            threshold = float(answer.get("threshold", DEFAULT_THRESHOLD))
+            answer = answer | describe_answer(io.load(path), impulse, threshold)
     try:
-        if "left_out" not in answer:
-            answer = answer | judged
-            answer["relative"], answer["rows"] = float(answer["relative"]), float(answer["rows"])
-        else:
-            answer = {"file": f"{answer.get('file', answer['left_out'])}", "verdict": LEFT_OUT}
-        numbers = {name: answer.get(name) for name in ANSWER_NUMBERS}
-        numbers = {
-            name: math.nan if x is None else float(x) for name, x in numbers.items()
-        }  # JSON has no NaN.
-    except (ValueError, KeyError, TypeError):
+        numbers = {x: math.nan if answer.get(x) is None else float(answer[x]) for x in ANSWER_NUMBERS}
+    except (ValueError, TypeError):
         return None
     texts = {"folder": str(folder), **{name: str(answer.get(name, "")) for name in ANSWER_TEXTS}}
-    return {name: escape_unprintable(text) for name, text in texts.items()} | numbers
+    is_judged = {"relative", "rows"} <= answer.keys()
+    return {name: escape_unprintable(text) for name, text in texts.items()} | numbers if is_judged else None
 
 
 def read_own_answers(report: Contents) -> Frame:
@@ -483,7 +478,7 @@ def tabulate_matrix(report: Contents) -> Frame:
 def tabulate_runs(report: Contents) -> Frame:
     """Tabulate each solver on each case: time to each tolerance, smallest errors, status, and reasons of failures."""
     frame = report.newest
-    runs = frame[(frame["order"] == "given") & ((frame["step"] < 0) | ~frame["solver"].isin([ENGINE_NAME]))]
+    runs = frame[(frame["step"] < 0) | ~frame["solver"].isin([ENGINE_NAME])]
     keys = ["case", "solver", "start"]
     # pandas 3.1 cannot align two indices of categories with codes of different sizes (above 127 cases).
     runs = runs.astype(dict.fromkeys((*keys, "claim_check", "status_conflict", "message"), str))
@@ -580,7 +575,7 @@ def tabulate_sequences(report: Contents) -> Frame:
     The time to map impulses to the next step is a column of its own, as an engine stores impulses in its contacts.
     """
     frame = report.frame
-    runs = frame[(frame["step"] >= 0) & (frame["order"] == "given")].astype({"start": str})
+    runs = frame[frame["step"] >= 0].astype({"start": str})
     keys = ["sequence", "solver", "mode", "tol", "max_iter"]
     groups = runs.groupby([*keys, "start"], observed=True)
     table = groups.agg(steps=("case", "size"), time=("time", "sum"), carry=("carry_time", "sum"),
@@ -613,7 +608,7 @@ def tabulate_sweeps(report: Contents) -> Frame:
     plain = list_plain_sweeps()
     order = [*plain, *sorted(name for name, x in registry.specs().items() if x.order and name not in plain)]
     runs = report.frame[(report.frame["mode"] == "budget") & (report.frame["step"] > 0)]
-    runs = runs[(runs["order"] == "given") & runs["solver"].isin(order)]
+    runs = runs[runs["solver"].isin(order)]
     if not len(runs):
         return pd.DataFrame()
     keys = ["sequence", "solver", "max_iter", "start"]
@@ -639,9 +634,7 @@ def tabulate_changes(report: Contents) -> Frame:
     rows, keys = [], ["case", "sha", "solver", "start", "tol"]
     assert report.earlier is not None
     frames = Contents(report.earlier).newest, report.frame[report.frame["step"] < 0]
-    some = [
-        f[(f["mode"] == "tol") & (f["order"] == "given")].astype(dict.fromkeys(keys[:4], str)) for f in frames
-    ]
+    some = [f[f["mode"] == "tol"].astype(dict.fromkeys(keys[:4], str)) for f in frames]
     both = pd.merge(*some, on=keys)
     drift = both.groupby("case")[["calibration_time_x", "calibration_time_y"]].median()
     drift = (drift["calibration_time_y"] / drift["calibration_time_x"]).fillna(1.0)

@@ -1,4 +1,4 @@
-"""Time solves, and define the plan of a run: tolerances, budgets, starts and orders. No other module times solves.
+"""Time solves, and define the plan of a run: tolerances, budgets and starts. No other module times solves.
 
 The timed call is the one that a report prints, `lv.solve(problem, "name", tol=...)`, of a quadratic program
 `lv.solve_qp(problem, "name", tol=...)`, including the judge. The arrays of its problem are newly written, as by a
@@ -11,9 +11,9 @@ from __future__ import annotations
 import gc
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from functools import cache
 from statistics import median
 from time import perf_counter
@@ -22,12 +22,11 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray, check_bool, check_float, check_int, check_sequence
-from lavender.base.errors import InputError, UnknownName, require_packages
+from lavender.base.errors import InputError, require_packages
 from lavender.base.lazy_import import import_numerical_modules
 from lavender.external.backends import explain_contradicted_claim
 from lavender.judge.solution import CONTRADICTED, Solution, Status, raise_if_interrupted
 from lavender.problem import Problem
-from lavender.problem.ordering import SWEEP_ORDERS
 from lavender.report import machine
 from lavender.report.case_kinds import ContactCase, ProgramCase, make_case
 from lavender.report.store import ERROR, RUN_COLUMNS, Row
@@ -70,8 +69,6 @@ class Task:
     max_iter: int
     time_limit: float
     start: str = "cold"
-    order: str = "given"
-    options: Mapping[str, Any] = field(default_factory=dict)
     repeats: int = 1
     step: int = -1
     guarded: bool = True
@@ -79,22 +76,11 @@ class Task:
 
     @classmethod
     def of_case(
-        cls, case: Row, solver: str, mode: str, tol: float, max_iter: int, start: str, limit: float,
-        repeats: int = 1, order: str = "given",
+        cls, case: Row, solver: str, mode: str, tol: float, max_iter: int, start: str, limit: float, repeats: int = 1
     ) -> Task:  # fmt: skip
         """Create the task of a solver on a case."""
-        return cls(
-            case["run"], case["case"], case["sha"], solver, mode, tol, max_iter, limit, start, order, repeats=repeats,
-            step=case["step"],
-        )  # fmt: skip
-
-    @property
-    def arguments(self) -> dict[str, Any]:
-        """Keyword arguments of the call: options, sweep order, tolerance, and largest number of iterations."""
-        name, _, seed = self.order.partition(":")
-        order: dict[str, Any] = {} if name == "given" else {"order": name}
-        order |= {"seed": int(seed)} if seed else {}
-        return {**self.options, **order, "tol": self.tol, "max_iter": self.max_iter or None}
+        own = case["run"], case["case"], case["sha"], solver
+        return cls(*own, mode, tol, max_iter, limit, start, repeats=repeats, step=case["step"])
 
     def make_row(self, times: Sequence[float] = (), **results: Any) -> Row:
         """Return the row of this task with the times [s] of its repetitions and other results."""
@@ -158,7 +144,7 @@ def _start_workers(case: ContactCase, task: Task) -> None:
     if spec.delegates and case.problem.qp is not None:
         solvers = [backend.load()() for backend in program_backends()]
     else:
-        solvers = [spec.load()(**task.options)] if spec.external and spec.builtin else []
+        solvers = [spec.load()()] if spec.external and spec.builtin else []
     for solver in solvers:
         solver.start_workers(None, 0.0)
 
@@ -242,7 +228,8 @@ def _time_call(case: ContactCase, task: Task, impulse: Any, limited: bool) -> tu
 
     A plug-in may not test convergence and would then use all iterations: it runs with its default limit first.
     """
-    spec, arguments = registry.get(task.solver), task.arguments
+    spec = registry.get(task.solver)
+    arguments: dict[str, Any] = {"tol": task.tol, "max_iter": task.max_iter or None}
     if limited:
         arguments["time_limit"] = task.time_limit
         _start_workers(case, task)
@@ -298,9 +285,6 @@ class Plan:
         solved, and a note is recorded.
     warm : bool
         Also start from the problem's guess, unless it is an answer.
-    orders : sequence of str
-        Sweep orders in addition to "given", each at the middle budget, for solvers with a sweep order; "random:3" is
-        random with seed 3.
     campaign : bool
         Measure no times; see `CampaignPlan`.
     cap : int
@@ -309,9 +293,7 @@ class Plan:
     Raises
     ------
     InputError
-        A tolerance, budget, count or limit is not positive, or a seed is invalid.
-    UnknownName
-        An order does not exist.
+        A tolerance, budget, count or limit is not positive.
     """
 
     tolerances: Sequence[float] = (1e-3, 1e-6, 1e-9)
@@ -320,16 +302,15 @@ class Plan:
     time_limit: float = 1.0
     sequence_time_limit: float = DEFAULT_SEQUENCE_TIME_LIMIT
     warm: bool = True
-    orders: Sequence[str] = ()
     campaign: bool = False
     cap: int = UNLIMITED_ITERATIONS
 
     def __post_init__(self) -> None:
-        for name in ("tolerances", "budgets", "orders"):
-            entries = check_sequence(name, getattr(self, name), "words" if name == "orders" else "numbers")
-            object.__setattr__(self, name, tuple(entries))
-        tolerances = [check_float("tolerance", value, above=0.0) for value in self.tolerances]
-        budgets = [check_int("budget", n, 1) for n in self.budgets]
+        given = {
+            name: check_sequence(name, getattr(self, name), "numbers") for name in ("tolerances", "budgets")
+        }
+        tolerances = [check_float("tolerance", value, above=0.0) for value in given["tolerances"]]
+        budgets = [check_int("budget", n, 1) for n in given["budgets"]]
         if not tolerances and not budgets:
             raise InputError("without tolerances and budgets there is nothing to run: give one of the two")
         # Remove duplicates: a value given twice would be run twice and change the middle value.
@@ -341,30 +322,20 @@ class Plan:
             check_float(name, getattr(self, name), above=0.0)
         for name in ("warm", "campaign"):
             check_bool(name, getattr(self, name))
-        for word in self.orders:
-            name, _, seed = str(word).partition(":")
-            if name not in SWEEP_ORDERS:
-                raise UnknownName("order", name, SWEEP_ORDERS)
-            if seed and not (name == "random" and seed.isdecimal()):
-                advice = "only the order random has a seed, an integer: random:3"
-                raise InputError(f"order {word!r} has an invalid seed {seed!r}; {advice}")
-        object.__setattr__(self, "orders", tuple(dict.fromkeys(self.orders)))
 
-    def measure_solver(
-        self, case: Row, problem: Problem, spec: SolverSpec, make: Callable[[Task], Row]
-    ) -> None:
+    def measure_solver(self, case: Row, spec: SolverSpec, make: Callable[[Task], Row]) -> None:
         """Measure one solver on one case; each row decides the next measurement.
 
         Runs to a tolerance come first. An exact solver runs once, at the tightest tolerance; other solvers run at each
         tolerance, the loosest first. After a missed tolerance, a resumable solver does not run at tighter tolerances,
         since its iterates would be the same, nor does a solver that ran out of time. Then follow runs with fixed
-        budgets, then runs in other sweep orders at the middle budget.
+        budgets.
         """
 
-        def measure_one(mode: str, tol: float, max_iter: int, start: str, order: str = "given") -> Row:
+        def measure_one(mode: str, tol: float, max_iter: int, start: str) -> Row:
             """Make one measurement; a fixed number of iterations is timed once."""
-            target, repeats = (mode, tol, max_iter, start), 1 if mode == "budget" else self.repeats
-            return make(Task.of_case(case, spec.name, *target, self.time_limit, repeats, order))
+            repeats = 1 if mode == "budget" else self.repeats
+            return make(Task.of_case(case, spec.name, mode, tol, max_iter, start, self.time_limit, repeats))
 
         starts = ["cold"]
         if self.warm and case["guess"] == "start" and spec.impulse and not spec.exact:
@@ -379,12 +350,6 @@ class Plan:
             if spec.resumable and not spec.exact:
                 for n in self.budgets:
                     measure_one("budget", 0.0, n, start)
-        if spec.order and self.budgets and not spec.exact:
-            middle = self.budgets[len(self.budgets) // 2]
-            for word in self.orders:
-                if word in ("bottom_up", "top_down") and problem.rows is None:
-                    continue  # Both orders sort blocks by the height of bodies, which are not known.
-                measure_one("budget", 0.0, middle, "cold", word)
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ WRONG = """
 nocommand | slove PROBLEM | report --solvers pgz | report no/such.npz | report stak(n=8) | report --tolerances 0
 report a.jsonl b.npz | report missing.jsonl | report --tolerances many | report --time-budgets 0 | report PROBLEM --list
 report PROBLEM --steps 3 | report PROBLEM --sequence-time-limit 3 | report PROBLEM --solvers direct --budgets 3
-report PROBLEM --solvers direct --orders reverse | report --workers 1 --time-limit 3 | report a.jsonl --tolerances 1e-3
+report --workers 1 --time-limit 3 | report a.jsonl --tolerances 1e-3
 report a.xml --seed 3 --controls zero
 report PROBLEM --seed 3 | report PROBLEM --workers 0 | report PROBLEM --workers -2 | check a.jsonl
 report PROBLEM --workers 1000000000 | solve PROBLEM --solver direct --order reverse

@@ -260,7 +260,7 @@ def test_the_page_on_failures_has_every_status_and_every_error():
 def test_documentation_has_every_column_of_records():
     page = (ROOT / "docs" / "report.md").read_text(encoding="utf-8")
     table = page.partition("## The columns of records")[2].partition("\n## ")[0]
-    lines = lv.report.run(["toy_stack"], ["pgs"], lv.report.Plan(tolerances=(1e-3,), budgets=(), orders=(), repeats=1))
+    lines = lv.report.run(["toy_stack"], ["pgs"], lv.report.Plan(tolerances=(1e-3,), budgets=(), repeats=1))
     assert set(re.findall(r"`(\w+)`", table)) >= set(lv.report.select_runs(lines))
 
 

@@ -19,10 +19,10 @@ from lavender.report.store import KEY, RUN_COLUMNS, make_lines, select_cases, se
 from lavender.report.sweeps import SweepStudy
 from lavender.report.timing import format_call
 
-QUICK = report.Plan(tolerances=(1e-3, 1e-8), budgets=(2, 5), repeats=2, time_limit=60.0, orders=("reverse",))
+QUICK = report.Plan(tolerances=(1e-3, 1e-8), budgets=(2, 5), repeats=2, time_limit=60.0)
 SEEDED = [f"granular(n=2, seed={i})" for i in range(40)]
 NAMES = [*(f"random_spd(n=12, condition=100, seed={i})" for i in range(3)), *SEEDED[:3], "toy_stack"]
-CAMPAIGN = report.CampaignPlan(tolerances=(1e-3, 1e-6), budgets=(4, 8), orders=("random:1",))
+CAMPAIGN = report.CampaignPlan(tolerances=(1e-3, 1e-6), budgets=(4, 8))
 
 
 def rows_of(lines):
@@ -50,12 +50,11 @@ def test_run_records_have_the_judged_result_of_each_target_and_its_times():
     p = stack(12)
     lines = report.run([p], ["pgs"], QUICK)
     found = rows_of(lines)
-    assert [(r.mode, r.tol, r.max_iter, r.order) for r in found] == [
-        ("tol", 1e-3, 10_000_000, "given"), ("tol", 1e-8, 10_000_000, "given"),
-        ("budget", 0.0, 2, "given"), ("budget", 0.0, 5, "given"), ("budget", 0.0, 5, "reverse"),
+    assert [(r.mode, r.tol, r.max_iter) for r in found] == [
+        ("tol", 1e-3, 10_000_000), ("tol", 1e-8, 10_000_000), ("budget", 0.0, 2), ("budget", 0.0, 5)
     ]  # fmt: skip
     for r in found:
-        again = lv.solve(p, "pgs", tol=r.tol, max_iter=r.max_iter, order=r.order)
+        again = lv.solve(p, "pgs", tol=r.tol, max_iter=r.max_iter)
         error = again.residual
         assert (r.relative, r.error_energy, r.velocity) == (error.relative, error.energy, error.velocity)
         found = r.status, r.worst_row, json.loads(r.work)
@@ -144,8 +143,8 @@ def test_run_solver_of_free_rows_is_replaced_by_its_bounded_variant():
 
 
 def test_plan_duplicates_are_removed():
-    plan = report.Plan(tolerances=(1e-3, 1e-9, 1e-3, 1e-6), budgets=(8, 4, 4), orders=("reverse",) * 2)
-    assert (plan.tolerances, plan.budgets, plan.orders) == ((1e-3, 1e-6, 1e-9), (4, 8), ("reverse",))
+    plan = report.Plan(tolerances=(1e-3, 1e-9, 1e-3, 1e-6), budgets=(8, 4, 4))
+    assert (plan.tolerances, plan.budgets) == ((1e-3, 1e-6, 1e-9), (4, 8))
 
 
 def test_limit_to_one_thread_covers_libraries_loaded_later():
@@ -383,7 +382,7 @@ def test_campaign_one_worker_and_two_give_equal_bits_and_no_times(tmp_path):
     assert select_cases(one).equals(select_cases(two))
     found = rows_of(one)
     assert all(r.repetitions == 0 and math.isnan(r.time) and math.isnan(r.setup_time) for r in found)
-    (r,) = (r for r in found if (r.case, r.solver, r.max_iter, r.order) == (NAMES[0], "pgs", 8, "given"))
+    (r,) = (r for r in found if (r.case, r.solver, r.max_iter) == (NAMES[0], "pgs", 8))
     again = lv.solve(suite.case(NAMES[0]).problem, "pgs", tol=0.0, max_iter=8)
     assert again.residual.relative == r.relative
     page = report.write(one, tmp_path)

@@ -206,7 +206,7 @@ class Stage:
                 is_slow = np.median(m.times) > MAX_TIME_RATIO * np.median(settings[0].times)
                 if np.isfinite(m.times).all() and (is_out or is_slow):
                     continue
-                text = f"round {round_index + 1} of {repeats}, {m.setting.name}"
+                text = f"round {round_index + 1} of {repeats}, {m.setting.short_name}"
                 progress.begin_measurement("timing", text)
                 m.times = np.minimum(m.times, self.run_stretches(model)[0])
 

@@ -171,14 +171,9 @@ class Tuning:
         return now if any(m is now for m in ties) else best
 
     @property
-    def most_accurate(self) -> Measured:
-        """MujocoSetting with the smallest maximum error on all worlds on which it was judged."""
-        return min(self._same_problem, key=self._compute_largest_error)
-
-    @property
     def limit_choice(self) -> Measured:
-        """`within_limit`, or `most_accurate` if that is None."""
-        return self.within_limit or self.most_accurate
+        """`within_limit`, or the setting with the smallest error on all worlds on which it was judged."""
+        return self.within_limit or min(self._same_problem, key=self._compute_largest_error)
 
     @property
     def pareto_front(self) -> list[Measured]:

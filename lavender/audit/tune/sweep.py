@@ -128,7 +128,7 @@ def _run_tuning(
         if measured and stage is not held_back:
             limit = max(float(measured[0].error.max()), threshold, error_limit or 0.0)
         for setting in settings:
-            progress.begin_measurement("judging", setting.name)
+            progress.begin_measurement("judging", setting.short_name)
             results.append(stage.judge_setting(setting, limit))
         return results
 

@@ -152,20 +152,12 @@ def run(
     order = get_sweep_order(scene.parameters) or scene.parameters.order
     method_parts = [] if spec.name == "sequential_impulses" else [spec.name]
     method = ", ".join([*method_parts, f"order {order}"] if spec.order else method_parts)
+    title = f"{scene.name or 'scene'}, {simulation.solver_iterations} iterations, "
+    title += f"{'warm' if simulation.warm_start else 'cold'}, {method}"
     return Trace(
-        scene=repr(scene),
-        time=time[:done],
-        solver=solver[:done],
-        depth=depth[:done],
-        cost=cost[:done],
-        lost_body=lost,
-        recorded=recorded,
-        title=f"{scene.name or 'scene'}, {simulation.solver_iterations} iterations, "
-        f"{'warm' if simulation.warm_start else 'cold'}, {method}",
-        order=order,
-        method=method,
-        stopped=stopped,
-    )
+        repr(scene), time[:done], solver[:done], depth[:done], cost[:done], lost_body=lost, recorded=recorded,
+        title=title, order=order, method=method, stopped=stopped,
+    )  # fmt: skip
 
 
 def format_step(step: int, observation: Mapping[str, Any], info: Mapping[str, Any]) -> str:

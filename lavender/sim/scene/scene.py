@@ -183,21 +183,12 @@ class Scene:
     # -- bodies ---------------------------------------------------------------------------------
 
     def add_body(
-        self,
-        mass: float = 1.0,
-        inertia: Any = None,
-        *,
-        position: Any = (0.0, 0.0, 0.0),
-        quaternion: Any = (1.0, 0.0, 0.0, 0.0),
-        velocity: Any = (0.0, 0.0, 0.0),
-        angular_velocity: Any = (0.0, 0.0, 0.0),
-        static: bool = False,
-        name: str | None = None,
-        friction: float | None = None,
-        restitution: float | None = None,
-        patch_radius: float | None = None,
+        self, mass: float = 1.0, inertia: Any = None, *, position: Any = (0.0, 0.0, 0.0),
+        quaternion: Any = (1.0, 0.0, 0.0, 0.0), velocity: Any = (0.0, 0.0, 0.0),
+        angular_velocity: Any = (0.0, 0.0, 0.0), static: bool = False, name: str | None = None,
+        friction: float | None = None, restitution: float | None = None, patch_radius: float | None = None,
         shape: Plane | Sphere | Box | None = None,
-    ) -> int:
+    ) -> int:  # fmt: skip
         """Add a body and return its number.
 
         Parameters
@@ -289,23 +280,11 @@ class Scene:
     # -- joints ---------------------------------------------------------------------------------
 
     def add_joint(
-        self,
-        kind: str,
-        a: int,
-        b: int,
-        *,
-        anchor: Any = None,
-        anchor_a: Any = None,
-        anchor_b: Any = None,
-        axis: Any = None,
-        length: float | None = None,
-        hertz: float = 0.0,
-        damping: float = 1.0,
-        motor_speed: float | None = None,
-        motor_torque: float | None = None,
-        collide: bool = False,
+        self, kind: str, a: int, b: int, *, anchor: Any = None, anchor_a: Any = None, anchor_b: Any = None,
+        axis: Any = None, length: float | None = None, hertz: float = 0.0, damping: float = 1.0,
+        motor_speed: float | None = None, motor_torque: float | None = None, collide: bool = False,
         name: str | None = None,
-    ) -> int:
+    ) -> int:  # fmt: skip
         """Add a joint between bodies a and b in their present poses and return its number.
 
         Parameters
