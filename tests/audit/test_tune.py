@@ -185,7 +185,7 @@ def test_settings_that_are_judged_in_part_do_not_change_the_choice(boxes, monkey
     monkeypatch.setattr(Stage, "run_stretches", take_time_of_options)
     path, found = boxes('solver="CG" iterations="8" tolerance="1e-5"'), []
     for limit in (None, 1e-4):
-        same = {"worlds": 4, "steps": 80, "repeats": 2, "max_velocity_error": limit}
+        same = {"worlds": 4, "steps": 40, "repeats": 2, "max_velocity_error": limit}
         part = tune(path, **same)
         n_part = n_runs.count(True)
         with monkeypatch.context() as whole:
@@ -193,8 +193,8 @@ def test_settings_that_are_judged_in_part_do_not_change_the_choice(boxes, monkey
             all_steps = tune(path, **same)
         assert n_part < n_runs.count(True) - n_part
         n_runs.clear()
-        assert len(part.measured[0].error) == len(all_steps.measured[0].error) == 160
-        assert min(len(m.error) for m in part.measured) == 40
+        assert len(part.measured[0].error) == len(all_steps.measured[0].error) == 80
+        assert min(len(m.error) for m in part.measured) == 20
         for name in ("faster", "closer", "limit_choice"):
             one, other = getattr(part, name), getattr(all_steps, name)
             found.append(one)

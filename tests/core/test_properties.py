@@ -18,7 +18,7 @@ from lavender.external.running import Answer, call_backend_until_accepted, class
 from lavender.judge.certificates import check_certificate
 from lavender.problem.cones import project_impulse
 from lavender.solvers import direct
-from lavender.solvers.islands import find_islands, get_rows_of_blocks, restrict_to_blocks
+from lavender.solvers.islands import find_islands
 from lavender.solvers.polyhedral import BoundedRowSolver, convert_to_bounded_rows
 from lavender.solving import log, loop
 from lavender.solving.velocity import accept_velocity
@@ -655,27 +655,6 @@ def list_problems_with_islands():
     rows = random_bodies_and_contacts(rng, bodies=12, joints=2, contacts=5)
     bodies = lv.Problem.from_rows(rows, mu=0.5, compliance=rng.uniform(0.0, 0.1, rows.joint_ptr[-1] + 15))
     return [general, bodies, lv.Problem(bodies.b, bodies.cones, bodies.csr)]
-
-
-@pytest.mark.parametrize("kind", range(3))
-def test_restrict_to_an_island_of_a_tree_has_its_block_of_the_matrix_and_its_answer(kind):
-    problem = list_problems_with_islands()[kind]
-    count, label = find_islands(problem)
-    assert count > 1
-    a, whole = problem.csr.toarray(), lv.solve(problem, tol=1e-12)
-    for island in range(count):
-        blocks = np.flatnonzero(label == island)
-        rows = get_rows_of_blocks(problem, blocks)
-        part = restrict_to_blocks(problem, blocks, rows)
-        assert [part.block_name(i) for i in range(len(blocks))] == [problem.block_name(int(i)) for i in blocks]
-        np.testing.assert_allclose(part.csr.toarray(), a[np.ix_(rows, rows)], atol=1e-13)
-        np.testing.assert_array_equal(part.b, problem.b[rows])
-        if problem.rows is not None:
-            bodies = np.unique(problem.rows.block_bodies[blocks])
-            np.testing.assert_array_equal(part.rows.v_free, problem.rows.v_free[bodies[bodies >= 0]])
-        others = np.delete(a[rows], rows, axis=1)
-        assert not others.any()
-        assert lv.residual(part, whole.impulse[rows]).relative <= 1e-9
 
 
 @pytest.mark.parametrize(("row", "column"), [(0, 3), (1, 4), (2, 3), (5, 0)])

@@ -195,44 +195,6 @@ def chain(n):
     return model
 
 
-def changed(what):
-    """Model, data, constraints and their data, q, v, of which one does not fit."""
-    model, models, q, v = robot()
-    data, datas, other = model.createData(), [m.createData() for m in models], chain(12)
-    if what.startswith("data of"):
-        data = chain(int(what.split()[-1])).createData()
-    elif what.startswith("constraint"):
-        make = {
-            "contact": lambda: pin.PointContactConstraintModel(other, 0, pin.SE3.Identity(), 12, pin.SE3.Identity()),
-            "friction": lambda: pin.JointFrictionConstraintModel(other, [12]),
-            "limit": lambda: pin.JointLimitConstraintModel(other, [12]),
-        }  # fmt: skip
-        models = [make[what.split()[-1]]()]
-        datas = [models[0].createData()]
-    elif what == "order of data":
-        datas = datas[::-1]
-    elif what == "no constraints":
-        models = [3, "a", None, {}]
-    elif what == "no data":
-        datas = [3, "a", None, {}]
-    elif what == "none":
-        models = None
-    elif what.startswith("joint"):
-        setattr(models[1], f"{what.replace(' ', '')}_id", 99)
-    elif what == "parent":
-        model.parents[2] = 7
-    elif what == "parent of itself":
-        model.parents[2] = 2
-    elif what in ("idx_vs", "nvs", "idx_qs", "nqs"):
-        getattr(model, what)[2] = 50
-    elif what == "rotation":
-        q[3:7] = 0.0
-    else:
-        model.addJoint(2, pin.JointModelRX(), pin.SE3.Identity(), "later")
-        q, v = np.append(q, 0.0), np.append(v, 0.0)
-    return model, data, models, datas, q, v
-
-
 def anchored_chain(kind):
     """A chain of four hinges with its tip anchored, a velocity that keeps the anchor, and (dJ/dt) v by kinematics."""
     model, parent = pin.Model(), 0

@@ -197,9 +197,6 @@ def test_cross_check_idle_problem_neither_agrees_nor_fails():
     assert table.agreed == ()
 
 
-TINY = lv.Problem.lcp(np.eye(2), np.ones(2))
-
-
 def test_cross_check_of_answers_at_their_floor_reports_no_breach():
     for seed in range(8):
         for problem in (lv.Problem.lcp(*spd(8, seed=seed)), random_lcp(seed), random_lcp(seed, rank=6)):

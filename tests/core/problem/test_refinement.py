@@ -41,26 +41,6 @@ def ill_problem(seed, condition, law="lcp", n=8):
 LAWS = ("linear", "lcp", "coulomb", "cone", "ellipses")
 
 
-def hinges(n, seed, rows=6):
-    """A chain of n hinges, each across the one before, its tip and some hinges held: condition 1e3 to 1e7."""
-    rng = np.random.default_rng(seed)
-    at = np.cumsum(np.vstack([np.zeros(3), rng.normal(size=(n, 3)) * 0.02 + [0.1, 0.0, 0.0]]), 0)
-    axis = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])[np.arange(n) % 2]
-    mass = 1e-6 * np.eye(n)
-    for k in range(n):
-        arm = 0.5 * (at[k] + at[k + 1])
-        linear, angular = np.zeros((3, n)), np.zeros((3, n))
-        for j in range(k + 1):
-            linear[:, j], angular[:, j] = np.cross(axis[j], arm - at[j]), axis[j]
-        mass += 0.1 * linear.T @ linear + 1e-4 * angular.T @ angular
-    tip = np.array([np.cross(axis[j], at[-1] - at[j]) for j in range(n)]).T
-    jac = np.vstack([tip, np.eye(n)[rng.choice(n, rows, replace=False)]])
-    m = len(jac)
-    return lv.Problem.from_jacobian(
-        jac, mass, rng.standard_normal(n), cones=lv.Cones.bounded(np.zeros(m), np.full(m, np.inf))
-    )
-
-
 def false_claim(problem, solution):
     """Why the status of a solution is not true of the exact data, or None."""
     found = judge_twin.Problem(spec_of(problem)).judge(solution.impulse)

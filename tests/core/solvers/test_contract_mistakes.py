@@ -4,6 +4,7 @@
 """
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 import pytest
@@ -22,6 +23,14 @@ class State:
     cones: lv.Cones
     done: int = 0
     step: dict[int, float] = field(default_factory=dict)  # of friction components, by their first row [kg]
+
+    @cached_property
+    def units(self):
+        """First rows of contacts, and all other rows, with the block of each."""
+        c = self.cones
+        rows = np.union1d(c.ptr[:-1], np.flatnonzero(~c.contact_rows)).tolist()
+        block = np.repeat(np.arange(c.n_blocks), np.diff(c.ptr)).tolist()
+        return [(row, block[row]) for row in rows]
 
 
 class Sweeps:
@@ -48,12 +57,12 @@ class Sweeps:
         return new
 
     def list_units(self, state):
-        """Return the first rows of contacts, and all other rows, in the order of a sweep."""
-        c = state.cones
-        units = np.union1d(c.ptr[:-1], np.flatnonzero(~c.contact_rows))
+        """Return the units in the order of a sweep."""
+        units = state.units
         if self.order == "random":
-            return np.random.default_rng([self.seed, state.done]).permutation(units)
-        orders = {"reverse": units[::-1], "colored": np.r_[units[::2], units[1::2]]}
+            order = np.random.default_rng([self.seed, state.done]).permutation(len(units))
+            return [units[i] for i in order]
+        orders = {"reverse": units[::-1], "colored": units[::2] + units[1::2]}
         return orders.get(self.order, units)
 
     def find_end(self, state, x, tol):
@@ -104,8 +113,7 @@ class Sweeps:
 
     def sweep(self, state, x):
         A, b, c, m = state.A, state.b, state.cones, self.mistake
-        for first in self.list_units(state):
-            i = np.searchsorted(c.ptr, first, side="right") - 1
+        for first, i in self.list_units(state):
             if c.kind[i] == ROW:
                 low, high = c.lower[first], c.upper[first]
                 low = 0.0 if m == "a lower bound above zero is zero" and low > 0.0 else low
@@ -119,7 +127,7 @@ class Sweeps:
                 if rows[0] not in state.step:
                     state.step[rows[0]] = 1.0 / np.linalg.eigvalsh(A[np.ix_(rows, rows)]).max()
                 y = x[rows] - state.step[rows[0]] * (A[rows] @ x - b[rows])
-                norm = np.linalg.norm(y)
+                norm = np.sqrt(y @ y)
                 if m == "discs are squares":
                     x[rows] = np.clip(y, -bound * x[first], bound * x[first])
                 else:
@@ -290,7 +298,7 @@ class Deadband(Sweeps):
 
     def list_units(self, state):
         b = np.abs(state.problem.b)
-        return [q for q in super().list_units(state) if b[q] >= 1e-3 * b.max()]
+        return [unit for unit in super().list_units(state) if b[unit[0]] >= 1e-3 * b.max()]
 
 
 #: Faulty solver, the check that must fail, and words of its sentence.

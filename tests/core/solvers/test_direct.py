@@ -190,13 +190,6 @@ def test_direct_with_cycling_exchanges_is_stalled():
     assert circled > 0
 
 
-def skew(seed, m=120, density=2.0):
-    """A sparse A = -A^T: a zero diagonal, and principal submatrices that are singular whatever their entries are."""
-    rng = np.random.default_rng(seed)
-    k = sp.random_array((m, m), density=density / m, rng=rng, data_sampler=rng.standard_normal)
-    return sp.csr_array(k - k.T), rng.standard_normal(m)
-
-
 def test_direct_with_a_lost_pivot_counts_and_names_it():
     m = 100
     a = 2.0 * np.eye(m)

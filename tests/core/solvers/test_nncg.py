@@ -7,24 +7,14 @@ from random_problems import random_contact_problem, random_lcp, sweeps
 import lavender as lv
 
 
-def stack(n, ratio=1.0):
-    """n equal spheres in a column, the top one heavier: tridiagonal, impulse i carries all above it."""
-    mass = np.ones(n)
-    mass[-1] = ratio
-    below = np.r_[0.0, 1.0 / mass[:-1]]
-    a = np.diag(below + 1.0 / mass) - np.diag(1.0 / mass[:-1], 1) - np.diag(1.0 / mass[:-1], -1)
-    b = np.r_[0.1, np.zeros(n - 1)]
-    return lv.Problem.lcp(a, b, name=f"stack {n}"), np.cumsum(mass[::-1])[::-1] * 0.1
-
-
 @pytest.mark.parametrize("name", ["nncg", "anderson"])
 @pytest.mark.parametrize("sweep", ["pgs", "blocks"])
 def test_nncg_on_a_stack_gives_its_closed_form(name, sweep):
-    problem, exact = stack(20)
-    solution = lv.solve(problem, name, sweep=sweep, tol=1e-10, max_iter=20_000)
+    case = lv.suite.stack(n=20)
+    solution = lv.solve(case.problem, name, sweep=sweep, tol=1e-10, max_iter=20_000)
     assert solution.success
     # cond(A) is near 650 for 20 bodies
-    np.testing.assert_allclose(solution.impulse, exact, rtol=1e-7)
+    np.testing.assert_allclose(solution.impulse, case.reference.impulse, rtol=1e-7)
 
 
 def sliding_pile():
@@ -96,17 +86,17 @@ def test_anderson_first_iterations_are_least_squares_over_the_last_sweeps(memory
         x = y - dy @ gamma if gamma.size else y
 
 
-@pytest.mark.parametrize("parameters", [{"n": 6}, {"n": 6, "sliding": 0.5}])
-def test_anderson_large_pile_at_rest_converges_from_the_cone_law(parameters):
+@pytest.mark.parametrize("name", ["granularF(n=6)", "granularF(n=6, sliding=0.5)"])
+def test_anderson_large_pile_at_rest_converges_from_the_cone_law(name):
     """Under Coulomb's law alone, the sweeps end at a residual of about 1e-3."""
-    problem = make_suite_problem("granularF", **parameters)
+    problem = lv.suite.case(name).problem
     assert lv.solve(problem, "anderson", tol=1e-6, max_iter=100).success
     assert not lv.solve(problem, "anderson", convex=0, tol=1e-6, max_iter=1000).success
 
 
 def test_anderson_warm_start_of_slipping_contacts_stays_under_coulomb():
     """From close to a solution with slip, the sweeps stay under Coulomb's law: the cone law would move away from it."""
-    problem = make_suite_problem("pyramidF", k=10)
+    problem = lv.suite.case("pyramidF(k=10)").problem
     start = lv.solve(problem, "newton", tol=1e-8).impulse * (1.0 + 1e-4)
     found, exact = (
         lv.solve(problem, "anderson", impulse=start, tol=1e-6, max_iter=100, **options)
@@ -119,13 +109,7 @@ def test_anderson_warm_start_of_slipping_contacts_stays_under_coulomb():
 
 def test_anderson_slipping_pyramid_leaves_the_cone_law():
     """The tests of the law cost a few sweeps, not the 512 sweeps that the cone law may take."""
-    problem = make_suite_problem("pyramidF", k=10)
+    problem = lv.suite.case("pyramidF(k=10)").problem
     found = lv.solve(problem, "anderson", tol=1e-6, max_iter=2000)
     assert found.success
     assert found.iterations < 1.3 * lv.solve(problem, "anderson", convex=0, tol=1e-6, max_iter=2000).iterations
-
-
-def make_suite_problem(name, **parameters):
-    """Return a problem of the suite."""
-    words = ", ".join(f"{key}={value}" for key, value in parameters.items())
-    return lv.suite.case(f"{name}({words})").problem
