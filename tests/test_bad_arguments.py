@@ -297,7 +297,7 @@ NOT_CALLED = [
     "SolverStage", "Snapshot", "SolverSpec", "Status", "CrossCheck", "MotionError", "SlipExplanation", "Redundancy",
     "Diagnostic", "Recording", "Stored", "Claims", "EngineStep", "StepVerdict", "Recorder", "Reconstruction",
     "Batch.make_kernel_worlds", "Batch.get_world", "SlipExplanation.draw_slip",
-    "Batch.start", "Batch.rows_of", "Batch.count", "Batch.index", "Solutions.count", "Solutions.index",
+    "Batch.rows_of", "Batch.count", "Batch.index", "Solutions.count", "Solutions.index",
     "Generalized.from_compressed_rows", "Generalized.from_operator", "Generalized.from_validated",
     "Generalized.with_diagonal_shift", "Generalized.restrict_to_rows_and_velocities", "Generalized.with_scaled_rows",
     "Solutions.store_late_world", "Problem.on_disk", "Problem.has_operator_of", "Problem.save",

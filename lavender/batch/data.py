@@ -30,7 +30,7 @@ from lavender.problem.cones import Cones
 from lavender.problem.generalized import MAX_ASYMMETRY, MAX_ASYMMETRY_FLOAT32
 from lavender_ext.batch.many import PLACE, Worlds
 from lavender_ext.core.checks import are_lower_triangles_valid, are_pointers_valid
-from lavender_ext.core.problem import LAWS, clip_zero_to_bounds
+from lavender_ext.core.problem import LAWS
 
 ERRORS = ("raise", "status")
 #: Offsets and sizes of a world, as the kernels number them.
@@ -314,12 +314,6 @@ class Batch(Sequence[Problem]):
         """Return the slice of world i in a flat array of all impulses."""
         first = int(self.at[i]["row"])
         return slice(first, first + int(self.at[i]["rows"]))
-
-    def start(self, i: int) -> FloatArray:
-        """Return the zero impulse (m,) [N s] of world i, clipped to its bounds."""
-        first = int(self.at[i]["cone_row"])
-        rows = slice(first, first + int(self.at[i]["rows"]))
-        return clip_zero_to_bounds(self.cones.lower[rows], self.cones.upper[rows])
 
     def flatten_impulses(self, name: str, value: Any) -> FloatArray:
         """Convert impulses [N s] of the batch's shape, or a result for such a batch, to a new flat array.

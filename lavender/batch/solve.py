@@ -75,24 +75,13 @@ class Solutions(WorldResults, Sequence[Solution]):
 
     velocity_tol: float | None = None
 
-    def __init__(
-        self,
-        problems: Any,
-        starts: Any,
-        cold: bool,
-        tol: float,
-        spec: SolverSpec,
-        options: dict[str, Any],
-        errors: str,
-        like: Any = None,
-    ) -> None:
-        super().__init__(problems, starts, cold, like)
-        self.tol, self._spec, self._starts, self._cold = tol, spec, starts, cold
-        self._options, self._errors = options, errors
+    def __init__(self, problems: Any, starts: Any, tol: float, spec: SolverSpec, like: Any = None) -> None:
+        # Keep a copy of the starts of a batch, because the loop overwrites them.
+        self._starts = starts.copy() if isinstance(starts, np.ndarray) else starts
+        super().__init__(problems, starts, starts is None, like)
+        self.tol, self._spec = tol, spec
         self._solutions: dict[int, Solution] = {}
         self._time_per_world = 0.0  # [s] Mean time of the worlds so far.
-        # Keep a copy of the starts of a batch, because the loop overwrites them.
-        self._given_starts = None if cold or type(problems) is not Batch else starts.copy()
 
     def __getstate__(self) -> dict[str, Any]:
         return super().__getstate__() | {"_spec": self._spec.name}
@@ -165,7 +154,7 @@ class Solutions(WorldResults, Sequence[Solution]):
     def get_start(self, i: int) -> Any:
         """Return the start (m,) [N s] of world i, or None if none was given."""
         if type(self.problems) is Batch:
-            return None if self._given_starts is None else self._given_starts[self._get_rows(i)]
+            return None if self._starts is None else self._starts[self._get_rows(i)]
         return self._starts[i]
 
     def store_solution(self, i: int, solution: Solution) -> None:
@@ -317,7 +306,7 @@ def solve_many(
     check_arguments(spec, None, tol, max_iter)
     starts, invalid_starts = _convert_starts(worlds, impulse, impulses, errors)
     named = cast("dict[str, Any]", options)
-    solutions = Solutions(worlds, starts, starts is None, tol, spec, named, errors, like)
+    solutions = Solutions(worlds, starts, tol, spec, like)
     solutions._invalid_starts, solutions.velocity_tol = invalid_starts, velocity_tol
     more: dict[str, Any] = {"tol": tol, "max_iter": max_iter, **named}
     # The compiled loop is used under the conditions under which `solve` makes a single compiled call.
@@ -388,10 +377,10 @@ def _convert_starts(
         starts = (
             [p.guess for p in worlds] if impulses is None else convert_impulses_or_guesses(worlds, impulses)
         )
-        parts = enumerate(starts)
+        parts = [(i, start) for i, start in enumerate(starts) if start is not None]
     invalid = dict[int, LavenderError]()
     for i, start in parts:
-        if start is not None and not all_finite(start):
+        if not all_finite(start):
             bad = np.flatnonzero(~np.isfinite(start))[0]
             message = f"world {i}: impulse [N s] is {start[bad]} at row {bad}; a finite start is needed"
             invalid[i] = InputError(message)

@@ -93,7 +93,7 @@ def compute_postponed_fields(
 
 bind_types(
     (
-        Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, perf_counter,
-        get_zero_impulse_reference, solve_new_generalized_problem, name_start,
+        Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, get_zero_impulse_reference,
+        solve_new_generalized_problem, name_start,
     )
 )  # fmt: skip

@@ -229,19 +229,21 @@ cdef enum:                      # results of `Worker.process_worlds` other than 
 
 
 def list_problem_data(list problems, kind):
-    """Return (data, rows) of n problems: a list and the number of rows of each (n,).
+    """Return (data, at, number of all rows) of n problems: a list, and an argument `at` of `Worlds`.
 
     An item of `data` is the `Data` of a problem, True if its derived numbers are not computed, or None if workers do not
     support it.
     """
     cdef Py_ssize_t i, n = len(problems)
+    cdef int64_t m = 0
     cdef list data = [None] * n
-    sizes = np.empty(n, np.int64)
-    cdef int64_t[::1] rows = sizes
+    places = np.zeros((n, PLACES), np.int64)
+    cdef int64_t[:, ::1] at = places
     for i in range(n):
         problem = problems[i]
         p = problem.derived.view
-        rows[i] = problem.m if p is None else (<Data>p).blocks.n_rows
+        at[i, ROWS], at[i, AT_ROW] = problem.m if p is None else (<Data>p).blocks.n_rows, m
+        m += at[i, ROWS]
         if type(problem) is not kind:
             continue
         if p is None:
@@ -251,7 +253,7 @@ def list_problem_data(list problems, kind):
         elif p.has_ellipse:
             continue
         data[i] = p
-    return data, sizes
+    return data, places, m
 
 
 cdef struct worker_t:             # memory of one thread

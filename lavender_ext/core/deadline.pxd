@@ -59,4 +59,5 @@ cdef class Deadline:
     cdef deadline_t at
 
 
+cpdef double read_clock()
 cdef deadline_t* get_pointer(Deadline deadline) noexcept

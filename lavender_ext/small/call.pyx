@@ -21,7 +21,7 @@ from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles, take_int
 from lavender_ext.core.arrays cimport C_CONTIGUOUS, DOUBLE, as_double_pointer, has_element_type, make_read_only, ndarray
 from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.checks cimport make_instance
-from lavender_ext.core.deadline cimport deadline_t, get_pointer, has_passed
+from lavender_ext.core.deadline cimport deadline_t, get_pointer, has_passed, read_clock
 from lavender_ext.core.csr cimport measure_asymmetry_and_bandwidth
 from lavender_ext.core.block_types cimport CONE, CONTACT_ROLLING, ROUND, blocks_t, has_independent_rows, islands_t
 from lavender_ext.core.problem cimport Data
@@ -438,15 +438,15 @@ cdef class Small:
 # [s] A limit of at least this does not end the call of few rows, which `solve_general` may repeat if the call fails.
 cdef double MIN_LONG_LIMIT = 0.1
 cdef tuple NO_CALL = (None, None, None, None), LAWS_OF_ROWS = ("linear", "lcp")
-cdef object Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, read_clock, get_zero_impulse_reference
+cdef object Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, get_zero_impulse_reference
 cdef object solve_new_generalized_problem, name_start
 
 
 def bind_types(types):
     """Set the classes and functions that `solve_compiled` needs; this package does not import them."""
-    global Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, read_clock, get_zero_impulse_reference
+    global Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, get_zero_impulse_reference
     global solve_new_generalized_problem, name_start
-    (Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, read_clock, get_zero_impulse_reference,
+    (Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, get_zero_impulse_reference,
      solve_new_generalized_problem, name_start) = types
 
 
