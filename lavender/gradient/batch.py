@@ -57,10 +57,7 @@ class Gradients(_PerProblem, GradientArrays):
 
         def __getattr__(self, name: str) -> Any:
             if name.startswith("_") or name not in INPUTS or name in MATRICES:
-                raise AttributeError(
-                    f"the gradients of all problems have no attribute {name!r}; gradients[i] is the "
-                    "gradient of problem i"
-                )
+                raise AttributeError(f"gradients of all problems have no {name!r}; gradients[i] may have it")
             if not self._separate and name in ("b", "target", "v_free"):
                 of = self._of
                 return self._numbers[of._velocities if name == "v_free" else of._rows]
@@ -144,25 +141,16 @@ def derivatives(problems: Iterable[Problem], solutions: Iterable[Any]) -> Deriva
         the problem's index.
     """
     if isinstance(problems, Problem):
-        raise InputError(
-            "problems is one Problem; a list of problems is needed: use [problem], or "
-            "`lavender.derivative`, which takes one problem"
-        )
+        raise InputError("problems is one Problem; a list of problems is needed, or `lavender.derivative`")
     problems = check_sequence("problems", problems, "Problems")
     is_batch = isinstance(solutions, Solutions) and not solutions.faults
-    impulses: Any = (
-        solutions
-        if is_batch
-        else [getattr(x, "impulse", x) for x in check_sequence("solutions", solutions, "Solutions")]
-    )
+    impulses: Any = solutions
+    if not is_batch:
+        impulses = [getattr(x, "impulse", x) for x in check_sequence("solutions", solutions, "Solutions")]
     if len(problems) != len(impulses):
-        raise InputError(
-            f"impulses has {len(impulses)} entries for {len(problems)} problems; one solution for each "
-            "problem is needed"
-        )
-    linears = Linears(
-        [_get_data(p) for p in problems], impulses.flat_impulses if is_batch else impulses, MAX_KERNEL_ROWS
-    )
+        raise InputError(f"{len(impulses)} solutions for {len(problems)} problems; one for each is needed")
+    flat = impulses.flat_impulses if is_batch else impulses
+    linears = Linears([_get_data(p) for p in problems], flat, MAX_KERNEL_ROWS)
     separate = {}
     for i in linears.skip_unsolvable(MAX_ACCEPTED_RESIDUAL):
         try:

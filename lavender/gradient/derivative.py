@@ -89,10 +89,7 @@ class Tangent:
         """Change of the impulses (m,) [N s]; CapabilityError if they are not unique (linearly dependent rows)."""
         unique = self._derivative.unique
         if not unique.impulse.all():
-            raise CapabilityError(
-                f"the impulses of this problem are not unique ({unique}), so they have no derivative; use "
-                "the change of slack or velocity, which are unique"
-            )
+            raise CapabilityError(f"impulses of this problem are not unique ({unique}); slacks are")
         return self._impulse
 
     @property
@@ -143,11 +140,6 @@ class Derivative:
         return root / self.problem.cones.stretch if self.problem.cones.has_ellipse else root
 
     @cached_property
-    def _slack(self) -> FloatArray:
-        w: FloatArray = self._linear.slack
-        return w / self.problem.cones.stretch if self.problem.cones.has_ellipse else w
-
-    @cached_property
     def _system_rows(self) -> Any:
         """Rows in which G is not the identity."""
         return np.flatnonzero(self._linear.system_row >= 0)
@@ -187,15 +179,6 @@ class Derivative:
         multiply_body_jacobian(p.data, v.reshape(-1, 6), out)
         return out
 
-    def _apply_jacobian_transposed(self, x: FloatArray) -> FloatArray:
-        """Compute J^T x (nv,)."""
-        p = self.problem
-        if p.rows is None:
-            return np.asarray(p.jacobian.T @ x)
-        out = np.empty((p.rows.n_bodies, 6))
-        write_body_wrenches(p.data, np.ascontiguousarray(x), out)
-        return out.ravel()
-
     def _apply_a(self, x: FloatArray, transpose: bool = False) -> FloatArray:
         """Compute A x or A^T x (m,)."""
         p = self.problem
@@ -234,7 +217,7 @@ class Derivative:
         rows = np.flatnonzero(np.repeat(self._coefficient_rows.ellipse, np.diff(self.problem.cones.ptr)))
         rows = rows[self.problem.cones.friction_rows[rows]]
         root, e = self._root[rows], self.problem.cones.friction_coefficient[rows]
-        lam, w = self._impulse[rows], self._slack[rows]
+        lam, w = self._impulse[rows], (self._linear.slack / self.problem.cones.stretch)[rows]
         has_friction = e > 0.0
         e = np.where(has_friction, e, 1.0)
         dz_de = np.where(has_friction, root * lam / e, 0.0)
@@ -245,24 +228,14 @@ class Derivative:
         x, rows = r.copy(), self._system_rows
         # On rows outside of the system, G is the identity: move their contribution to the right-hand side.
         x[rows] = 0.0
-        fixed = (
-            self._linear.multiply_projection_derivative(self._apply_a(x / self._root) / self._root)
-            if x.any()
-            else 0.0
-        )
-        rhs = (r - fixed)[rows]
-        if check and self._system.singular and self._is_inconsistent(rhs):
+        rhs = r
+        if x.any():
+            rhs = r - self._linear.multiply_projection_derivative(self._apply_a(x / self._root) / self._root)
+        rhs = rhs[rows]
+        if check and self._system.has_null_component(rhs, MAX_NULL_COSINE, True):
             self._check_row_changes("no derivative along this change exists")
         x[rows] = self._system.solve(rhs)
         return x
-
-    def _is_inconsistent(self, rhs: FloatArray) -> bool:
-        """Return whether G x = rhs has no solution."""
-        size = MAX_NULL_COSINE * float(np.linalg.norm(rhs))
-        return any(
-            abs(float(q @ rhs)) > size * float(np.linalg.norm(q))
-            for q in self._system.draw_null_vectors(True)
-        )
 
     def _check_row_changes(self, message: str) -> None:
         """Raise CapabilityError if data of a single row cannot change because other rows share its load."""
@@ -288,17 +261,14 @@ class Derivative:
         cones, rows = self.problem.cones, self._system_rows
         ones = np.ones(cones.n_blocks)
         changes = (ones if name == key else None for key in COEFFICIENT_INPUTS)
-        r = self._apply_coefficient_change(self._coefficient_rows.compute_row_coefficient_changes(*changes))[
-            rows
-        ]
+        de = self._coefficient_rows.compute_row_coefficient_changes(*changes)
+        r = self._apply_coefficient_change(de)[rows]
         # An entry of r depends only on the coefficient of its own block: test each block separately.
         block = np.repeat(np.arange(cones.n_blocks), np.diff(cones.ptr))[rows]
         size = MAX_NULL_COSINE * np.sqrt(np.bincount(block, r * r))
         for q in self._system.draw_null_vectors(True):
             if (np.abs(np.bincount(block, q * r)) > size * float(np.linalg.norm(q))).any():
-                self._check_row_changes(
-                    f"no derivative by {name} of one contact exists here (jvp: of several)"
-                )
+                self._check_row_changes(f"no derivative by {name} of one contact (jvp: of several) exists")
 
     # -- adjoint and forward products ------------------------------------------------------------
 
@@ -346,27 +316,25 @@ class Derivative:
             rhs += self._apply_jacobian(self._apply_inverse_mass(y))
         scaled, q = (rhs / self._root)[self._system_rows], np.zeros(p.m)
         # Slacks and velocities are unique if A comes from bodies or J and M and the law is convex: no check is needed.
-        if p.matrix is not None or p.law == "coulomb" or c.any():
-            self._check_unique(scaled)
+        needs_check = p.matrix is not None or p.law == "coulomb" or c.any()
+        if needs_check and self._system.has_null_component(scaled, MAX_NULL_ENTRY, False):
+            raise CapabilityError(
+                f"the requested gradient is not unique: {self.unique}. Use cotangents of velocities, of "
+                "slacks, or of sums of impulses, which are unique"
+            )
         q[self._system_rows] = self._system.solve(scaled, True)
         s = self._linear.multiply_projection_derivative(q, True) / self._root
         if x is not None:
             s -= x
         if p.matrix is not None:
             return np.concatenate([q, s, c])
-        f = (0.0 if y is None else y) - self._apply_jacobian_transposed(s)
-        return np.concatenate([q, s, f, c])
-
-    def _check_unique(self, c: FloatArray) -> None:
-        """Raise CapabilityError if a scaled cotangent weighs a component of the solution that is not unique."""
-        if not self._system.singular:
-            return
-        size = float(np.linalg.norm(c))
-        if any(abs(float(x @ c)) > MAX_NULL_ENTRY * size for x in self._null_space):
-            raise CapabilityError(
-                f"the requested gradient is not unique: {self.unique}. Use cotangents of velocities, of "
-                "slacks, or of sums of impulses, which are unique"
-            )
+        if p.rows is None:
+            force = np.asarray(p.jacobian.T @ s)
+        else:
+            wrench = np.empty((p.rows.n_bodies, 6))
+            write_body_wrenches(p.data, np.ascontiguousarray(s), wrench)
+            force = wrench.ravel()
+        return np.concatenate([q, s, (0.0 if y is None else y) - force, c])
 
     def jvp(self, **changes: Any) -> Tangent:
         """Compute the change of the solution along changes of the data, by one linear solve.
@@ -399,22 +367,21 @@ class Derivative:
             r += weight * self._root * data.get(name, 0.0)
         coefficients = [data.get(name) for name in COEFFICIENT_INPUTS]
         if any(x is not None for x in coefficients):
-            r += self._apply_coefficient_change(
-                self._coefficient_rows.compute_row_coefficient_changes(*coefficients)
-            )
+            de = self._coefficient_rows.compute_row_coefficient_changes(*coefficients)
+            r += self._apply_coefficient_change(de)
         dv: Any = None if p.matrix is not None else np.zeros(self._velocity.shape)
         if "A" in data:
             dw += data["A"] @ self._impulse
         if "compliance" in data:
             dw += data["compliance"] * self._impulse
         dj = data.get("J")
-        momentum = None  # Will hold dJ^T lambda - dM v' of equation (2) in `lavender.gradient`.
+        momentum: Any = 0.0  # dJ^T lambda - dM v' of equation (2) in `lavender.gradient`
         if dj is not None:
             dw += dj @ self._velocity
             momentum = dj.T @ self._impulse
         if "M" in data:
-            momentum = (0.0 if momentum is None else momentum) - data["M"] @ self._velocity_change
-        if momentum is not None:
+            momentum = momentum - data["M"] @ self._velocity_change
+        if np.ndim(momentum):
             dv += self._apply_inverse_mass(momentum)
         if dv is not None and dv.any():
             dw += self._apply_jacobian(dv)
@@ -437,11 +404,8 @@ class Derivative:
         rows, dz_de, dy_de = self._ellipse_terms
         dz, dy, others = np.zeros(len(de)), np.zeros(len(de)), de.copy()
         dz[rows], dy[rows], others[rows] = dz_de * de[rows], dy_de * de[rows], 0.0
-        return (
-            linear.multiply_projection_derivative(others, False, True)
-            + dz
-            - linear.multiply_projection_derivative(dy)
-        )
+        changed: FloatArray = linear.multiply_projection_derivative(others, False, True) + dz
+        return changed - linear.multiply_projection_derivative(dy)
 
     def _check_changes(self, changes: dict[str, Any]) -> dict[str, Any]:
         """Convert the changes of data to arrays; raise InputError for invalid ones."""
@@ -460,10 +424,8 @@ class Derivative:
                 if name == "M" and abs(out[name] - out[name].T).max() > 1e-12 * abs(out[name]).max():
                     raise InputError("the change of M must be symmetric, because M is: give both triangles")
             elif name in COEFFICIENT_INPUTS:
-                shape: tuple[int, ...] = (p.n_blocks,)
-                out[name] = as_array(
-                    name, value, (*shape, 2) if name == "mu" and np.ndim(value) == 2 else shape
-                )
+                is_pair = name == "mu" and np.ndim(value) == 2
+                out[name] = as_array(name, value, (p.n_blocks, 2) if is_pair else (p.n_blocks,))
             elif name == "v_free":
                 like = getattr(p.rows if p.rows is not None else p.generalized, name)
                 out[name] = as_array(name, value, like.shape)
@@ -476,16 +438,12 @@ class Derivative:
     # -- existence -------------------------------------------------------------------------------
 
     @cached_property
-    def _null_space(self) -> FloatArray:
-        return self._system.draw_null_vectors(False)
-
-    @cached_property
     def unique(self) -> Unique:
         """Uniqueness of impulse, slack and target by row; linearly dependent rows can share a load in many ways."""
         p, m = self.problem, self.problem.m
         impulse, slack, target, velocity = np.ones((3, m), bool)[0], np.ones(m, bool), np.ones(m, bool), True
         rows = self._system_rows
-        for z in self._null_space:
+        for z in self._system.draw_null_vectors(False):
             x = np.zeros(m)
             x[rows] = z
             limit = MAX_NULL_ENTRY * np.abs(x).max()
@@ -496,10 +454,8 @@ class Derivative:
         for q in self._system.draw_null_vectors(True):
             x = np.zeros(m)
             x[rows] = q
-            target &= (
-                np.abs(self._linear.multiply_projection_derivative(x, True))
-                <= MAX_NULL_ENTRY * np.abs(x).max()
-            )
+            change = np.abs(self._linear.multiply_projection_derivative(x, True))
+            target &= change <= MAX_NULL_ENTRY * np.abs(x).max()
         return Unique(impulse, slack, velocity, target, p)
 
     @cached_property
@@ -512,7 +468,13 @@ class Derivative:
         """Estimated error of each block (k,) [N s]: the size of the next step of Newton's method plus rounding."""
         linear, p = self._linear, self.problem
         with np.errstate(all="ignore"):
-            size = np.abs(self._apply_abs_a()) + np.abs(p.b)
+            x = np.abs(self._impulse)
+            if p.generalized is None:
+                size = np.abs(p.b) + abs(p.csr) @ x
+            else:  # An upper bound of |A| |lambda|, which does not form A.
+                y = abs(p.whitened)
+                assert p.compliance is not None
+                size = np.abs(p.b) + (y @ (y.T @ x) + p.compliance * x)
             rounding = UNIT_ROUNDOFF * size / self._root * np.random.default_rng(0).choice([-1.0, 1.0], p.m)
             error = np.zeros(p.m)
             for r in (-linear.residual, linear.multiply_projection_derivative(rounding)):
@@ -522,15 +484,6 @@ class Derivative:
             error += 4.0 * UNIT_ROUNDOFF * size / self._root**2
         first = p.cones.ptr[:-1]
         return np.maximum.reduceat(np.nan_to_num(error, nan=np.inf), first) if len(first) else error
-
-    def _apply_abs_a(self) -> FloatArray:
-        """Compute |A| |lambda| (m,), or an upper bound in generalised coordinates, which do not form A."""
-        p, x = self.problem, np.abs(self._impulse)
-        if p.matrix is not None or p.rows is not None:
-            return np.asarray(abs(p.csr) @ x)
-        y = abs(p.whitened)
-        assert p.compliance is not None
-        return np.asarray(y @ (y.T @ x) + p.compliance * x)
 
     @property
     def distance(self) -> FloatArray:
@@ -564,9 +517,8 @@ class Derivative:
     def __str__(self) -> str:
         notes = [repr(self.states)]
         if self.switching:
-            names = ", ".join(
-                self.problem.row_name(int(self.problem.cones.ptr[i])) for i in self.switching[:3]
-            )
+            rows = self.problem.cones.ptr[list(self.switching[:3])]
+            names = ", ".join(self.problem.row_name(int(row)) for row in rows)
             notes.append(f"{len(self.switching)} about to switch ({names}): one of several derivatives")
         if not self.unique:
             notes.append(f"not unique: {self.unique}")

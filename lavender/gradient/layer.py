@@ -72,11 +72,9 @@ class Step:
         arguments = arrays[: len(ARGUMENTS)]
         flat, batch = _flatten_batch(arguments)
         gradients: list[list[FloatArray]] = [[] for _ in ARGUMENTS]
-        others = [
-            np.broadcast_to(x, (*batch, x.shape[-1])).reshape(prod(batch), x.shape[-1])
-            for x in arrays[len(arguments) :]
-        ]
-        problems, (impulses, y, c) = list(self.iterate_problems(flat)), others
+        sizes = ((x, x.shape[-1]) for x in arrays[len(arguments) :])
+        impulses, y, c = (np.broadcast_to(x, (*batch, n)).reshape(prod(batch), n) for x, n in sizes)
+        problems = list(self.iterate_problems(flat))
         for p, g in zip(problems, derivatives(problems, impulses).vjp(velocity=y, impulse=c), strict=True):
             for out, name, is_needed, like in zip(gradients, ARGUMENTS, needed, flat, strict=True):
                 if not is_needed:
@@ -115,10 +113,7 @@ def infer_result_shapes(arrays: Sequence[Any]) -> tuple[tuple[int, ...], tuple[i
     shapes = [tuple(x.shape) for x in arrays]
     for name, shape, n in zip(ARGUMENTS, shapes, ARGUMENT_AXES, strict=True):
         if len(shape) < n:
-            raise InputError(
-                f"{name} has shape {shape}; {n} axes are needed, after any number of batch axes: {n} or "
-                "more axes in total"
-            )
+            raise InputError(f"{name} has shape {shape}; {n} axes after any batch axes are needed")
     m, nv = shapes[0][-2:]
     required_shapes = ((m, nv), (nv, nv), (nv,), shapes[3][-1:], (m,), (m,))
     for name, shape, required in zip(ARGUMENTS, shapes, required_shapes, strict=True):
@@ -126,10 +121,9 @@ def infer_result_shapes(arrays: Sequence[Any]) -> tuple[tuple[int, ...], tuple[i
             raise InputError(
                 f"{name} has shape {shape}; (..., {', '.join(map(str, required))}) is needed, as J is {shapes[0]}"
             )
+    batches = [shape[: len(shape) - n] for shape, n in zip(shapes, ARGUMENT_AXES, strict=True)]
     try:
-        batch = np.broadcast_shapes(
-            *(shape[: len(shape) - n] for shape, n in zip(shapes, ARGUMENT_AXES, strict=True))
-        )
+        batch = np.broadcast_shapes(*batches)
     except ValueError:
         raise InputError(
             f"the batch axes of {', '.join(ARGUMENTS)} cannot be broadcast together: the shapes are {shapes}"

@@ -70,37 +70,25 @@ class Gradient(GradientArrays):
     contacts.
     """
 
-    def __init__(self, derivative: Any, adjoint: FloatArray) -> None:
-        # `_adjoint` holds q, s (m), f (nv) and c (m) of equation (4) in `lavender.gradient`, concatenated.
-        self._derivative, self._adjoint = derivative, adjoint
-
     if TYPE_CHECKING:
         A: Any
         J: sp.csr_array
         M: sp.csr_array
 
-    @property
-    def _q(self) -> FloatArray:
-        return self._adjoint[: self._derivative.m]
-
-    @property
-    def _s(self) -> FloatArray:
-        m = self._derivative.m
-        return self._adjoint[m : 2 * m]
-
-    @property
-    def _f(self) -> FloatArray:
-        """Gradient f = y - J^T s (nv,) by v*, of equation (4)."""
-        m = self._derivative.m
-        return self._adjoint[2 * m : len(self._adjoint) - m]
+    def __init__(self, derivative: Any, adjoint: FloatArray) -> None:
+        m, end = derivative.m, len(adjoint) - derivative.m
+        # q, s (m), f = y - J^T s (nv) and c (m) of equation (4) in `lavender.gradient`.
+        self._q, self._s, self._f, self._c = (
+            adjoint[:m],
+            adjoint[m : 2 * m],
+            adjoint[2 * m : end],
+            adjoint[end:],
+        )
+        self._derivative = derivative
 
     @cached_property
     def _p(self) -> FloatArray:
         return np.asarray(self._derivative._apply_inverse_mass(self._f))
-
-    @property
-    def _c(self) -> FloatArray:
-        return self._adjoint[len(self._adjoint) - self._derivative.m :]
 
     def __repr__(self) -> str:
         return f"<Gradient of {self._derivative.m} rows by {', '.join(self._derivative.inputs)}>"
@@ -124,16 +112,41 @@ class Gradient(GradientArrays):
                 derivative._check_row_changes(f"no derivative by {name} exists here")
             if name in (*COEFFICIENT_INPUTS, "coefficients") and not derivative._uses_kernel:
                 derivative._check_coefficient_changes("mu" if name == "coefficients" else name)
-            value = self.__dict__[name] = getattr(self, f"_by_{name}")()
+            value = self.__dict__[name] = self._compute(name)
             return value
 
-    def _by_b(self) -> FloatArray:
-        return self._s
-
-    _by_target = _by_b
-
-    def _by_v_free(self) -> FloatArray:
-        return self._f.reshape(self._derivative._velocity_shape())
+    def _compute(self, name: str) -> Any:
+        """Compute the gradient by one input: (5) of `lavender.gradient`."""
+        derivative, problem = self._derivative, self._derivative.problem
+        if name in ("b", "target"):
+            return self._s
+        if name == "v_free":
+            return self._f.reshape(derivative._velocity_shape())
+        if name == "compliance":
+            return -self._s * derivative._impulse
+        if name in ("lower", "upper"):
+            return derivative._bound_weights[int(name == "upper")] * self._by_fixed_impulse
+        if name in MATRICES:
+            pattern = (
+                problem.generalized.mass
+                if name == "M"
+                else problem.jacobian
+                if name == "J"
+                else problem.matrix
+            )
+            pairs = self._list_outer_product_pairs(name)
+            return _sum_on_pattern(pattern, *pairs) if issparse(pattern) else np.outer(*pairs[0])
+        rows = derivative._coefficient_rows
+        first, second, rolling = (
+            rows.select_rows_or_zero(self._by_row_coefficient, at)
+            for at in (rows.first, rows.second, rows.rolling)
+        )
+        if name == "mu":
+            return first + rows.radius * second
+        if name == "coefficients":
+            pair = np.where(rows.has_pair, first, self.mu), np.where(rows.has_pair, second, 0.0)
+            return np.stack(pair, axis=1)
+        return rows.mu * second if name == "patch_radius" else rolling
 
     @cached_property
     def _by_fixed_impulse(self) -> FloatArray:
@@ -145,69 +158,28 @@ class Gradient(GradientArrays):
         assert compliance is not None
         return np.asarray(self._c + derivative._apply_jacobian(self._p) - compliance * self._s)
 
-    def _by_lower(self) -> FloatArray:
-        return self._derivative._bound_weights[0] * self._by_fixed_impulse
-
-    def _by_upper(self) -> FloatArray:
-        return self._derivative._bound_weights[1] * self._by_fixed_impulse
-
     @cached_property
     def _by_row_coefficient(self) -> FloatArray:
         """Gradient (m,) by the friction coefficient e of each row."""
         derivative = self._derivative
-        e = derivative._linear.multiply_projection_derivative(self._q, True, True)
+        linear = derivative._linear
+        e: FloatArray = linear.multiply_projection_derivative(self._q, True, True)
         if derivative.problem.cones.has_ellipse:
             rows, dz_de, dy_de = derivative._ellipse_terms
             e[rows] = (
-                dz_de * self._q[rows]
-                - dy_de * derivative._linear.multiply_projection_derivative(self._q, True)[rows]
+                dz_de * self._q[rows] - dy_de * linear.multiply_projection_derivative(self._q, True)[rows]
             )
         return e
-
-    def _by_mu(self) -> FloatArray:
-        rows, gradient = self._derivative._coefficient_rows, self._by_row_coefficient
-        return rows.select_rows_or_zero(gradient, rows.first) + rows.radius * rows.select_rows_or_zero(
-            gradient, rows.second
-        )
-
-    def _by_coefficients(self) -> FloatArray:
-        rows, gradient = self._derivative._coefficient_rows, self._by_row_coefficient
-        second = np.where(rows.has_pair, rows.select_rows_or_zero(gradient, rows.second), 0.0)
-        first = np.where(rows.has_pair, rows.select_rows_or_zero(gradient, rows.first), self.mu)
-        return np.stack([first, second], axis=1)
-
-    def _by_patch_radius(self) -> FloatArray:
-        rows = self._derivative._coefficient_rows
-        return rows.mu * rows.select_rows_or_zero(self._by_row_coefficient, rows.second)
-
-    def _by_rolling(self) -> FloatArray:
-        rows = self._derivative._coefficient_rows
-        return rows.select_rows_or_zero(self._by_row_coefficient, rows.rolling)
-
-    def _by_compliance(self) -> FloatArray:
-        return -self._s * self._derivative._impulse
-
-    def _by_A(self) -> Any:
-        matrix, pairs = self._derivative.problem.matrix, self._list_outer_product_pairs("A")
-        return _sum_on_pattern(matrix, *pairs) if issparse(matrix) else np.outer(*pairs[0])
 
     def _list_outer_product_pairs(self, name: str) -> list[tuple[FloatArray, FloatArray]]:
         """Return the gradient (5) by A, J or M, a sum of outer products u v^T, as pairs (u, v)."""
         derivative = self._derivative
         if name == "A":
             return [(-self._s, derivative._impulse)]
-        p = self._p
         if name == "J":
-            return [(derivative._impulse, p), (-self._s, derivative._velocity)]
-        return [(-0.5 * p, derivative._velocity_change), (-0.5 * derivative._velocity_change, p)]
-
-    def _by_J(self) -> sp.csr_array:
-        return _sum_on_pattern(self._derivative.problem.jacobian, *self._list_outer_product_pairs("J"))
-
-    def _by_M(self) -> sp.csr_array:
-        general = self._derivative.problem.generalized
-        assert general is not None
-        return _sum_on_pattern(general.mass, *self._list_outer_product_pairs("M"))
+            return [(derivative._impulse, self._p), (-self._s, derivative._velocity)]
+        change, half = derivative._velocity_change, -0.5 * self._p
+        return [(half, change), (-0.5 * change, self._p)]
 
     def full(self, name: str) -> FloatArray:
         """Compute the gradient by A, J or M as a dense array, including entries outside of the sparsity pattern.

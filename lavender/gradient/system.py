@@ -75,6 +75,7 @@ class System:
                 "added: A is indefinite, or states of contacts are wrong. Solve with a smaller tol first"
             )
         self._solve_factored = solve
+        self._null_vectors: dict[bool, FloatArray] = {}
 
     def _factor_dense(self, shift: float) -> Solve | None:
         return self.linear.solve if factor_dense(self.problem, self.linear, shift) else None
@@ -133,6 +134,8 @@ class System:
 
     def draw_null_vectors(self, transpose: bool) -> FloatArray:
         """Return random unit vectors (NULL_VECTORS, n) in the null space of G, or of G^T; empty if G is regular."""
+        if transpose in self._null_vectors:
+            return self._null_vectors[transpose]
         if not self.singular:
             return np.zeros((0, self.n))
         g, vectors = (self.g.T if transpose else self.g), []
@@ -140,4 +143,9 @@ class System:
             for _ in range(MAX_PROXIMAL_STEPS):
                 x = x - self._solve_factored(g @ x, transpose)
             vectors.append(x / np.linalg.norm(x))
-        return np.stack(vectors)
+        return self._null_vectors.setdefault(transpose, np.stack(vectors))
+
+    def has_null_component(self, r: FloatArray, limit: float, transpose: bool) -> bool:
+        """Return whether the cosine of r with a null vector of G, or of G^T, exceeds the limit."""
+        size = limit * float(np.linalg.norm(r))
+        return any(abs(float(x @ r)) > size for x in self.draw_null_vectors(transpose))
