@@ -63,10 +63,7 @@ class _Adjoint(torch.autograd.Function):  # type: ignore[misc]
     @staticmethod
     def backward(ctx: Any, *cotangents: Any) -> Any:
         """Raise NotImplementedError: there are no second derivatives."""
-        raise NotImplementedError(
-            "lavender.torch has first derivatives only, and a gradient of a gradient was requested: leave "
-            "create_graph=True out"
-        )
+        raise NotImplementedError("lavender.torch has first derivatives only: leave create_graph=True out")
 
     @staticmethod
     def vmap(info: Any, in_dims: Any, step: Step, needed: Any, *arrays: Any) -> Any:

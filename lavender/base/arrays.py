@@ -59,10 +59,7 @@ def to_numpy(name: str, value: Any) -> np.ndarray:
                 f"{name} cannot be read as an array ({error}); an array of numbers is needed"
             ) from None
     if getattr(value, "requires_grad", False):
-        raise InputError(
-            f"{name} requires a gradient, which would be lost: give {name}.detach(), or use lavender.torch to "
-            "differentiate"
-        )
+        raise InputError(f"{name} requires a gradient, which would be lost: give {name}.detach()")
     if hasattr(
         value, "resolve_neg"
     ):  # PyTorch passes a view with the negative bit by DLPack with the wrong sign.
@@ -150,10 +147,7 @@ def as_array(
         required = f"({sizes}{',' * (len(shape) == 1)})"
         raise InputError(f"{label} has shape {array.shape}; {required} is needed")
     if dtype is np.int32 and array.size and (float(array.min()) < -(2**31) or float(array.max()) >= 2**31):
-        raise InputError(
-            f"{label} holds a number beyond 32 bits (from {array.min():g} to {array.max():g}); numbers from "
-            "-2^31 to 2^31 - 1 are needed"
-        )
+        raise InputError(f"{label} holds {array.min():g} to {array.max():g}; -2^31 to 2^31 - 1 is needed")
     if array.dtype.itemsize > 8:
         with np.errstate(over="ignore", under="ignore"):
             array = array.astype(np.float64)  # Long doubles out of range become infinite without a warning.
@@ -188,10 +182,7 @@ def check_unmasked(name: str, value: Any) -> None:
     if hasattr(value, "mask") and np.ma.is_masked(value):
         masked = np.argwhere(np.ma.getmaskarray(value))
         index = ", ".join(map(str, masked[0]))
-        raise InputError(
-            f"{name} is masked at [{index}] ({len(masked)} masked entries); an array without masked entries "
-            f"is needed: replace them, for example with {name}.filled(0.0)"
-        )
+        raise InputError(f"{name} is masked at [{index}]; an array without masked entries is needed")
 
 
 def get_shape(name: str, value: Any) -> tuple[int, ...]:

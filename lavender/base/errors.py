@@ -9,19 +9,9 @@ from typing import Any
 import numpy as np
 
 __all__ = [
-    "BREAKDOWN",
-    "CapabilityError",
-    "InUse",
-    "InputError",
-    "LavenderError",
-    "SolveFailed",
-    "SolverUnavailable",
-    "TooLarge",
-    "UnknownName",
-    "check_name",
-    "format_error",
-    "require_packages",
-]
+    "BREAKDOWN", "CapabilityError", "InUse", "InputError", "LavenderError", "SolveFailed", "SolverUnavailable",
+    "TooLarge", "UnknownName", "check_name", "format_error", "require_packages",
+]  # fmt: skip
 
 
 class LavenderError(Exception):

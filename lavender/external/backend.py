@@ -129,15 +129,12 @@ def _call_through_qpsolvers(
     x = None if solution.x is None else np.asarray(solution.x, float).ravel()
     lam = program.join_multipliers(solution.y, solution.z, solution.z_box, backend.finite)
     iterations = _get_iterations(extras)
-    message = text or (
-        "solved" if solution.found else "not solved" + (", nothing returned" if x is None else "")
-    )
+    unsolved = "not solved" if x is not None else "not solved, nothing returned"
+    message = text or ("solved" if solution.found else unsolved)
     if backend.settings is None:
         message += ", at its own tolerance"
     if backend.jax and not sys.modules["jax"].config.jax_enable_x64:
-        message += (
-            "; JAX computes in 32 bits: jax.config.update('jax_enable_x64', True) makes it compute in 64 bits"
-        )
+        message += "; JAX computes in 32 bits: jax.config.update('jax_enable_x64', True) changes that"
     return Answer(status, message, x, lam, {} if iterations is None else {"iterations": iterations})
 
 

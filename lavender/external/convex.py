@@ -211,10 +211,8 @@ class ConvexProgram:
         size = np.sqrt((signed * signed).sum(axis=0))
         size[size == 0.0] = 1.0
         try:
-            found = (
-                import_module_under_lock("scipy.optimize").nnls(signed / size, weight * (P @ x + scaled.q))[0]
-                / size
-            )
+            nnls = import_module_under_lock("scipy.optimize").nnls
+            found = nnls(signed / size, weight * (P @ x + scaled.q))[0] / size
         except RuntimeError:
             return None
         lam = np.zeros(len(scaled.t))
@@ -308,18 +306,16 @@ class ScaledProgram(ConvexProgram):
         self, bounds_as_rows: bool
     ) -> tuple[IntArray, IntArray, FloatArray | None, FloatArray | None]:
         """Return the rows of A and of G, and lb and ub (n,), None without bounds; or bounds as rows of A and G."""
-        rows: tuple[Any, Any, Any, Any] = split_rows(
-            self.J, self.t, self.variable, self.is_kept, self.n, self.free, bounds_as_rows
-        )
+        fields = self.J, self.t, self.variable, self.is_kept, self.n, self.free
+        rows: tuple[Any, Any, Any, Any] = split_rows(*fields, bounds_as_rows)
         return rows
 
     def select_rows(self, rows: IntArray, sign: float, dense: bool) -> Any:
         """Return sign J of these rows, dense or as `csc_matrix`."""
         if dense:
             return make_dense(self.J, self.n, np.asarray(rows, np.int32), sign)
-        return sp.csc_matrix(
-            make_columns(self.J, self.n, np.asarray(rows, np.int32), sign), (len(rows), self.n)
-        )
+        columns = make_columns(self.J, self.n, np.asarray(rows, np.int32), sign)
+        return sp.csc_matrix(columns, (len(rows), self.n))
 
     def get_hessian(self, dense: bool) -> Any:
         """Return a new dense P, or P as `csc_matrix` with sorted indices."""
@@ -331,9 +327,8 @@ class ScaledProgram(ConvexProgram):
 
     def join_multipliers(self, y: Any, z: Any, box: Any, bounds_as_rows: bool = False) -> FloatArray:
         """Return lambda (m,) of multipliers with the signs of qpsolvers; missing ones count as 0."""
-        lam: FloatArray = join_multipliers(
-            self.J, self.variable, self.is_kept, self.n, self.free, y, z, box, bounds_as_rows
-        )
+        fields = self.J, self.variable, self.is_kept, self.n, self.free
+        lam: FloatArray = join_multipliers(*fields, y, z, box, bounds_as_rows)
         return lam
 
     def split_multipliers(self, lam: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

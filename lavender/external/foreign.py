@@ -19,8 +19,7 @@ class ForeignSolver(Solver):
         missing = [m for m in ("prepare", "run") if not callable(getattr(solver, m, None))]
         if missing:
             raise InputError(
-                f"the factory of solver {name!r} returned a {type(solver).__name__} without the methods "
-                f"{' and '.join(missing)}; prepare and run are needed (lavender.registry.Solver)"
+                f"solver {name!r} is a {type(solver).__name__} without {' and '.join(missing)}; both are needed"
             )
         for method in ("prepare", "update", "start_workers", "set_deadline"):
             if getattr(solver, method, None) is not None:

@@ -120,12 +120,8 @@ class Form:
         z: FloatArray = -self.problem.slack(impulse)
         if self.name == "impulse":
             bounds = np.flatnonzero(self.program.variable >= 0)
-            own = np.zeros(len(x))
-            np.add.at(
-                own,
-                self.program.variable[bounds],
-                -self.program.J[2][self.program.J[0][bounds]] * lam[bounds],
-            )
+            own, sign = np.zeros(len(x)), self.program.J[2][self.program.J[0][bounds]]
+            np.add.at(own, self.program.variable[bounds], -sign * lam[bounds])
             z[self.unknown_rows] = own
         return z
 
@@ -151,10 +147,7 @@ def choose_program_form(problem: Problem, form: str, definite: bool = False) -> 
     if form in ("impulse", "velocity") and problem.has_singular_program:
         raise CapabilityError(f"form={form!r} needs a positive definite P; P of this program is singular")
     if form == "velocity" and problem.matrix is not None:
-        raise CapabilityError(
-            "form='velocity' needs a problem with bodies (Problem.from_rows, without ellipses) or J and M "
-            "(Problem.from_jacobian); this one is a matrix"
-        )
+        raise CapabilityError("form='velocity' needs bodies without ellipses, or J and M; this is a matrix")
     if form != "auto":
         return form
     if problem.qp is not None:
@@ -213,14 +206,9 @@ def get_program(qp: QuadraticProgram) -> ConvexProgram:
     """Return the convex program of a quadratic program, which is stored with it."""
     program: ConvexProgram | None = qp.__dict__.get("_convex_program")
     if program is None:
+        definite = not qp.is_singular
         program = ConvexProgram(
-            P=qp.hessian,
-            q=qp.q,
-            J=qp.jacobian,
-            t=qp.target,
-            free=qp.free,
-            variable=qp.variable,
-            definite=not qp.is_singular,
+            qp.hessian, qp.q, qp.jacobian, qp.target, qp.free, qp.variable, definite=definite
         )
         program.__dict__["scales"] = qp.scales
         qp.__dict__["_convex_program"] = program

@@ -44,10 +44,8 @@ def call_clarabel(
             raise InputError(f"clarabel has no setting {key!r}; known: {', '.join(known)}")
         setattr(settings, key, value)
     matrix = program.select_rows(rows, -1.0, False)
-    solver = clarabel.DefaultSolver(
-        program.make_upper_triangle(), program.q, matrix, -program.t[rows], cones, settings
-    )
-    result = solver.solve()
+    data = program.make_upper_triangle(), program.q, matrix, -program.t[rows]
+    result = clarabel.DefaultSolver(*data, cones, settings).solve()
     name, z = str(result.status), np.array(result.z)
     # "Almost infeasible" is a claim, too, because the certificate is checked.
     almost = name in ("AlmostPrimalInfeasible", "AlmostDualInfeasible")

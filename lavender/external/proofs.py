@@ -36,9 +36,9 @@ def find_infeasibility_proof(
     if not len(program.t):
         return None
     rows = program.without_cost()
-    scaled, (_, e, _, _), is_equation = (
+    scaled, e, is_equation = (
         rows.scaled.without_far_rows(),
-        rows.scales,
+        rows.scales[1],
         np.arange(len(rows.t)) < rows.free,
     )
     candidates = [] if multipliers is None else [multipliers]
@@ -50,9 +50,8 @@ def find_infeasibility_proof(
                 continue
             if deadline.has_passed():
                 return None
-            proof = prove_infeasibility(
-                problem, np.concatenate([np.zeros(problem.m - len(y)), y]), 0.0, deadline
-            )
+            direction = np.concatenate([np.zeros(problem.m - len(y)), y])
+            proof = prove_infeasibility(problem, direction, 0.0, deadline)
             if not proof.reason:
                 return proof
         if attempt or deadline.has_passed():
@@ -63,9 +62,9 @@ def find_infeasibility_proof(
         found = _solve_linear_program(-t, matrix, None, np.where(is_equation, -1.0, 0.0), high, deadline)
         if found is None:
             return None
-        candidates = (
-            [found * e] if deadline.has_passed() else [_project_to_kernel(found, matrix) * e, found * e]
-        )
+        candidates = [found * e]
+        if not deadline.has_passed():
+            candidates.insert(0, _project_to_kernel(found, matrix) * e)
     return None
 
 
@@ -92,10 +91,8 @@ def find_ray(
     if point is None or not _is_feasible(program, point):
         if deadline.has_passed():
             return None
-        none = np.full(n, np.inf)
-        found = _solve_linear_program(
-            np.zeros(n), jac[:free], jac[free:], -none, none, deadline, scaled.t[:free], scaled.t[free:]
-        )
+        none, t = np.full(n, np.inf), (scaled.t[:free], scaled.t[free:])
+        found = _solve_linear_program(np.zeros(n), jac[:free], jac[free:], -none, none, deadline, *t)
         if found is None:
             return None
         point = found * (scale * sigma)

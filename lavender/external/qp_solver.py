@@ -178,9 +178,7 @@ class QPSolver(Solver):
 
     def __post_init__(self) -> None:
         if not isinstance(self.settings, Mapping):
-            raise InputError(
-                f"settings is a {type(self.settings).__name__}; a mapping of names to values is needed"
-            )
+            raise InputError(f"settings is a {type(self.settings).__name__}; a mapping of names is needed")
         if self.isolate is not None:
             check_bool("isolate", self.isolate)
 

@@ -132,9 +132,7 @@ def call_backend_until_accepted(
         work = sum_work_counts((work, {"backend_calls": 1}, answer.work))
         message = answer.message
         if scaled.shift:
-            message = (
-                f"{message}; {scaled.shift:.1g} was added to the diagonal of the singular P, in scaled units"
-            )
+            message += f"; {scaled.shift:.1g} was added to the diagonal of the singular P, in scaled units"
         result = BackendResult(answer.status, message, work, shift=scaled.shift)
         accepted = is_unfounded = False
         if answer.status is Status.INFEASIBLE:

@@ -37,33 +37,11 @@ from lavender.io.velocities import Reconstruction, reconstruct
 from lavender.problem import Problem
 
 __all__ = [
-    "Claims",
-    "EngineStep",
-    "MujocoScratch",
-    "Reconstruction",
-    "Recorder",
-    "Recording",
-    "StepVerdict",
-    "Stored",
-    "drake",
-    "efc",
-    "from_drake",
-    "from_efc",
-    "from_genesis",
-    "from_kamino",
-    "from_mujoco",
-    "from_mujoco_many",
-    "from_newton_mujoco",
-    "from_pinocchio",
-    "load",
-    "load_solution",
-    "mujoco",
-    "read",
-    "read_recorded_state",
-    "reconstruct",
-    "record",
-    "save",
-]
+    "Claims", "EngineStep", "MujocoScratch", "Reconstruction", "Recorder", "Recording", "StepVerdict", "Stored",
+    "drake", "efc", "from_drake", "from_efc", "from_genesis", "from_kamino", "from_mujoco", "from_mujoco_many",
+    "from_newton_mujoco", "from_pinocchio", "load", "load_solution", "mujoco", "read", "read_recorded_state",
+    "reconstruct", "record", "save",
+]  # fmt: skip
 __dir__ = sorted(__all__).copy  # Completion shows public names only.
 
 
@@ -134,10 +112,7 @@ def save(
     suffix = path.suffix.lower()
     if suffix == ".npz":
         if drop:
-            raise InputError(
-                "drop= has no effect on an .npz file, which holds everything: leave it out, or give a path that "
-                "ends with .hdf5 (FCLIB)"
-            )
+            raise InputError("drop= has no effect on an .npz file, which holds everything: leave it out")
         write_npz(problem, path, impulse=impulse)
     elif suffix in HDF5:
         fclib.write(problem, path, impulse=impulse, drop=drop)

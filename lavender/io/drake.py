@@ -132,18 +132,11 @@ def _build_problem(
     impulses = np.concatenate([np.zeros(0), *(dt * c.force for c in contacts), np.zeros(len(limits))])
     _complete_impulses(plant, context, dynamics, v_free, jac, impulses, limits, 3 * len(contacts), dt)
     problem = Problem.from_jacobian(
-        jac,
-        dynamics,
-        v_free,
-        target=np.concatenate([np.zeros(0), *gaps]),
-        cones=cones,
-        compliance=compliance,
-        friction=friction,
-        names=[c.name for c in contacts] + [x.name for x in limits],
+        jac, dynamics, v_free, target=np.concatenate([np.zeros(0), *gaps]), cones=cones, compliance=compliance,
+        friction=friction, names=[c.name for c in contacts] + [x.name for x in limits],
         angular=[False] * (3 * len(contacts)) + [x.is_angular for x in limits],
-        dof_names=list(plant.GetVelocityNames(always_add_suffix=True)),
-        name=name,
-    )
+        dof_names=list(plant.GetVelocityNames(always_add_suffix=True)), name=name,
+    )  # fmt: skip
     return problem, impulses
 
 
@@ -157,9 +150,7 @@ def _check_no_locked_joints(plant: Any, context: Any) -> None:
     joints = [plant.get_joint(JointIndex(int(i))) for i in plant.GetJointIndices()]
     locked = [joint.name() for joint in joints if joint.num_velocities() and joint.is_locked(context)]
     if locked:
-        raise CapabilityError(
-            f"the joints {', '.join(locked):.200} are locked, which is not supported; replace them by welds"
-        )
+        raise CapabilityError(f"the joints {', '.join(locked):.200} are locked; welds are supported")
 
 
 @dataclass(frozen=True)
@@ -200,8 +191,7 @@ def compute_free_motion(plant: Any, context: Any, dt: float) -> tuple[FloatArray
             actuator = plant.get_joint_actuator(JointActuatorIndex(int(i)))
             if actuator.has_controller():
                 raise CapabilityError(
-                    f"actuator {actuator.name()} has a PD controller, which SAP integrates implicitly and "
-                    "this import does not support: remove the controller, and add its torque as an input"
+                    f"actuator {actuator.name()} has a PD controller, which is not supported: replace it by a torque"
                 )
         force += plant.MakeActuationMatrix() @ plant.get_net_actuation_output_port().Eval(context)
     applied = plant.get_applied_generalized_force_input_port()
@@ -242,8 +232,7 @@ def _read_contacts(plant: Any, context: Any) -> list[_Contact]:
     results = plant.get_contact_results_output_port().Eval(context)
     if results.num_hydroelastic_contacts():
         raise CapabilityError(
-            f"the plant has {results.num_hydroelastic_contacts()} hydroelastic contacts; only point "
-            "contacts are supported: call plant.set_contact_model(ContactModel.kPoint)"
+            f"there are {results.num_hydroelastic_contacts()} hydroelastic contacts; only point contacts are supported"
         )
     inspector = port.Eval(context).inspector()
     world, contacts = plant.world_frame(), []

@@ -328,8 +328,7 @@ def from_mujoco_many(
         kinds.setdefault(mj.mj_stateSize(model, kind), kind)
     if size not in kinds:
         raise InputError(
-            f"each state has {size} numbers; one of {sorted(kinds)} is needed, the sizes of "
-            "mjSTATE_PHYSICS, mjSTATE_FULLPHYSICS and mjSTATE_INTEGRATION of the model"
+            f"each state has {size} numbers; one of {sorted(kinds)} is needed, as of mjSTATE_PHYSICS"
         )
     if velocity is not None and kinds[size] != mj.mjtState.mjSTATE_INTEGRATION:
         raise InputError(f"velocity was given with states of {size} numbers; mjSTATE_INTEGRATION is needed")

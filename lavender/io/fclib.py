@@ -159,14 +159,10 @@ def read(path: str | os.PathLike[str]) -> Stored:
         raise InputError(f"{path}: {error}") from None
     point = file.solution
     return Stored(
-        problem,
-        file.group,
-        impulse=_join_impulse(point) if "r" in point else None,
-        slack=np.append(point["u"], np.zeros(len(point.get("l", ())))) if "u" in point else None,
-        compare=file.compare,
-        guesses=guesses,
-        info=file.info,
-    )
+        problem, file.group, impulse=_join_impulse(point) if "r" in point else None,
+        slack=np.append(point["u"], np.zeros(len(point.get("l", ())))) if "u" in point else None, compare=file.compare,
+        guesses=guesses, info=file.info,
+    )  # fmt: skip
 
 
 def _read_file(r: HDF5Reader) -> Contents:
@@ -180,10 +176,7 @@ def _read_file(r: HDF5Reader) -> Contents:
         )
     group, rolling = present[0], present[0].endswith(ROLLING)
     if present[-1].endswith(ROLLING) != rolling:
-        raise InputError(
-            f"the file holds the groups {' and '.join(present)}, a problem with rolling friction and one "
-            "without; keep one of the two"
-        )
+        raise InputError(f"the file holds the groups {' and '.join(present)}; only one of the two is needed")
     spacedim = r.read_integer(f"{group}/spacedim")
     if spacedim not in ((ROLLING_ROWS,) if rolling else (2, 3)):
         needed = f"{ROLLING_ROWS}, as rolling friction has," if rolling else "2 or 3"
@@ -199,10 +192,7 @@ def _read_file(r: HDF5Reader) -> Contents:
     if local and first_shape != (m, m):
         raise InputError(f"{group}/W is {first_shape[0]} x {m}; a square matrix is needed")
     if m % spacedim:
-        raise InputError(
-            f"{group} has {m} rows, which is not a multiple of spacedim = {spacedim}; spacedim rows for "
-            "each contact are needed"
-        )
+        raise InputError(f"{group} has {m} rows; a multiple of spacedim = {spacedim} is needed")
     size = {"m": m, "n": n, "p": p, "c": m // spacedim}
     absent = [*("" if has_equations else "VRG"), *("" if p else "sb"), *([] if rolling else ["mu_r"])]
     parts = {name: shape for name, shape in PARTS[LOCAL if local else GLOBAL].items() if name not in absent}
@@ -214,14 +204,11 @@ def _read_file(r: HDF5Reader) -> Contents:
     values: dict[str, Any] = {name: r.read_matrix(f"{group}/{name}", shapes[name]) for name in matrices}
     values |= {name: r.read_vector(f"{vectors}/{name}", shapes[name][0]) for name in names}
     return Contents(
-        group,
-        spacedim,
-        values,
-        solution=_read_point(r, "solution", n, m, p) if r.has_path("solution") else {},
+        group, spacedim, values, solution=_read_point(r, "solution", n, m, p) if r.has_path("solution") else {},
         guesses=tuple(_read_point(r, guess, n, m, p) for guess in guesses),
         info={name: r.read_text(f"{group}/info/{name}") for name in ("title", "description", "math_info")},
         compare=r.read_text("reference/compare"),
-    )
+    )  # fmt: skip
 
 
 def _read_point(r: HDF5Reader, group: str, n: int, m: int, p: int) -> dict[str, FloatArray]:
@@ -241,10 +228,7 @@ def _list_guess_groups(r: HDF5Reader) -> list[str]:
         return []
     count = r.read_integer("guesses/number_of_guesses")
     if count < 0 or count > len(r.find_node("guesses")):
-        raise InputError(
-            f"guesses/number_of_guesses is {count}, but the file holds {len(r.find_node('guesses')) - 1} "
-            "guesses; the number must not be larger"
-        )
+        raise InputError(f"guesses/number_of_guesses is {count}; it has {len(r.find_node('guesses')) - 1}")
     return [f"guesses/{i + 1}" for i in range(count)]
 
 

@@ -64,7 +64,7 @@ def from_genesis(scene: Any) -> EngineStep:
     solver = getattr(getattr(scene, "sim", None), "rigid_solver", None)
     if solver is None or not getattr(scene, "is_built", False):
         raise InputError(
-            f"scene is a {type(scene).__name__}; a built genesis.Scene with rigid bodies is needed"
+            f"scene is a {type(scene).__name__}; a built genesis.Scene of rigid bodies is needed"
         )
     try:
         step = _convert_solver_arrays(scene, solver)
@@ -134,23 +134,14 @@ def _convert_solver_arrays(scene: Any, solver: Any) -> EngineStep:
                 "accelerations, which is not supported: change one of both"
             )
     result = from_efc(
-        efc_J=jac,
-        efc_D=_copy_to_host(constraints.efc_D, m).T,
-        efc_aref=_copy_to_host(constraints.aref, m).T,
-        efc_type=row_type,
-        M=np.ascontiguousarray(np.moveaxis(_copy_to_host(solver.rigid_info.mass_mat), 2, 0)),
-        qvel=velocity.astype(jac.dtype),
-        qacc_smooth=_copy_to_host(dofs.acc_smooth).T,
-        timestep=dt,
-        efc_frictionloss=np.abs(loss),
-        nefc=rows,
-        contacts=contacts,
-        efc_force=_copy_to_host(constraints.efc_force, m).T,
-        qfrc_smooth=_copy_to_host(dofs.qf_smooth).T,
-        qacc=_copy_to_host(constraints.qacc).T,
-        moved_by=moved_by,
+        efc_J=jac, efc_D=_copy_to_host(constraints.efc_D, m).T, efc_aref=_copy_to_host(constraints.aref, m).T,
+        efc_type=row_type, M=np.ascontiguousarray(np.moveaxis(_copy_to_host(solver.rigid_info.mass_mat), 2, 0)),
+        qvel=velocity.astype(jac.dtype), qacc_smooth=_copy_to_host(dofs.acc_smooth).T, timestep=dt,
+        efc_frictionloss=np.abs(loss), nefc=rows, contacts=contacts,
+        efc_force=_copy_to_host(constraints.efc_force, m).T, qfrc_smooth=_copy_to_host(dofs.qf_smooth).T,
+        qacc=_copy_to_host(constraints.qacc).T, moved_by=moved_by,
         friction="coulomb" if config.enable_signorini_contact else "cone",
-    )
+    )  # fmt: skip
     converged = ~_copy_to_host(constraints.improved).astype(bool)
     if result.impulse is None:
         raise AssertionError("from_efc returns impulses if it is given forces")

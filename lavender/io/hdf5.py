@@ -22,11 +22,8 @@ class HDF5Reader:
         """Return the group or dataset at a path, or None."""
         node = self.file.get(path)
         # HDF5 would read beyond the end of a chunk that is shorter than its checksum of 4 bytes.
-        if (
-            isinstance(node, self.h5py.Dataset)
-            and node.fletcher32
-            and node.id.chunk_iter(lambda chunk: True if chunk.size < 4 else None)
-        ):
+        has_checksum = isinstance(node, self.h5py.Dataset) and node.fletcher32
+        if has_checksum and node.id.chunk_iter(lambda chunk: True if chunk.size < 4 else None):
             raise InputError(f"{path} has an incomplete chunk; the file is damaged: write or copy it again")
         return node
 
@@ -38,9 +35,8 @@ class HDF5Reader:
         """Return a dataset of `count` numbers (None: any number) without reading it."""
         data = self.find_node(path)
         if not isinstance(data, self.h5py.Dataset):
-            raise InputError(
-                f"{path} {'is a group' if data is not None else 'is missing'}; a dataset is needed"
-            )
+            found = "is a group" if data is not None else "is missing"
+            raise InputError(f"{path} {found}; a dataset is needed")
         if data.dtype.kind not in kinds or data.shape is None:
             wanted = "whole numbers" if kinds == "iu" else "numbers"
             raise InputError(f"{path} has type {data.dtype}; {wanted} are needed")
@@ -116,16 +112,10 @@ def _build_from_triplets(
 ) -> sp.csr_array:
     """Return the matrix (m, n) of nz triplets: columns p, rows i, values x."""
     if min(len(p), len(i), len(x)) < nz:
-        raise InputError(
-            f"nz announces {nz} triplets, but p has {len(p)} entries, i {len(i)} and x {len(x)}; at least "
-            f"{nz} are needed in each"
-        )
+        raise InputError(f"nz announces {nz} triplets; p, i and x have {len(p)}, {len(i)} and {len(x)}")
     p, i, x = p[:nz], i[:nz], x[:nz]
     if nz and (p.min() < 0 or i.min() < 0 or p.max() >= n or i.max() >= m):
-        raise InputError(
-            f"the triplets have row indices (i) or column indices (p) outside of the matrix; {m} rows and "
-            f"{n} columns are declared"
-        )
+        raise InputError(f"row indices i or column indices p are outside of the matrix ({m}, {n})")
     return sp.csr_array(sp.coo_array((x, (i.astype(np.int64), p.astype(np.int64))), shape=(m, n)))
 
 
@@ -148,7 +138,5 @@ def import_h5py() -> Any:
     try:
         import h5py
     except ImportError:
-        raise InputError(
-            "FCLIB files are HDF5, which need h5py: pip install 'lavender-contact[fclib]' (or use .npz)"
-        ) from None
+        raise InputError("FCLIB files need h5py: pip install 'lavender-contact[fclib]'") from None
     return h5py

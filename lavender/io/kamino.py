@@ -126,10 +126,7 @@ def _check_configuration(engine: Any) -> None:
             f"{' or '.join(map(repr, DYNAMICS_SOLVERS))} of SolverKamino.Config is supported"
         )
     if config.sparse_dynamics:
-        raise CapabilityError(
-            "sparse_dynamics=True never forms the matrix that proves which arrays the importer reads; "
-            "sparse_dynamics=False of SolverKamino.Config is supported"
-        )
+        raise CapabilityError("sparse_dynamics=True of SolverKamino.Config is not supported")
     if engine.problem_fd is None or (
         not config.sparse_jacobian and engine._jacobians.data.J_cts_data is None
     ):
@@ -250,12 +247,9 @@ class _Worlds:
         first = np.flatnonzero(begins)
         cones = Cones(
             ptr=np.append(first, len(begins)).astype(np.int32),
-            kind=np.where(self.begins_contact[first], CONTACT, ROW).astype(np.int32),
-            lower=lower,
-            upper=upper,
-            mu=mu[first],
-            patch_radius=np.zeros(len(first)),
-        )
+            kind=np.where(self.begins_contact[first], CONTACT, ROW).astype(np.int32), lower=lower, upper=upper,
+            mu=mu[first], patch_radius=np.zeros(len(first)),
+        )  # fmt: skip
         ragged = {"velocity_ptr": self.velocity_ptr} if jac.ndim == 1 else {}
         batch = Batch(
             jac, mass, free if jac.ndim == 1 else free.reshape(self.n, -1), target=target, cones=cones,

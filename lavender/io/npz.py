@@ -221,13 +221,9 @@ def _read_meta(archive: Arrays) -> dict[str, Any]:
         ) from None
     needed = ("operator", "friction", "name", "names")
     if missing := [name for name in needed if not isinstance(meta, dict) or name not in meta]:
-        raise InputError(
-            f"entry 'meta' has no {', '.join(missing)}; a JSON object with {', '.join(needed)} is needed"
-        )
+        raise InputError(f"entry 'meta' has no {', '.join(missing)}; a JSON object with them is needed")
     if meta["operator"] not in FORMS:
-        raise InputError(
-            f"entry 'meta' has the operator {meta['operator']!r}; one of {', '.join(FORMS)} is needed"
-        )
+        raise InputError(f"entry 'meta' has operator {meta['operator']!r}; {', '.join(FORMS)} are known")
     return meta
 
 
@@ -330,6 +326,6 @@ def build_checked_csr(
         matrix.check_format(full_check=True)
     except ValueError as error:
         raise InputError(
-            f"pointers, indices and values of a compressed matrix ({m}, {n}) do not fit: {error}"
+            f"pointers, indices, values of a compressed ({m}, {n}) do not fit: {error}"
         ) from None
     return matrix

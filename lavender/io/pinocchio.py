@@ -126,17 +126,9 @@ def from_pinocchio(
             )
         target = rows @ v - dt * _differentiate_constraint_velocity(pin, model, constraint_models, q, v)
     return Problem.from_jacobian(
-        rows,
-        mass,
-        v + dt * a,
-        target=target,
-        cones=cones,
-        compliance=compliance,
-        friction=friction,
-        names=names,
-        angular=angular,
-        name=name,
-    )
+        rows, mass, v + dt * a, target=target, cones=cones, compliance=compliance, friction=friction, names=names,
+        angular=angular, name=name,
+    )  # fmt: skip
 
 
 def _differentiate_constraint_velocity(pin: Any, model: Any, constraints: Any, q: Any, v: Any) -> Any:
@@ -252,8 +244,7 @@ def _check_model(pin: Any, model: Any, data: Any) -> None:
         )
     if len(model.mimicking_joints):
         raise CapabilityError(
-            f"the model has {len(model.mimicking_joints)} mimicking joints, which Pinocchio's aba does not "
-            "support: build the model without them"
+            f"the model has {len(model.mimicking_joints)} mimicking joints; 0 are supported"
         )
     n, nv, nq = int(model.njoints), int(model.nv), int(model.nq)
     lists = ("joints", "parents", "idx_vs", "nvs", "idx_qs", "nqs", "inertias", "jointPlacements")
@@ -277,10 +268,7 @@ def _check_model(pin: Any, model: Any, data: Any) -> None:
                 f"parent and ({at_v}, {joint.nv}, {at_q}, {joint.nq}) are needed. {OTHER_MODEL_ADVICE}"
             )
         if not _is_rotation(model.jointPlacements[i].rotation):
-            raise InputError(
-                f"the placement of joint {i} has a matrix that is not a rotation; an orthogonal matrix with "
-                "determinant 1 is needed"
-            )
+            raise InputError(f"the placement of joint {i} has a matrix that is not a rotation")
         at_v, at_q = at_v + joint.nv, at_q + joint.nq
     sizes = {len(data.oMi), len(data.v), len(data.f)}
     if (at_v, at_q) != (nv, nq) or sizes != {n} or np.shape(data.M) != (nv, nv):
@@ -301,16 +289,10 @@ def _check_constraint(i: int, model: Any, constraint: Any, data: Any) -> None:
     if not hasattr(constraint, "createData") or not hasattr(constraint, "calc"):
         raise InputError(f"constraint model {i} is a {kind}; a constraint model of Pinocchio is needed")
     if type(data).__name__ != kind.replace("Model", "Data"):
-        raise InputError(
-            f"constraint data {i} are a {type(data).__name__}; the data of a {kind} are needed: create them "
-            "with its createData()"
-        )
+        raise InputError(f"constraint data {i} are a {type(data).__name__}; the data of a {kind} are needed")
     for name in ("joint1_placement", "joint2_placement"):
         if hasattr(constraint, name) and not _is_rotation(getattr(constraint, name).rotation):
-            raise InputError(
-                f"constraint {i}, a {kind}: {name} has a matrix that is not a rotation; an orthogonal "
-                "matrix with determinant 1 is needed"
-            )
+            raise InputError(f"constraint {i}, a {kind}: {name} has a matrix that is not a rotation")
     if kind == "FrameAnchorConstraintModel" and np.any(constraint.desired_constraint_offset):
         raise CapabilityError(
             f"constraint {i}, a {kind}, has a desired offset, which Pinocchio does not read: put it into a placement"

@@ -225,9 +225,8 @@ class Recorder:
         states = self._split_states(state, len(verdicts), isinstance(problems, Problem))
         changed = False
         for verdict in verdicts:
-            changed |= self._record_selected_world(
-                verdict, problems, impulse, claims, states, reasons.get(verdict.world, ""), facts
-            )
+            reason = reasons.get(verdict.world, "")
+            changed |= self._record_selected_world(verdict, problems, impulse, claims, states, reason, facts)
         if changed or self._removed:
             self.write_lines()
         self.n_steps += 1
@@ -269,9 +268,8 @@ class Recorder:
         elif isinstance(problems, Batch):
             many = residual_many(problems, impulse, threshold=self.threshold, errors="status")
             rows = problems.row_counts.tolist()
-            numbers = list(
-                zip(many.velocity_error.tolist(), many.relative.tolist(), many.verdict.tolist(), strict=True)
-            )
+            columns = (many.velocity_error, many.relative, many.verdict)
+            numbers = list(zip(*(x.tolist() for x in columns), strict=True))
             reasons = {i: str(error) for i, error in many.faults.items()}
         else:
             raise InputError(
@@ -299,19 +297,13 @@ class Recorder:
         """Return a function that returns the state of a world, or None without states."""
         if state is None:
             return None
-        if not isinstance(state, Mapping) or not all(
-            isinstance(name, str) and name and not set(name) & {"/", "\\", "\0"} for name in state
-        ):
-            raise InputError(
-                f"state is {state!r:.60}; a dict of arrays with names without / and \\ is needed"
-            )
+        names = state if isinstance(state, Mapping) else [""]
+        if not all(isinstance(name, str) and name and not set(name) & {"/", "\\", "\0"} for name in names):
+            raise InputError(f"state is {state!r:.60}; a dict of arrays, names without / and \\, is needed")
         arrays = {name: np.asarray(to_numpy(f"state {name!r}", x)) for name, x in state.items()}
         for name, x in arrays.items():
             if x.dtype.hasobject:
-                raise InputError(
-                    f"state {name!r} holds objects ({x.dtype}), which no reader could load: an array of numbers or "
-                    "texts is needed; fill up lists of different lengths"
-                )
+                raise InputError(f"state {name!r} holds objects ({x.dtype}); numbers or texts are needed")
         if is_single:
             return lambda i: arrays
         for name, x in arrays.items():
@@ -391,7 +383,5 @@ def read_recorded_state(folder: str | os.PathLike[str], file: str) -> dict[str, 
     """
     path = Path(folder) / STATES_FOLDER / file
     if not path.is_file():
-        raise InputError(
-            f"{path} does not exist, because {file} was recorded without state=; record the steps again with state="
-        )
+        raise InputError(f"{path} does not exist; a problem recorded with state= is needed")
     return read_arrays(path)

@@ -66,16 +66,13 @@ class Recording:
         if self.left_out:
             text.append(f"{len(self.left_out)} left out: {self.left_out[0]}")
         if above:
-            threshold = f"{above[0]['threshold']:g}".replace("e-0", "e-")
-            text.append(
-                f"MuJoCo's own answers: {len(above)} above their floor, {len(far)} more than {threshold} m/s off"
-            )
+            count = f"{len(far)} more than {above[0]['threshold']:g}".replace("e-0", "e-")
+            text.append(f"MuJoCo's own answers: {len(above)} above their floor, {count} m/s off")
         if far:
             worst = max(far, key=lambda line: float(line["velocity"]))
             verdict = "it " + (UNCONVERGED if worst["verdict"] == UNCONVERGED else f"is {WRONG}")
-            text.append(
-                f"worst: {worst['velocity']:.2g} m/s off at {worst['worst']}, step {worst['step']}: {verdict}"
-            )
+            place = f"{worst['velocity']:.2g} m/s off at {worst['worst']}, step {worst['step']}"
+            text.append(f"worst: {place}: {verdict}")
         return "\n".join(text)
 
 

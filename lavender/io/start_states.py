@@ -55,10 +55,7 @@ def load_model(source: Any) -> tuple[Any, Any]:
         )
     path = str(as_path(source))
     if Path(path).suffix.lower() in SUFFIXES:
-        raise InputError(
-            f"{path} has the suffix of a problem file; a model of MuJoCo (MJCF) is needed: `lavender check` and "
-            "`lavender report` read problems"
-        )
+        raise InputError(f"{path} has the suffix of a problem file; a model of MuJoCo (MJCF) is needed")
     is_binary = Path(path).suffix.lower() == ".mjb"
     try:
         read = mj.MjModel.from_binary_path if is_binary else mj.MjModel.from_xml_path
@@ -118,9 +115,7 @@ def make_controller(model: Any, control: Control, seed: int) -> Callable[[Any, i
         return called
     if isinstance(control, str):
         if control not in CONTROLS:
-            raise InputError(
-                f"control is {control!r}; {', '.join(CONTROLS)}, an array or a function is needed"
-            )
+            raise InputError(f"control is {control!r}; {', '.join(CONTROLS)}, an array or function is needed")
         if control == "zero":
             return lambda data, step: np.zeros(n)
         if control == "hold":
@@ -222,14 +217,13 @@ def _describe_other_version(mj: Any, arrays: Mapping[str, Any]) -> str:
 
 def _describe_misfit(mj: Any, model: Any, arrays: Mapping[str, Any]) -> str:
     """Return a sentence on states that belong to another model; else empty."""
-    advice = (
-        "If the model was changed after loading, as environments and domain randomisation do, the errors are those of "
-        "another problem: give the changed model as a mujoco.MjModel or as .mjb (mujoco.mj_saveModel)."
-    )
     if other := _describe_other_version(mj, arrays):
         return other
     if "model" in arrays and {*np.atleast_1d(arrays["model"]).tolist()} != {hash_model(model)}:
-        return f"The start states are of a model with other bodies, geoms, joints or equalities. {advice}"
+        return (
+            "The start states are of a model with other bodies, geoms, joints or equalities: if it was changed after "
+            "loading, give the changed model as a mujoco.MjModel or as .mjb (mujoco.mj_saveModel)."
+        )
     return ""
 
 
@@ -238,19 +232,13 @@ def check_array_names(source: str, names: Iterable[str], valid: Iterable[str]) -
     valid = tuple(valid)
     for name in names:
         if name not in (*valid, *LABELS):
-            raise InputError(
-                f"{source} has an array {name!r}, which is not part of a state; the arrays of a state are "
-                f"{', '.join(valid)}: remove or rename it"
-            )
+            raise InputError(f"{source} has an array {name!r}; the arrays of a state are {', '.join(valid)}")
 
 
 def _read_keyframes(mj: Any, model: Any) -> StartStates:
     """Return the model's keyframes; raise InputError if it has none."""
     if not model.nkey:
-        raise InputError(
-            "states are 'keyframes', but the model has no keyframes; give an .npz file of states, or add "
-            "keyframes to the model"
-        )
+        raise InputError("states are 'keyframes', and the model has none; a keyframe is needed")
     data, vectors = mj.MjData(model), []
     for key in range(model.nkey):
         mj.mj_resetDataKeyframe(model, data, key)
@@ -280,10 +268,7 @@ def _read_arrays(mj: Any, model: Any, arrays: Mapping[str, Any], source: str) ->
     n = counts["qpos"]
     if n == 0 or set(counts.values()) != {n}:
         sizes = ", ".join(f"{count} of {name}" for name, count in counts.items())
-        raise InputError(
-            f"{source} holds states of different numbers: {sizes}; all arrays must have the same number of "
-            "entries, at least one"
-        )
+        raise InputError(f"{source} holds different numbers of states: {sizes}; one number above 0 is needed")
     vectors = []
     for i in range(n):
         data = mj.MjData(model)

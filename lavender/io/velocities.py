@@ -64,10 +64,7 @@ def reconstruct(problem: Problem, velocity: ArrayLike) -> Reconstruction:
     check_problem(problem)
     form = problem.rows if problem.generalized is None else problem.generalized
     if form is None:
-        raise CapabilityError(
-            "this problem was given as a matrix; velocities need J and M: make it with Problem.from_rows, "
-            "RowBuilder or Problem.from_jacobian"
-        )
+        raise CapabilityError("this problem was given as a matrix; J and M are needed for velocities")
     shape = form.v_free.shape
     if problem.generalized is None and get_shape("velocity", velocity) == (shape[0], 3):
         planar = as_array("velocity", velocity, (shape[0], 3), unit="m/s, rad/s")

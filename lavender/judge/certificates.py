@@ -46,12 +46,8 @@ from lavender.problem import Problem
 from lavender_ext.factor.linear import LinearSystem
 
 __all__ = [
-    "Proof",
-    "check_certificate",
-    "format_lower_bound",
-    "list_conflicting_blocks",
-    "prove_infeasibility",
-]
+    "Proof", "check_certificate", "format_lower_bound", "list_conflicting_blocks", "prove_infeasibility",
+]  # fmt: skip
 
 UNIT_ROUNDOFF = 2.0**-53
 VELTKAMP_FACTOR = 2.0**27 + 1.0  # Splits a float64 into two halves of 26 bits.

@@ -103,10 +103,8 @@ class Builders(Operators):
         """
         b = as_array("b", b, (None,), unit="m/s")
         check_rhs_length(A, b)
-        bounds = [
-            as_array(n, x, (len(b),), finite=False, unit="N s")
-            for n, x in (("lower", lower), ("upper", upper))
-        ]
+        named = (("lower", lower), ("upper", upper))
+        bounds = [as_array(n, x, (len(b),), finite=False, unit="N s") for n, x in named]
         check_options("lcp", more)
         return cls(b, Cones.bounded(*bounds), A, **more)
 
@@ -226,10 +224,7 @@ class Builders(Operators):
         """
         lower, upper, findex = convert_to_findex(self.cones)
         if self.law == "cone":
-            raise InputError(
-                "findex describes Coulomb friction, and this problem has the law 'cone': give "
-                "problem.relaxed('coulomb')"
-            )
+            raise InputError("findex needs Coulomb's law: give problem.relaxed('coulomb')")
         return self.delassus(), self.b, lower, upper, findex
 
     @classmethod
@@ -495,17 +490,13 @@ class Builders(Operators):
         general = self.generalized
         if general is None and not (J is None and M is None and v_free is None and target is None):
             raise InputError(
-                "J, M, v_free and target can be changed only in a problem in generalised coordinates, and "
-                f"this problem is given by {self.operator}: give b"
+                f"J, M, v_free and target need generalised coordinates; the problem is given by {self.operator}"
             )
         if b is not None and target is not None:
-            raise InputError(
-                "b and target are both given, and each of them determines the right-hand side: give one of the two"
-            )
+            raise InputError("b and target are both given; one of them determines the right-hand side")
         if b is None and target is None and (J is not None or v_free is not None):
             raise InputError(
-                "J or v_free is given without target and without b; the right-hand side target - J v_free "
-                "depends on them: give target or b, too"
+                "J or v_free is given without target and b; one of them is needed, since b = target - J v_free"
             )
         if general is not None and not (J is None and M is None and v_free is None):
             if M is None:

@@ -52,18 +52,9 @@ from lavender_ext.core import blocks as kernels
 from lavender_ext.core.checks import FAULT_NAMES, are_pointers_valid, make_instance
 
 __all__ = [
-    "CONTACT",
-    "CONTACT_BOX",
-    "CONTACT_ELLIPSE",
-    "CONTACT_ROLLING",
-    "CONTACT_SPIN",
-    "ROUND",
-    "ROW",
-    "SHAPES",
-    "Cones",
-    "get_block_kinds",
-    "project_impulse",
-]
+    "CONTACT", "CONTACT_BOX", "CONTACT_ELLIPSE", "CONTACT_ROLLING", "CONTACT_SPIN", "ROUND", "ROW", "SHAPES", "Cones",
+    "get_block_kinds", "project_impulse",
+]  # fmt: skip
 
 ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING, CONTACT_ELLIPSE = kernels.KINDS
 
@@ -165,10 +156,7 @@ class Cones:
         """Concatenate the blocks of several cones."""
         blocks = kernels.concatenate_blocks([each._blocks for each in cones])
         if blocks is None:
-            raise InputError(
-                "the blocks together have more than 2^31 - 1 rows, which 32-bit indices cannot number: "
-                "split the problem"
-            )
+            raise InputError("the blocks together have more than 2^31 - 1 rows; 32-bit indices are needed")
         return cls._from_blocks(blocks)
 
     def __repr__(self) -> str:
@@ -195,9 +183,7 @@ class Cones:
         low = as_array("lower", lower, (None,), finite=False, unit="N s")
         m = len(low)
         high = as_array("upper", upper, (m,), finite=False, unit="N s")
-        return cls(
-            np.arange(m + 1, dtype=np.int32), np.zeros(m, np.int32), low, high, np.zeros(m), np.zeros(m)
-        )
+        return cls(np.arange(m + 1), np.zeros(m), low, high, np.zeros(m), np.zeros(m))
 
     @classmethod
     def free(cls, m: int) -> Cones:
@@ -322,13 +308,10 @@ class Cones:
     @property
     def ellipses_replaced_by_disks(self) -> Cones:
         """These blocks, with each ellipse replaced by a disk of its larger coefficient."""
-        ellipse = self.kind == CONTACT_ELLIPSE
-        return replace(
-            self,
-            kind=np.where(ellipse, CONTACT, self.kind).astype(np.int32),
-            mu=np.where(ellipse, self.coefficients.max(axis=1), self.mu),
-            patch_radius=np.where(ellipse, 0.0, self.patch_radius),
-        )
+        ellipse = self.is_ellipse
+        kind, radius = np.where(ellipse, CONTACT, self.kind), np.where(ellipse, 0.0, self.patch_radius)
+        mu = np.where(ellipse, self.coefficients.max(axis=1), self.mu)
+        return replace(self, kind=kind, mu=mu, patch_radius=radius)
 
     @property
     def is_polyhedral(self) -> bool:
@@ -374,10 +357,7 @@ class Cones:
         if check_shape("shape", shape) == "box":
             bad = np.flatnonzero(has_pair & ~np.isin(self.kind, (CONTACT, CONTACT_BOX, CONTACT_ELLIPSE)))
             if len(bad):
-                raise InputError(
-                    f"block {bad[0]} has more rows than a normal and two tangents, and a box cannot bound "
-                    "spin or rolling rows: leave these rows out, or keep the shape of the contact"
-                )
+                raise InputError(f"block {bad[0]} has spin, rolling or over two tangents, which no box has")
             kind[has_pair], radius[has_pair & (self.kind == CONTACT)] = CONTACT_BOX, 1.0
         else:
             box = np.flatnonzero(self.kind == CONTACT_BOX)
@@ -404,8 +384,7 @@ class Cones:
         mask = np.zeros(self.n_rows, bool)
         rolling = self.rolling_rows[self.rolling_rows >= 0]
         mask[np.concatenate([self.spin_rows[self.spin_rows >= 0], rolling, rolling + 1])] = True
-        mask.setflags(write=False)
-        return mask
+        return mark_read_only(mask)
 
     @property
     def normal_rows(self) -> IntArray:
@@ -435,9 +414,8 @@ class Cones:
     @cached_property
     def separate_rows(self) -> IntArray:
         """Row of each block (k,) with the bound mu patch_radius lambda_n: spin, second tangent of a box; -1 if none."""
-        return mark_read_only(
-            np.where(self.kind == CONTACT_BOX, self.ptr[1:] - 1, self.spin_rows).astype(np.int32)
-        )
+        rows = np.where(self.kind == CONTACT_BOX, self.ptr[1:] - 1, self.spin_rows)
+        return mark_read_only(rows.astype(np.int32))
 
     @cached_property
     def rolling_rows(self) -> IntArray:
@@ -475,22 +453,15 @@ class Cones:
             indices = resolve_index(blocks, self.n_blocks, "block")
         except IndexError as error:
             raise InputError(f"blocks: {error}") from None
-        return self._select_blocks(np.array(indices if isinstance(indices, list) else [indices], np.int32))
+        return self._select_blocks(np.atleast_1d(np.array(indices, np.int32)))
 
     def _select_blocks(self, blocks: IntArray) -> Cones:
         """Return the blocks with these indices, which are not checked."""
         size = np.diff(self.ptr)[blocks]
         ptr = np.concatenate([[0], np.cumsum(size)]).astype(np.int32)
         rows = np.arange(ptr[-1]) + np.repeat(self.ptr[:-1][blocks] - ptr[:-1], size)
-        return Cones(
-            ptr=ptr,
-            kind=self.kind[blocks],
-            lower=self.lower[rows],
-            upper=self.upper[rows],
-            mu=self.mu[blocks],
-            patch_radius=self.patch_radius[blocks],
-            rolling=self.rolling[blocks],
-        )
+        kind, mu, radius, rolling = (x[blocks] for x in (self.kind, self.mu, self.patch_radius, self.rolling))
+        return Cones(ptr, kind, self.lower[rows], self.upper[rows], mu, radius, rolling)
 
     def __add__(self, other: object) -> Cones:
         """Append the blocks of `other`."""
@@ -520,10 +491,7 @@ def _convert_fields(
     """Convert the fields to arrays of the required types and shapes; raise InputError for invalid ones."""
     ptr = as_array("cones.ptr", ptr, (None,), dtype=np.int32)
     if not are_pointers_valid(ptr, 1):
-        raise InputError(
-            f"cones.ptr is {ptr.tolist()!s:.60}; it must start with 0 and increase: the first row of "
-            "each block, then the number of rows"
-        )
+        raise InputError(f"cones.ptr is {ptr.tolist()!s:.60}; it must start with 0 and increase")
     k, m = len(ptr) - 1, int(ptr[-1])
     kind = as_array("cones.kind", kind, (k,), dtype=np.int32)
     if k and not np.isin(kind, kernels.KINDS).all():
@@ -572,23 +540,18 @@ def _raise_fault(fault: str, index: int, fields: tuple[np.ndarray, ...]) -> NoRe
         raise InputError(f"block {index} is {name} of {ptr[index + 1] - ptr[index]} rows; {requirement}")
     if fault == "bounds":
         raise InputError(
-            f"row {index}: lower = {lower[index]}, upper = {upper[index]}; a finite number must lie "
-            "between them (lower <= upper)"
+            f"row {index}: lower = {lower[index]}, upper = {upper[index]}; a finite number between is needed"
         )
     if fault == "ratio":
-        raise InputError(
-            f"block {index} is an ellipse with mu_2 / mu_1 = {radius[index]:g} (stored in patch_radius); "
-            "1e-18 to 1e18 is needed"
-        )
+        raise InputError(f"block {index} has mu_2 / mu_1 = {radius[index]:g}; 1e-18 to 1e18 is needed")
     if fault in ("lower", "upper"):
         bound = lower if fault == "lower" else upper
-        check_finite_and_in_range(
-            fault, np.where(np.isinf(bound) | np.repeat(kind != ROW, np.diff(ptr)), 0.0, bound), "N s"
-        )
-    check_nonnegative_magnitudes("mu", mu, "-")
-    check_nonnegative_magnitudes("patch_radius", radius, "m")
-    check_nonnegative_magnitudes(
-        "mu patch_radius (of boxes and ellipses mu_2)", np.where(kind == ROW, 0.0, mu * radius), "m"
-    )
-    check_nonnegative_magnitudes("rolling", rolling, "m")
+        is_unread = np.isinf(bound) | np.repeat(kind != ROW, np.diff(ptr))
+        check_finite_and_in_range(fault, np.where(is_unread, 0.0, bound), "N s")
+    product = np.where(kind == ROW, 0.0, mu * radius)
+    for name, x, unit in (
+        ("mu", mu, "-"), ("patch_radius", radius, "m"), ("mu patch_radius (of boxes and ellipses mu_2)", product, "m"),
+        ("rolling", rolling, "m"),
+    ):  # fmt: skip
+        check_nonnegative_magnitudes(name, x, unit)
     raise InputError(f"block {index} is invalid: {fault}")

@@ -22,10 +22,8 @@ from lavender.problem.rows import Rows
 
 def make_joints(rows: Rows, lower: ArrayLike, upper: ArrayLike) -> Cones:
     """Build the joints' blocks with bounds of their rows (mj,) [N s]."""
-    low, high = (
-        as_array(name, x, (len(rows.jac),), finite=False, unit="N s")
-        for name, x in (("lower", lower), ("upper", upper))
-    )
+    named = (("lower", lower), ("upper", upper))
+    low, high = (as_array(name, x, (len(rows.jac),), finite=False, unit="N s") for name, x in named)
     zeros = np.zeros(rows.n_joints)
     return Cones(rows.joint_ptr, zeros.astype(np.int32), low, high, mu=zeros, patch_radius=zeros)
 
@@ -47,10 +45,7 @@ def make_contacts_of_rows(
         mu = np.full(m // rows if m % rows == 0 else 1, mu)
     mu = as_array("mu", mu, (None,))
     if (len(mu) == 0) != (m == 0) or (len(mu) and m % len(mu)):
-        raise InputError(
-            f"{name} has {m} rows, which is not a multiple of the {len(mu)} values of mu; every contact "
-            "needs the same number of rows"
-        )
+        raise InputError(f"{name} has {m} rows; a multiple of the {len(mu)} values of mu is needed")
     count = m // len(mu) - 1 - angular_rows if len(mu) else 2 * (rolling is not None)
     if not 0 <= count <= 2 or (own is not None and len(mu) and count != own):
         asked = "up to two tangent rows" if own is None else f"{own} tangent rows"
@@ -67,8 +62,7 @@ def make_contacts_of_rows(
         patch_radius = as_array("patch_radius", patch_radius, (len(mu),), unit="m")
     elif count == 0 and np.any(mu > 0.0):
         raise InputError(
-            f"mu has {len(mu)} values for {m} rows, so each contact has a normal row only and no row for "
-            "friction: give one mu for each contact, not for each row, or mu = 0"
+            f"mu has {len(mu)} values for {m} rows; mu > 0 needs rows for friction: give one mu for each contact"
         )
     return Cones.contacts(mu, count, patch_radius, rolling=rolling)
 

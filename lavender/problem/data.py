@@ -114,11 +114,9 @@ class ProblemData:
         m, k = cones.n_rows, cones.n_blocks
         rhs = as_array("b", b, (m,), unit="m/s", copy=copy)
         check_rhs(rhs)
-        if (matrix is None) + (rows is None) + (generalized is None) != 2:
-            raise InputError(
-                f"{sum(x is not None for x in (matrix, rows, generalized))} of matrix=, rows= and generalized= are "
-                "given; exactly one is needed"
-            )
+        missing = (matrix is None) + (rows is None) + (generalized is None)
+        if missing != 2:
+            raise InputError(f"{3 - missing} of matrix=, rows= and generalized= are given; one is needed")
         if not isinstance(friction, str) or friction not in FRICTION_LAWS:
             hint = " (a separate bound for each tangent is a shape of the contacts: shape='box')"
             is_shape = isinstance(friction, str) and friction in ("box", "pyramid", "pyramidal")
@@ -131,9 +129,7 @@ class ProblemData:
         if type(precision) is not str or precision != "float64":
             precision = check_choice("precision", precision, PRECISIONS)
         if friction != "cone" and cones.has_round:
-            raise InputError(
-                "Coulomb's law is not supported for a round cone of more than two tangents: give friction='cone'"
-            )
+            raise InputError("a round cone of more than two tangents needs friction='cone'")
         # `copy` applies to this call only: problems derived from this one copy by default.
         fields = self.__dict__
         fields.update({
@@ -147,10 +143,7 @@ class ProblemData:
             fields["compliance"] = as_array("compliance", soft, (m,), unit="1/kg", copy=copy)
             check_nonnegative_magnitudes("compliance", fields["compliance"], "1/kg")
         elif compliance is not None:
-            raise InputError(
-                "compliance is given for a problem with a matrix A; A already contains compliance on its diagonal: add "
-                "it there, or give rows= or generalized="
-            )
+            raise InputError("compliance is given with a matrix A: add it to the diagonal")
         if rows is not None:
             self._check_rows(rows, k)
         elif generalized is not None:
@@ -170,7 +163,11 @@ class ProblemData:
         if key is not None:
             fields["key"] = _convert_keys(key, k)
         if angular is not None:
-            fields["angular"] = _convert_flags(angular, m)
+            flags = as_array("angular", angular, (m,))
+            others = flags[(flags != 0.0) & (flags != 1.0)]
+            if len(others):
+                raise InputError(f"angular holds {others[0]:g}; True or False is needed")
+            fields["angular"] = mark_read_only(flags.astype(bool))
         if names is not None and not (isinstance(names, Names) and len(names) == k):
             fields["names"] = as_names("blocks", names, k)
         self._check_magnitudes()
@@ -208,13 +205,9 @@ class ProblemData:
     def _set_view(self) -> None:
         """Set the view for kernels of a problem in generalised coordinates."""
         assert self.generalized is not None
-        self.derived.view = make_generalized_data(
-            self.cones._blocks,
-            self.b,
-            self.generalized.operator,
-            self.compliance,
-            FRICTION_NUMBER[self.friction],
-        )
+        law = FRICTION_NUMBER[self.friction]
+        data = self.cones._blocks, self.b, self.generalized.operator, self.compliance, law
+        self.derived.view = make_generalized_data(*data)
 
     # -- size and kind --------------------------------------------------------------------------
 
@@ -345,8 +338,7 @@ class ProblemData:
         if self.rows is not None:
             linear = self.rows.jac.reshape(-1, 4, 3)[:, ::2]
             mask[: len(linear)] |= ~linear.any(axis=(1, 2)) & self.rows.jac.any(axis=1)
-        mask.setflags(write=False)
-        return mask
+        return mark_read_only(mask)
 
     def row_unit(self, row: int) -> str:
         """Return the unit of a row's velocity error: "m/s", or "rad/s" on an angular row with nu = d.
@@ -382,11 +374,8 @@ class ProblemData:
         # Copies and pickles hold the fields, and the motion of an engine that `residual` judges: derived values are
         # computed again, and arrays stay read-only.
         state = {k: v for k, v in self.__dict__.items() if k == "engine_motion"}
-        return (
-            type(self),
-            tuple(f.name != "copy" and getattr(self, f.name) for f in fields(self) if f.init),
-            state,
-        )
+        values = tuple(f.name != "copy" and getattr(self, f.name) for f in fields(self) if f.init)
+        return type(self), values, state
 
     def __repr__(self) -> str:
         kind = self.operator if self.matrix is None else "CSR" if issparse(self.matrix) else "dense"
@@ -426,26 +415,13 @@ def _convert_keys(key: Any, k: int) -> np.ndarray:
     return mark_read_only(array.astype(np.uint64))
 
 
-def _convert_flags(angular: ArrayLike, m: int) -> npt.NDArray[np.bool_]:
-    """Convert the flags of angular rows to bool, read-only; raise InputError for other numbers than 0 and 1."""
-    values = as_array("angular", angular, (m,))
-    if not np.isin(values, (0.0, 1.0)).all():
-        raise InputError(
-            f"angular holds {values[~np.isin(values, (0.0, 1.0))][0]:g}; True or False is needed"
-        )
-    mask = values.astype(bool)
-    mask.setflags(write=False)
-    return mask
-
-
 def check_rhs(b: FloatArray) -> None:
     """Raise InputError unless b [m/s] is finite and in range, and max |b_i| is 0 or at least MIN_MAGNITUDE."""
     if not is_rhs_valid(b):
         check_finite_and_in_range("b [m/s]", b, "m/s")
         max_abs = np.abs(b).max()
         raise InputError(
-            f"the largest entry of b [m/s] is {max_abs:g}, at [{int(np.argmax(np.abs(b)))}]; it must be 0 "
-            f"or at least {MIN_MAGNITUDE:g}: another unit of length or time brings it nearer to 1"
+            f"the largest entry of b [m/s] is {max_abs:g}; 0 or at least {MIN_MAGNITUDE:g} is needed: change a unit"
         )
 
 

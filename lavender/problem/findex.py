@@ -28,8 +28,7 @@ def order_findex_rows(findex: Any, count: int | None = None) -> IntArray:
             raise InputError(f"findex[{i}] is {i}, its own row; the row of its normal is needed, or -1")
         if findex[j] >= 0:
             raise InputError(
-                f"findex[{i}] is {j}, but row {j} is not a normal, because its own findex is {findex[j]}; "
-                "the row of a normal (findex -1) is needed"
+                f"findex[{i}] is {j}, a row with findex {findex[j]}; the row of a normal (findex -1) is needed"
             )
     normal = np.where(findex >= 0, findex, np.arange(m))
     # Sort by the normal row, then the normal before its friction rows, then by the original order.
@@ -65,10 +64,7 @@ def convert_from_findex(lower: Any, upper: Any, findex: Any, m: int) -> tuple[In
     count = np.bincount(findex[is_friction], minlength=m) if m else np.zeros(0, int)
     bad = np.flatnonzero(count > 2)
     if len(bad):
-        raise InputError(
-            f"{count[bad[0]]} rows have findex {bad[0]}; a normal has at most two, its tangents: "
-            "give the others constant bounds (findex -1), or spin by patch_radius of Cones.contacts"
-        )
+        raise InputError(f"{count[bad[0]]} rows have findex {bad[0]}; at most two are possible")
     first = order[~is_friction[order]]  # First row of each block, as an index into the arrays.
     size = 1 + count[first]
     ptr = np.concatenate([[0], np.cumsum(size)]).astype(np.int32)
@@ -92,10 +88,7 @@ def convert_to_findex(cones: Cones) -> tuple[FloatArray, FloatArray, IntArray]:
     """Return lower, upper and findex (m,) of blocks; raise InputError for disks."""
     disks = np.flatnonzero(cones.n_together > 1)
     if len(disks):
-        raise InputError(
-            f"block {disks[0]} is a disk, which bounds the norm of its tangents, and findex bounds each "
-            "tangent separately: change the friction law by cones.shaped('box') first"
-        )
+        raise InputError(f"block {disks[0]} is a disk; a box is needed: cones.shaped('box')")
     lower, upper = cones.lower.copy(), cones.upper.copy()
     findex = np.full(cones.n_rows, -1, np.int32)
     rows, coefficient = np.flatnonzero(cones.friction_rows), cones.friction_coefficient.copy()

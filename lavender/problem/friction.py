@@ -32,22 +32,13 @@ def check_friction_combination(
 ) -> None:
     """Raise InputError if no kind of contact has this combination of rows."""
     if is_box and (spin or rolling or tangents > 2):
-        raise InputError(
-            "a box has up to two tangents, and neither spin nor rolling: leave patch_radius, rolling and tangents "
-            "out, or give shape='disk'"
-        )
+        raise InputError("a box has up to two tangents, without spin (patch_radius) and rolling")
     if is_pair and not is_box:
-        raise InputError(
-            f"mu has shape {np.shape(mu)}; two coefficients for each contact define an ellipse, which has "
-            "neither spin nor rolling: leave patch_radius, rolling and tangents out, or give one mu for each contact"
-        )
+        raise InputError(f"mu has shape {np.shape(mu)}, of ellipses; (k,) is needed with spin or rolling")
     if tangents > 2 and spin:
         raise InputError(f"{tangents} tangents make a round cone, which has spin: leave patch_radius out")
     if rolling and tangents != 2:
-        raise InputError(
-            f"rolling needs tangents=2, because the rolling rows rotate about two tangents; tangents is {tangents}"
-            + (" (a round cone, which includes rolling)" if tangents > 2 else "")
-        )
+        raise InputError(f"tangents is {tangents}; rolling needs tangents=2, the axes of rolling")
 
 
 def _convert_coefficient_pairs(mu: Any) -> FloatArray:
@@ -76,8 +67,7 @@ def convert_ellipse_coefficients(mu: Any) -> tuple[FloatArray, FloatArray | None
     bad = np.flatnonzero((smaller < 2.0 * MIN_COEFFICIENT_RATIO * larger) & (larger > 0.0))
     if len(bad):
         raise InputError(
-            f"mu of contact {bad[0]} is {pairs[bad[0]].tolist()}; an ellipse needs two numbers above 0 with a "
-            "ratio below 1e18, or two zeros: give shape='box' for a tangent without friction"
+            f"mu of contact {bad[0]} is {pairs[bad[0]].tolist()}; an ellipse needs a ratio above 0 and below 1e18"
         )
     first, second = pairs[:, 0], pairs[:, 1]
     ratio = np.divide(second, first, out=np.ones(len(first)), where=first > 0.0)
@@ -92,10 +82,9 @@ def make_contact_blocks(
         tangents = check_int("tangents", tangents, 0, 5)
     is_box = check_shape("shape", shape) == "box"
     is_pair = type(mu) is not float and len(get_shape("mu", mu)) > 1
-    if patch_radius is not None or rolling is not None or tangents != 2:
-        check_friction_combination(
-            mu, tangents, patch_radius is not None, rolling is not None, is_box, is_pair
-        )
+    has_spin, has_rolling = patch_radius is not None, rolling is not None
+    if has_spin or has_rolling or tangents != 2:
+        check_friction_combination(mu, tangents, has_spin, has_rolling, is_box, is_pair)
     ratio, pair_kind = None, 0
     if is_box and tangents == 2:
         pair_kind = BOX_KIND
@@ -114,9 +103,7 @@ def make_contact_blocks(
         patch_radius = np.ascontiguousarray(np.broadcast_to(ratio, (k,)))
     blocks = kernels.make_contact_blocks(k, tangents, mu, patch_radius, rolling, pair_kind)
     if blocks is None:
-        raise InputError(
-            f"{k} contacts have more than 2^31 - 1 rows, which 32-bit indices cannot number: split the problem"
-        )
+        raise InputError(f"{k} contacts have more than 2^31 - 1 rows: split the problem")
     return blocks
 
 
@@ -132,8 +119,7 @@ def project_impulse(cones: Any, impulse: FloatArray) -> FloatArray:
     first, tangents = cones.ptr[:-1], cones.n_together
     groups = [(tangents == width, first + 1, width) for width in range(1, int(tangents.max(initial=0)) + 1)]
     groups += [
-        (cones.separate_rows >= 0, cones.separate_rows, 1),
-        (cones.rolling_rows >= 0, cones.rolling_rows, 2),
+        (rows >= 0, rows, width) for rows, width in ((cones.separate_rows, 1), (cones.rolling_rows, 2))
     ]
     for has_component, first_row, width in groups:
         rows = first_row[has_component][:, None] + np.arange(width)

@@ -42,8 +42,16 @@ class Operators(ProblemData):
     """A, J, and the arrays that kernels and the judge read, derived from the fields of a problem."""
 
     def _check_magnitudes(self) -> None:
-        if self.matrix is None and self._has_large_entries():
-            self.metric  # noqa: B018 - raises the error now, not in a solve
+        """Raise InputError now, not in a solve, if large entries of J, M^-1 or the compliance make A_ii too large."""
+        r, general, c = self.rows, self.generalized, self.compliance
+        if general is not None:
+            is_large = general.operator.has_entry_above(MAX_SAFE_ENTRY) or has_entry_above(MAX_SAFE_ENTRY, c)
+        else:
+            is_large = r is not None and has_entry_above(
+                MAX_SAFE_ENTRY, c, r.jac, r.arm_a, r.arm_b, r.inv_mass, r.inv_inertia
+            )
+        if is_large:
+            self.metric  # noqa: B018
 
     @classmethod
     def _from_checked_data(cls, view: Data, friction: str, name: str, rest: tuple[Any, Any]) -> Any:
@@ -95,16 +103,6 @@ class Operators(ProblemData):
         if generalized is not None and derived.view is None:
             other._set_view()
         return other
-
-    def _has_large_entries(self) -> bool:
-        """Return whether an entry of J, M^-1 or the compliance exceeds MAX_SAFE_ENTRY: A_ii may be too large."""
-        r, general, c = self.rows, self.generalized, self.compliance
-        if general is not None:
-            return bool(
-                general.operator.has_entry_above(MAX_SAFE_ENTRY) or has_entry_above(MAX_SAFE_ENTRY, c)
-            )
-        assert r is not None
-        return bool(has_entry_above(MAX_SAFE_ENTRY, c, r.jac, r.arm_a, r.arm_b, r.inv_mass, r.inv_inertia))
 
     @property
     def asymmetry(self) -> float:
@@ -190,9 +188,7 @@ class Operators(ProblemData):
         try:
             view.compute_derived_numbers()
         except OverflowError as error:
-            raise TooLarge(
-                f"the problem is too large: {error}. Split it into smaller problems, for example by islands"
-            ) from None
+            raise TooLarge(f"the problem is too large: {error}: split it, for example by islands") from None
         self._check_diagonal(view)
         return view
 
@@ -229,25 +225,18 @@ class Operators(ProblemData):
         return float(entries), assemble.bound_delassus_bandwidth(self.data, *lists)
 
     @property
-    def _n_couplings(self) -> float:
-        """Number of pairs of rows that share a body; pairs that share both bodies count twice."""
-        return self._couplings[0]
-
-    @property
     def max_entries(self) -> float:
         """Number of entries of A, or an upper bound if A is not formed."""
         if self.matrix is not None or "_compressed" in self.__dict__:
             return float(len(self._compressed[1]))
-        bound = self._n_couplings if self.rows is not None else self.metric.entries_of_matrix
+        bound = self._couplings[0] if self.rows is not None else self.metric.entries_of_matrix
         return min(float(bound), float(self.m) ** 2)
 
     def check_matrix_fits(self) -> None:
         """Raise TooLarge if A in compressed rows may have more entries than 32-bit indices reach."""
-        if self.matrix is not None or "_compressed" in self.__dict__:
-            return
-        self._check_entry_count(
-            self._n_couplings if self.generalized is None else self.metric.entries_of_matrix
-        )
+        if self.matrix is None and "_compressed" not in self.__dict__:
+            bound = self._couplings[0] if self.generalized is None else self.metric.entries_of_matrix
+            self._check_entry_count(bound)
 
     def _check_entry_count(self, bound: float) -> None:
         """Raise TooLarge if this upper bound of the number of entries of A off the diagonal is too large."""
@@ -290,8 +279,7 @@ class Operators(ProblemData):
         """
         if self.generalized is None:
             raise CapabilityError(
-                f"Y exists only in generalised coordinates, and this problem was given as {self.operator}: "
-                "build it with Problem.from_jacobian"
+                f"Y exists only in generalised coordinates, and this problem was given as {self.operator}"
             )
         return _mark_matrix_read_only(
             sp.csr_array(self.metric.whitened(), shape=(self.m, self.generalized.nv))
@@ -309,10 +297,7 @@ class Operators(ProblemData):
         if self.generalized is not None:
             return self.generalized.jac
         if self.rows is None:
-            raise CapabilityError(
-                "this problem was given as a matrix; its Jacobian is not known (make it with "
-                "Problem.from_rows or Problem.from_jacobian)"
-            )
+            raise CapabilityError("this problem was given as a matrix; its Jacobian is not known")
         return _mark_matrix_read_only(self.rows.jacobian(self.cones))
 
     @property
@@ -363,10 +348,7 @@ class Operators(ProblemData):
         """
         general = self.rows if self.generalized is None else self.generalized
         if general is None:
-            raise CapabilityError(
-                "this problem was given as a matrix; velocities need J and M (make it with "
-                "Problem.from_rows or Problem.from_jacobian)"
-            )
+            raise CapabilityError("this problem was given as a matrix; J and M are needed for velocities")
         return general.v_free + self.compute_velocity_change(self.make_start(impulse))
 
     def compute_velocity_change(self, impulse: FloatArray) -> FloatArray:
@@ -430,16 +412,6 @@ def has_shifted_cholesky(a: Any) -> bool:
         except np.linalg.LinAlgError:
             return False
         return True
-    system, values = analyse_matrix_for_factorisation(a)
-    return bool(system.factor(values, None, SEMIDEFINITE_SHIFT) == 0)
-
-
-def analyse_matrix_for_factorisation(a: Any) -> tuple[LinearSystem, FloatArray]:
-    """Analyse a sparse symmetric matrix with a full diagonal for a supernodal factorisation L L^T.
-
-    Return the analysed system, and the entries that its `factor` needs. TooLarge: the factor would have 2^31 entries or
-    more.
-    """
     a = sp.csr_array(0.5 * (a + a.T))  # Make the pattern, and entries that differ by rounding, symmetric.
     a.sort_indices()
     try:
@@ -447,4 +419,4 @@ def analyse_matrix_for_factorisation(a: Any) -> tuple[LinearSystem, FloatArray]:
         system.analyse()
     except OverflowError as error:
         raise TooLarge(f"A cannot be factored: {error}. Use a sweep solver, which needs no factor") from None
-    return system, a.data
+    return bool(system.factor(a.data, None, SEMIDEFINITE_SHIFT) == 0)

@@ -80,15 +80,10 @@ def compute_block_order(
         raise InputError(f"seed={seed} needs order='random': leave seed out")
     if not isinstance(order, str):
         if ground is not None:
-            raise InputError(
-                "ground= is given with an array of blocks as order; it needs order='bottom_up' or "
-                "'top_down': leave one of the two out"
-            )
+            raise InputError("ground= is given with an array; it needs order='bottom_up' or 'top_down'")
         blocks = as_array("order", order, (k,), dtype=np.int32).copy()
         if not np.array_equal(np.sort(blocks), np.arange(k)):
-            raise InputError(
-                f"order is not a permutation of the blocks; every block from 0 to {k - 1} is needed exactly once"
-            )
+            raise InputError(f"order is no permutation; every block from 0 to {k - 1} is needed exactly once")
         return Order(blocks, k, GIVEN, rng)
     if order not in SWEEP_ORDERS:
         raise UnknownName("order", order, SWEEP_ORDERS)
@@ -123,15 +118,10 @@ def compute_block_levels_from_ground(problem: Problem, ground: Any = None) -> In
     k = problem.n_blocks
     if problem.rows is not None:
         if ground is not None:
-            raise InputError(
-                "ground= is given for a problem with rows, whose static bodies are the ground: leave it out"
-            )
+            raise InputError("ground= is given with rows, whose static bodies are the ground: leave it out")
         return compute_block_levels(problem.rows.moving_block_bodies, problem.rows.n_bodies)
     if ground is None:
-        raise CapabilityError(
-            "the levels of a problem given as a matrix cannot be computed without ground=; give the "
-            "numbers of the blocks that touch the ground"
-        )
+        raise CapabilityError("levels of a matrix need ground=, the blocks that touch the ground")
     ground = as_array("ground", ground, (None,), dtype=np.int32)
     if ground.size and (ground.min() < 0 or ground.max() >= k):
         raise InputError(f"ground holds block {ground.max()}; there are {k} blocks, numbered from 0")
@@ -197,14 +187,9 @@ def compute_block_colors(problem: Problem) -> IntArray:
     """
     if problem.rows is not None:
         return compute_body_colors(problem.rows.moving_block_bodies, problem.rows.n_bodies)
-    graph = _build_block_graph(problem)
-    k = problem.n_blocks
-    return compute_matrix_colors(
-        np.arange(k + 1, dtype=np.int32),
-        np.arange(k, dtype=np.int32),
-        graph.indptr.astype(np.int32),
-        graph.indices.astype(np.int32),
-    )
+    graph, numbers = _build_block_graph(problem), np.arange(problem.n_blocks + 1, dtype=np.int32)
+    pattern = graph.indptr.astype(np.int32), graph.indices.astype(np.int32)
+    return compute_matrix_colors(numbers, numbers[:-1], *pattern)
 
 
 def group_blocks_by_island(count: int, label: IntArray) -> list[IntArray]:

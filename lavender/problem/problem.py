@@ -262,16 +262,9 @@ class Problem(Builders):
             "generalized": self.generalized, "compliance": self.compliance
         }  # fmt: skip
         return Problem(
-            self.b,
-            Cones.bounded(lower, upper),
-            guess=self.guess,
-            names=names,
-            name=self.name,
-            copy=False,
-            precision=self.precision,
-            angular=self.angular_rows,
-            **more,
-        )
+            self.b, Cones.bounded(lower, upper), guess=self.guess, names=names, name=self.name, copy=False,
+            precision=self.precision, angular=self.angular_rows, **more,
+        )  # fmt: skip
 
     def velocity_form(self) -> VelocityForm:
         """Compute the mass-scaled velocity form (see `VelocityForm`).

@@ -113,9 +113,7 @@ class QPSolution:
 
     def __str__(self) -> str:
         if self.ray is not None:
-            return (
-                f"unbounded: the objective decreases without end along ray; at x it is {self.objective:.6g}"
-            )
+            return f"unbounded: the objective decreases along ray; at x it is {self.objective:.6g}"
         # Show the status only if the program is not solved.
         status = "" if self.solution is None or self.found else f"{self.solution.status.name}, "
         if status == "CONVERGED, ":
@@ -188,9 +186,9 @@ class QPSolution:
         if self.ray is not None or not self.error <= self.tol:
             return False
         solution = self.solution
-        return solution is None or not (
-            solution.status.name == "INFEASIBLE" and solution.claim_check == "confirmed"
-        )
+        if solution is None or solution.status.name != "INFEASIBLE":
+            return True
+        return bool(solution.claim_check != "confirmed")
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,12 +221,8 @@ class QuadraticProgram:
         matrix.sort_indices()
         b = np.concatenate([-self.q, self.target])
         names = Names(len(b), partial(_make_program_names, n, len(b) - n))
-        return {
-            "b": b,
-            "cones": _make_one_sided_cones(n + self.free, len(b)),
-            "matrix": matrix,
-            "names": names,
-        }
+        cones = _make_one_sided_cones(n + self.free, len(b))
+        return {"b": b, "cones": cones, "matrix": matrix, "names": names}
 
     def with_bias(self, b: FloatArray) -> QuadraticProgram:
         """Return the program of a singular P for which the right-hand side of (5) is b (n + m,)."""
@@ -391,7 +385,9 @@ def _make_one_sided_cones(free: int, m: int) -> Cones:
 def make_quadratic_program(arrays: ProgramArrays) -> QuadraticProgram:
     """Check the arrays P, q, G, h, A, b, lb, ub and convert them to a program; see `Problem.from_qp`."""
     P, q, G, h, A, b, lb, ub = _unpack_arguments(arrays)
-    q, h, b, lb, ub = map(_flatten_column, (q, h, b, lb, ub))
+    q, h, b, lb, ub = (  # An array (n, 1) counts as (n,).
+        np.asarray(x)[:, 0] if getattr(x, "shape", ())[1:] == (1,) else x for x in (q, h, b, lb, ub)
+    )
     q = as_array("q", q, (None,))
     n = len(q)
     lower = _convert_hessian(P, n)
@@ -431,10 +427,7 @@ def _unpack_arguments(arguments: ProgramArrays) -> ProgramArrays:
             "P and q are needed, or a qpsolvers.Problem alone"
         )
     if any(x is not None for x in arguments[1:]):
-        raise InputError(
-            "a qpsolvers.Problem and further arrays are given; the qpsolvers.Problem already holds all "
-            "arrays: give it alone"
-        )
+        raise InputError("a qpsolvers.Problem and further arrays are given; the former alone is needed")
     return tuple(getattr(P, name) for name in names)
 
 
@@ -470,20 +463,13 @@ def _convert_hessian(P: Any, n: int) -> Compressed:
         return extract_lower_triangle("P", sp.csr_array(matrix), hint)
 
 
-def _flatten_column(vector: Any) -> Any:
-    """Return the entries of an (n, 1) array as (n,); other arguments unchanged."""
-    return np.asarray(vector)[:, 0] if getattr(vector, "shape", ())[1:] == (1,) else vector
-
-
 def _convert_rows(
     name: str, matrix: Any, rhs_name: str, rhs: Any, n: int, sign: float
 ) -> tuple[Compressed | None, FloatArray | None]:
     """Convert A and b, or -G and h, to checked compressed rows and an array; None without them."""
     if (matrix is None) != (rhs is None):
         missing = name if matrix is None else rhs_name
-        raise InputError(
-            f"{missing} is missing; {name} and {rhs_name} describe the same constraints: give both or neither"
-        )
+        raise InputError(f"{missing} is missing; both or neither of {name} and {rhs_name} are needed")
     if matrix is None:
         return None, None
     rows = _convert_matrix(name, matrix, n, sign)

@@ -103,8 +103,7 @@ def _as_inverses(name: str, value: ArrayLike, n: int, unit: str) -> FloatArray:
     infinite = np.flatnonzero(np.isposinf(array))
     if len(infinite):
         raise InputError(
-            f"{name} [{unit}] of body {infinite[0]} is inf, and a finite number is needed; it is 0 for a body that "
-            "impulses do not move"
+            f"{name} [{unit}] of body {infinite[0]} is inf; a finite number, 0 if fixed, is needed"
         )
     check_nonnegative_magnitudes(name, array, unit)
     return array
@@ -571,16 +570,12 @@ class RowBuilder:
         blocks, rows, b, compliance, keys = self._blocks.export(is_box)
         given = dict(self._names)
         return Problem(
-            b,
-            Cones._from_blocks(blocks),
-            rows=Rows(self._inv_mass, self._inv_inertia, self._velocity, **rows, copy=False),
-            friction=friction,
-            compliance=compliance,
-            key=keys,
-            names=Names(len(keys), lambda: [given.get(key) or name_block(key) for key in keys.tolist()]),
-            name=name,
+            b, Cones._from_blocks(blocks),
+            rows=Rows(self._inv_mass, self._inv_inertia, self._velocity, **rows, copy=False), friction=friction,
+            compliance=compliance, key=keys,
+            names=Names(len(keys), lambda: [given.get(key) or name_block(key) for key in keys.tolist()]), name=name,
             copy=False,
-        )
+        )  # fmt: skip
 
     def rows_of(self, key: int) -> slice:
         """Return the rows of a block in the problem's impulses and slacks, by the key that its method returned.

@@ -136,10 +136,7 @@ class Rows:
         n, c = masses[0] if len(masses) == 1 else None, normals[0] if normals else None
         ptr = as_array("joint_ptr", joint_ptr, (None,), dtype=np.int32, copy=copy)
         if not checks.are_pointers_valid(ptr, 1):
-            raise InputError(
-                f"joint_ptr is {ptr.tolist()!s:.60}; it must start with 0 and increase: the first row of "
-                "each joint, then the number of joint rows"
-            )
+            raise InputError(f"joint_ptr is {ptr.tolist()!s:.60}; it must start with 0 and increase")
         _check_joint_counts(ptr, jac, joint_body)
         numbers: dict[str, tuple[Any, tuple[int | None, ...]]] = {
             "inv_mass": (inv_mass, (n,)), "inv_inertia": (inv_inertia, (n, 3, 3)), "v_free": (v_free, (n, 6)),
@@ -182,10 +179,7 @@ class Rows:
                 raise InputError(
                     f"{name}_body[{index}] is [{body}, {body}]; two different bodies are needed, or -1 for a static one"
                 )
-            raise InputError(
-                f"{name}_body[{index}] is [-1, -1], two static bodies, which no impulse moves; at least one "
-                f"moving body is needed: leave this {name} out"
-            )
+            raise InputError(f"{name}_body[{index}] is [-1, -1], two static bodies; a moving one is needed")
         check_nonnegative_magnitudes("inv_mass", self.inv_mass, UNITS["inv_mass"])
         largest = np.abs(self.inv_inertia).max(axis=(1, 2), initial=0.0)
         check_nonnegative_magnitudes("largest entry of inv_inertia", largest, UNITS["inv_inertia"])

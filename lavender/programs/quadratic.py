@@ -168,15 +168,9 @@ def _update_program(problem: Problem, q: Any, h: Any, b: Any, others: tuple[Any,
     """Return the problem with another q, h and b; the same object without them."""
     qp = problem.qp
     if qp is None:
-        raise InputError(
-            "the problem does not contain a quadratic program; a problem of Problem.from_qp is needed "
-            "(results of updated() and problems read from files contain only the constraint problem)"
-        )
+        raise InputError("the problem contains no quadratic program; one of Problem.from_qp is needed")
     if any(x is not None for x in others):
-        raise InputError(
-            "G, A, lb or ub is given with a problem; only q, h and b of a problem can be replaced: "
-            "give P and all arrays, or make a new problem with Problem.from_qp"
-        )
+        raise InputError("G, A, lb or ub is given with a problem; only q, h and b of it can be replaced")
     if q is None and h is None and b is None:
         return problem
     qp = qp.with_vectors(q, h, b)
@@ -411,18 +405,13 @@ class _Task:
         return {
             "residual": judged,
             "iterations": work.get("iterations", 0 if self.solution is None else self.solution.iterations),
-            "work": MappingProxyType(work),
-            "solver": SolverRun(self.spec.name, self.options, last.form),
-            "message": message,
-            "history": None if self.solution is None else self.solution.history,
-            "dual": None,
+            "work": MappingProxyType(work), "solver": SolverRun(self.spec.name, self.options, last.form),
+            "message": message, "history": None if self.solution is None else self.solution.history, "dual": None,
             "certificate": None if proof is None else proof.y,
             "impulse_bound": None if proof is None else proof.impulse_bound,
-            "claim_check": CONTRADICTED if conflict else CONFIRMED,
-            "status_conflict": conflict,
-            "sweeps_per_decade": math.nan,
-            "stages": stages,
-        }
+            "claim_check": CONTRADICTED if conflict else CONFIRMED, "status_conflict": conflict,
+            "sweeps_per_decade": math.nan, "stages": stages,
+        }  # fmt: skip
 
 
 def _is_program_backend(spec: SolverSpec, options: dict[str, Any]) -> bool:

@@ -122,5 +122,5 @@ def _max_entries(problem: Problem) -> int | None:
     rows = problem.rows
     if rows is None or problem.law != "lcp" or rows.n_joints or problem.m > problem.n_blocks:
         return None
-    entries = int(problem._n_couplings)
+    entries = int(problem._couplings[0])
     return entries if entries <= min(MAX_ENTRIES_PER_ROW * problem.m, MAX_SWEPT_ENTRIES) else None

@@ -151,9 +151,8 @@ def _factor_asymmetric(problem: Problem) -> DirectState:
     factor = PanelsLU(problem)
     if factor.usable:
         return DirectState(problem, general=factor, note=why)
-    return replace(
-        _factor_by_rank_revealing_lu(problem, f"{why}; LU by panels lost a pivot"), failed_factorisations=1
-    )
+    state = _factor_by_rank_revealing_lu(problem, f"{why}; LU by panels lost a pivot")
+    return replace(state, failed_factorisations=1)
 
 
 @np.errstate(all="ignore")  # Results that overflow are judged.
@@ -243,9 +242,8 @@ class _Run:
     def pivot_work(self) -> dict[str, int]:
         """Work of exchanges in this run."""
         work = {} if self.state.pivot is None else self.state.pivot.rows.work
-        return {
-            kind: n - self.reported.get(kind, 0) for kind, n in work.items() if n > self.reported.get(kind, 0)
-        }
+        new = {kind: n - self.reported.get(kind, 0) for kind, n in work.items()}
+        return {kind: n for kind, n in new.items() if n > 0}
 
     def make_claim(self, status: Status, **more: Any) -> Claim:
         """Return a claim with this status, the work and the notes."""
@@ -292,11 +290,10 @@ class _Run:
         elif not self.is_good() and singular:
             # Try the residual of least squares in the metric of D, which is orthogonal to the range of A.
             measure.compute_slack(problem.csr_data, x, w)
-            proof = self.make_infeasibility_claim(-w / problem.csr_data.d) or self.make_infeasibility_claim(
-                factor.compute_left_null_part(problem.b)
-            )
-            if proof is not None:
-                return proof
+            for direction in (-w / problem.csr_data.d, factor.compute_left_null_part(problem.b)):
+                proof = self.make_infeasibility_claim(direction)
+                if proof is not None:
+                    return proof
         return self.make_claim_for_best_iterate()
 
     def solve_with_rank_revealing_lu(self, why: str) -> Claim:

@@ -62,14 +62,11 @@ def restrict_to_blocks(problem: Problem, blocks: IntArray, rows: IntArray) -> Pr
     number_in_part[used] = np.arange(len(used))
     joint_sizes = np.diff(bodies.joint_ptr)[joints]
     part = replace(
-        bodies,
-        **{name: getattr(bodies, name)[used] for name in ("inv_mass", "inv_inertia", "v_free")},
+        bodies, **{name: getattr(bodies, name)[used] for name in ("inv_mass", "inv_inertia", "v_free")},
         **{name: getattr(bodies, name)[contacts] for name in ("normal", "tangent", "arm_a", "arm_b")},
         jac=bodies.jac[rows[: int(joint_sizes.sum())]],
-        joint_ptr=np.concatenate([[0], np.cumsum(joint_sizes)]).astype(np.int32),
-        joint_body=number_in_part[pairs[0]],
-        contact_body=number_in_part[pairs[1]],
-        copy=False,
-    )
+        joint_ptr=np.concatenate([[0], np.cumsum(joint_sizes)]).astype(np.int32), joint_body=number_in_part[pairs[0]],
+        contact_body=number_in_part[pairs[1]], copy=False,
+    )  # fmt: skip
     assert problem.compliance is not None
     return Problem(b, cones, rows=part, compliance=problem.compliance[rows], **attributes)

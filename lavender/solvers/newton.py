@@ -108,9 +108,8 @@ class NewtonState:
         if system.form == "velocity":
             return Count("bodies", system.work, float(problem.metric.work), float(problem.m))
         set_up = 0.0 if problem.generalized is None else estimate_formation_cost(problem, False)
-        return Count(
-            "dense" if system.dense else "panels", system.work, system.entries, float(problem.m), set_up
-        )
+        kind = "dense" if system.dense else "panels"
+        return Count(kind, system.work, system.entries, float(problem.m), set_up)
 
     @property
     def steps(self) -> float:
@@ -143,9 +142,8 @@ class Newton(Solver):
 
     def cost(self, problem: Problem) -> Cost:
         """Estimate the costs; the total is a lower bound that needs no analysis of the matrix (`NewtonState.cost`)."""
-        return Cost(
-            partial(self._estimate_setup_cost, problem), total=partial(self._estimate_min_cost, problem)
-        )
+        total = partial(self._estimate_min_cost, problem)
+        return Cost(partial(self._estimate_setup_cost, problem), total=total)
 
     def _estimate_setup_cost(self, problem: Problem) -> float:
         """Estimate the cost of `prepare` [ns]."""
@@ -183,22 +181,18 @@ class Newton(Solver):
         if self.form not in FORMS:
             check_choice("form", self.form, FORMS)
         if self.form == "velocity" and problem.matrix is not None:
-            raise InputError(
-                "form='velocity' needs J and M, and this problem was given as a matrix A: build it with "
-                "Problem.from_rows or Problem.from_jacobian, or give form='impulse'"
-            )
+            raise InputError("form='velocity' needs J and M, and this problem was given as a matrix A")
         if not len(problem.b):
             return NewtonState(problem, None)
         bodies = kernel = None
         over_velocities = problem.generalized is not None and self.form != "impulse"
         if over_velocities:
-            max_cost = (
-                VELOCITY_MAX_COST_RATIO * _estimate_full_matrix_cost(problem) if self.form == "auto" else inf
-            )
+            max_cost = inf
+            if self.form == "auto":
+                max_cost = VELOCITY_MAX_COST_RATIO * _estimate_full_matrix_cost(problem)
             fixed = estimate_velocity_newton_cost(problem, 0.0)
-            kernel = general.prepare_islands(
-                problem, (max_cost - fixed) / (estimate_velocity_newton_cost(problem, 1.0) - fixed)
-            )
+            slope = estimate_velocity_newton_cost(problem, 1.0) - fixed
+            kernel = general.prepare_islands(problem, (max_cost - fixed) / slope)
             if kernel is not None and self.form == "auto" and _is_sparse_matrix_faster(problem, kernel.work):
                 kernel = None
         if self.form != "impulse" and (kernel is None or NEWTON.cost_limit(problem, kernel) == 0.0):
@@ -270,18 +264,14 @@ class Newton(Solver):
         """
         is_continued, state.begun = state.begun, True
         if state.general is None:
+            most = min(remaining or SPEC.max_iter, SPEC.max_iter)
+            deadline = Deadline(time_limit)
             return self._run_system(
-                state.problem,
-                state.system,
-                impulse,
-                n,
-                tol,
-                Deadline(time_limit),
-                is_continued,
-                min(remaining or SPEC.max_iter, SPEC.max_iter),
+                state.problem, state.system, impulse, n, tol, deadline, is_continued, most
             )
+        deadline = Deadline(time_limit)
         claim = general.run_newton_steps(
-            state.problem, state.general, impulse, n, tol, Deadline(time_limit), is_continued
+            state.problem, state.general, impulse, n, tol, deadline, is_continued
         )
         if claim.status is Status.MAX_ITERATIONS and state.general.how != OUTCOMES["more"]:
             return Claim(Status.STALLED, claim.iterations, claim.work)
@@ -363,16 +353,8 @@ class Newton(Solver):
                     return replace(claim, judged=judged)
         solve, steps = system.solve, max(1, int(INTERRUPT_CHECK_INTERVAL / max(system.factor_seconds, 1e-6)))
         run = run_newton_method(
-            problem,
-            solve,
-            impulse,
-            max_iter - warm_factorisations,
-            tol,
-            deadline,
-            steps,
-            max_total,
-            is_continued,
-        )
+            problem, solve, impulse, max_iter - warm_factorisations, tol, deadline, steps, max_total, is_continued,
+        )  # fmt: skip
         factorisations = warm_factorisations + run.counts[0]
         message = ", ".join(
             [

@@ -316,22 +316,14 @@ class SolverSpec:
         if type(problem) is not Problem:
             check_problem(problem)
         if not self.singular_programs and problem.qp is not None and problem.qp.is_singular:
-            return (
-                "needs a positive definite P, and P of this program is singular: use auto, or "
-                f"{_list_program_solvers()}"
-            )
+            return f"needs a positive definite P, and P is singular: use auto, or {_list_program_solvers()}"
         if self.takes_all:
             return None
         law, blocks = problem.law, problem.cones._blocks
-        if (
-            law in self.laws
-            and law not in ("linear", "lcp", *self.box_friction_laws)
-            and problem.cones.has_box
-        ):
-            return (
-                "takes no boxes, contacts that bound each tangent by itself: use one of those that do, "
-                "lavender.available(problem) lists them, or give the problem cones.shaped('disk')"
-            )
+        others = "use a solver of lavender.available(problem), or"
+        accepts_boxes = law in ("linear", "lcp", *self.box_friction_laws)
+        if law in self.laws and not accepts_boxes and problem.cones.has_box:
+            return f"takes no boxes, which bound each tangent: {others} cones.shaped('disk')"
         if law not in self.laws and not (law in self.box_friction_laws and problem.cones.is_polyhedral):
             takes = ", ".join(law for law in LAWS if law in self.laws)
             way = _suggest_alternative(law, self.laws)
@@ -349,15 +341,9 @@ class SolverSpec:
                 given = f"by its {problem.operator} form with ellipses, which becomes a matrix (problem.disk)"
             return f"needs a problem with {needs}; this one was given {given}"
         if blocks.has_round and not self.round_cones:
-            return (
-                "takes no round cones (more than two tangents in one): use one of those that do, "
-                "lavender.available(problem) lists them, or give the edges of a pyramid as rows"
-            )
+            return f"takes no round cones (over two tangents in one): {others} give edges as rows"
         if blocks.has_rolling and not self.supports_rolling:
-            return (
-                "takes no contacts that resist what rolls: use one of those that do, lavender.available(problem) lists "
-                "them, or leave the rows that roll out"
-            )
+            return f"takes no contacts that resist what rolls: {others} leave the rows that roll out"
         if self.refusal is None:
             return None
         return self.refusal(problem.disk if blocks.has_ellipse else problem) or None

@@ -57,9 +57,8 @@ def make_limits(
     step = RATES["entry"], RATES["work"]["velocities"], DECISIONS.factorisations
     row_rates = RATES["velocity row"], RATES["velocity contact row"]
     rows = SMALL_ROWS, MAX_ROWS_ALWAYS_DENSE, DENSE_ROWS_PER_VELOCITY, VELOCITIES_OF_TWO_BODIES
-    return Limits(
-        np.array([*step, *row_rates, *sweep, general.MAX_MATRIX_ENTRIES, max_cost, *rows, steps, lanes])
-    )
+    numbers = [*step, *row_rates, *sweep, general.MAX_MATRIX_ENTRIES, max_cost, *rows, steps, lanes]
+    return Limits(np.array(numbers))
 
 
 def get_small_call(problem: Problem) -> Any:
@@ -202,13 +201,8 @@ class SmallCall:
                 note = "A is singular on the free rows: shifted and refined"
             return Claim(status, done, ran[0][1], note, form="band" if symmetric else "LU")
         stages = _make_stages(problem, ran, start, after)
-        return Claim(
-            status,
-            done,
-            sum_work_counts(stage.work for stage in stages),
-            describe_stages(stages) or no_work,
-            stages=stages,
-        )
+        work = sum_work_counts(stage.work for stage in stages)
+        return Claim(status, done, work, describe_stages(stages) or no_work, stages=stages)
 
 
 SolverWork = list[tuple[str, dict[str, int]]]  # (name of the solver, {kind of work: count}) of each stage.
@@ -260,12 +254,8 @@ def describe_stages(stages: Sequence[SolverStage]) -> str:
 
 def describe_work(name: str, work: Mapping[str, int]) -> str:
     """Describe the work of a solver."""
-    separator = " "
-    for kind, count in work.items():
-        if count:
-            name += separator + format_work_count(count, kind)
-            separator = ", "
-    return name
+    done = ", ".join(format_work_count(count, kind) for kind, count in work.items() if count)
+    return f"{name} {done}" if done else name
 
 
 AUTO = SmallCall("auto", make_limits(DECISIONS.first_sweeps, steps=AUTO_MAX_STEPS, lanes=True), True, True)

@@ -179,20 +179,12 @@ def make_fields(run: FinishedRun, judged: Judged, verdict: Verdict | None = None
     if verdict is None:
         verdict = Verdict(claim.status, claim.message)
     return {
-        "residual": make_residual(run.problem, judged),
-        "iterations": claim.iterations,
-        "work": MappingProxyType(dict(claim.work)),
-        "solver": SolverRun(spec.name, run.options, claim.form, order),
-        "message": verdict.message,
-        "history": run.history,
-        "dual": claim.dual,
-        "certificate": verdict.certificate,
-        "impulse_bound": verdict.impulse_bound,
-        "claim_check": verdict.claim_check,
-        "status_conflict": verdict.status_conflict,
-        "sweeps_per_decade": run.sweeps_per_decade,
-        "stages": claim.stages,
-    }
+        "residual": make_residual(run.problem, judged), "iterations": claim.iterations,
+        "work": MappingProxyType(dict(claim.work)), "solver": SolverRun(spec.name, run.options, claim.form, order),
+        "message": verdict.message, "history": run.history, "dual": claim.dual, "certificate": verdict.certificate,
+        "impulse_bound": verdict.impulse_bound, "claim_check": verdict.claim_check,
+        "status_conflict": verdict.status_conflict, "sweeps_per_decade": run.sweeps_per_decade, "stages": claim.stages,
+    }  # fmt: skip
 
 
 def check_claim(run: FinishedRun, judged: Residual) -> Verdict:

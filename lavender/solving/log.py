@@ -224,14 +224,11 @@ class SolveLog:
         if self.conflict is not None and self.certificate is None and self.best > self.tol:
             messages.append("of the convex relaxation, " + self.conflict.message)
         return Claim(
-            Status.INTERRUPTED if self.interrupted else status,
-            self.iterations,
-            self.work,
+            Status.INTERRUPTED if self.interrupted else status, self.iterations, self.work,
             "; ".join(filter(None, messages)),
-            certificate=self.direction if self.certificate is None else self.certificate,
-            stages=tuple(self.stages),
+            certificate=self.direction if self.certificate is None else self.certificate, stages=tuple(self.stages),
             judged=self.judged,
-        )
+        )  # fmt: skip
 
 
 @dataclass

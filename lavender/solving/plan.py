@@ -12,7 +12,7 @@ from lavender.base.arrays import check_float
 from lavender.base.deadline import format_seconds
 from lavender.base.errors import CapabilityError, InputError
 from lavender.judge.residuals import get_zero_impulse_reference
-from lavender.problem import Problem
+from lavender.problem import Problem, check_problem
 from lavender.solvers.registry import get
 from lavender.solvers.small import describe_small_call
 from lavender.solving.singular_programs import program_backends
@@ -56,22 +56,18 @@ class Plan:
 
     def data(self) -> Mapping[str, Any]:
         """Return the fields as JSON-compatible values: costs in nanoseconds, None for an infinite number."""
-        values = asdict(self) | {"stages": [asdict(stage) for stage in self.stages]}
-        return {name: _to_jsonable(value) for name, value in values.items()}
+        tables = [asdict(self), *map(asdict, self.stages)]
+        values, *stages = ({k: None if v == inf else v for k, v in table.items()} for table in tables)
+        return values | {"stages": stages, "in_turn": self.in_turn}
 
     def __str__(self) -> str:
-        lines = [
-            f"{self.rows} rows, law {self.law!r}, given as {self.operator}; tol {self.tol:g}".replace(
-                "e-0", "e-"
-            )
-        ]
+        tol = f"{self.tol:g}".replace("e-0", "e-")
+        lines = [f"{self.rows} rows, law {self.law!r}, given as {self.operator}; tol {tol}"]
         if self.small:
             lines.append(f"first one compiled call: {self.small}")
         if self.in_turn:  # It is empty for programs with a singular P, which only backends solve.
-            lines.append(
-                f"newton is counted to take {format_seconds(1e-9 * self.newton)}, "
-                f"a sweep {format_seconds(1e-9 * self.sweep)}"
-            )
+            newton, sweep = (format_seconds(1e-9 * cost) for cost in (self.newton, self.sweep))
+            lines.append(f"newton is counted to take {newton}, a sweep {sweep}")
         for stage in self.stages:
             limit = "to its end"
             if stage.iterations < 1e9:
@@ -82,14 +78,6 @@ class Plan:
         names = ", ".join(self.in_turn)
         lines.append(f"then {names} in turn with doubled work, and a certificate that there is no solution")
         return "\n".join(lines)
-
-
-def _to_jsonable(value: Any) -> Any:
-    if isinstance(value, list):
-        return [_to_jsonable(entry) for entry in value]
-    if isinstance(value, dict):
-        return {name: _to_jsonable(entry) for name, entry in value.items()}
-    return None if value == float("inf") else value
 
 
 def explain(problem: Problem, tol: float = 1e-6) -> Plan:
@@ -112,8 +100,7 @@ def explain(problem: Problem, tol: float = 1e-6) -> Plan:
     CapabilityError
         `auto` does not accept the problem.
     """
-    if not isinstance(problem, Problem):
-        raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
+    check_problem(problem)
     tol = check_float("tol", tol, above=0.0)
     if problem.m == 0:
         raise InputError("the problem has no rows; at least one is needed for a plan")

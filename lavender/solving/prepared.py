@@ -232,10 +232,7 @@ class Prepared:
             check_problem(original)
             tol = relative_tolerance(original, velocity_tol, tol)
         if not self._lock.acquire(False):
-            raise InUse(
-                f"this prepared {self.spec.name!r} is already solving, and it can run one solve at a time: "
-                "make one for each thread (lavender.prepare)"
-            )
+            raise InUse(f"this prepared {self.spec.name!r} is already solving: make one for each thread")
         try:
             solution: Solution | None = None
             failed_call: tuple[int, ...] | None = None
@@ -250,12 +247,8 @@ class Prepared:
                     self.problem, self._setup = original, NotSetUp()
             else:
                 deadline = None if limit == math.inf else make_deadline(self.spec, limit, begun)
-                solution = self._solve(
-                    check_arguments(
-                        self.spec, impulse, tol, max_iter, deadline, history, callback, failed_call
-                    ),
-                    original,
-                )
+                arguments = (impulse, tol, max_iter, deadline, history, callback, failed_call)
+                solution = self._solve(check_arguments(self.spec, *arguments), original)
         finally:
             self._lock.release()
         return solution if velocity_tol is None else accept_velocity(solution, velocity_tol)
@@ -264,9 +257,7 @@ class Prepared:
         """Return the prepared problem with a new right-hand side b or a new v*, see `solve`."""
         original = self.problem
         if problem is not None:
-            raise InputError(
-                "problem is given with b or v_free: give problem.updated(b=...), or leave problem out"
-            )
+            raise InputError("problem is given with b or v_free: give problem.updated(b=...) alone")
         general = original.generalized
         if original.has_singular_program or (v_free is not None and general is None):
             return original.updated(b=b, v_free=v_free)
@@ -411,12 +402,8 @@ class Prepared:
         else:
             has_checks = type(getattr(setup.state, "watch", None)) is StoppingTest
             keeps_best = has_checks or spec.delegates  # Its result is never worse than the start.
-            if (
-                loop.tol > 0.0
-                and not keeps_best
-                and not has_default_start
-                and not problem.has_singular_program
-            ):
+            is_given = not (has_default_start or problem.has_singular_program)
+            if loop.tol > 0.0 and not keeps_best and is_given:
                 # The start is judged as given, as in compiled calls, but empty rows keep their bounds.
                 begin = choose_start(problem, start, loop.tol)
                 changed = (begin != start) & (loop.impulse == start)
@@ -515,18 +502,12 @@ def _check_option_names(spec: SolverSpec, options: dict[str, Any]) -> None:
         if name in spec.accepts:
             continue
         if name in SOLVE_ARGUMENTS:
-            raise CapabilityError(
-                f"prepare does not take {name}=; give it to the method solve of the returned "
-                f"object: prepare(...).solve({name}=...)"
-            )
+            raise CapabilityError(f"prepare does not take {name}=: give it to prepare(...).solve")
         if name in ("order", "ground", "seed"):
-            raise CapabilityError(
-                f"solver {spec.name!r} does not take {name}=; it takes: "
-                f"{', '.join(sorted(spec.accepts)) or 'no options'}"
-            )
-        raise UnknownName(
-            f"option of solver {spec.name!r}", name, {*spec.accepts, *SOLVE_ARGUMENTS, "solver"}
-        )
+            accepted = ", ".join(sorted(spec.accepts)) or "no options"
+            raise CapabilityError(f"solver {spec.name!r} does not take {name}=; it takes: {accepted}")
+        known = {*spec.accepts, *SOLVE_ARGUMENTS, "solver"}
+        raise UnknownName(f"option of solver {spec.name!r}", name, known)
 
 
 def check_arguments(
@@ -549,21 +530,17 @@ def check_arguments(
     if callback is not None:
         if not callable(callback):
             raise InputError(
-                f"callback is {callback!r}; a function of (iterations, impulse, residual) is needed"
+                f"callback is {callback!r}; a function (iterations, impulse, residual) is needed"
             )
         if not spec.callback:
             raise CapabilityError(
-                f"solver {spec.name!r} runs in one call, so it cannot call a callback: leave callback out, or "
-                "use a solver of lavender.available(problem, callback=True)"
+                f"solver {spec.name!r} runs in one call; a solver of lavender.available(callback=True) is needed"
             )
     if history is not False and check_bool("history", history) and not spec.history:
         raise CapabilityError(
-            f"solver {spec.name!r} runs in one call, so it cannot record a history: leave history out, or "
-            "use a solver of lavender.available(problem, history=True)"
+            f"solver {spec.name!r} runs in one call; a solver of lavender.available(history=True) is needed"
         )
-    return SolveArguments(
-        impulse, tol, max_iter, deadline, history=bool(history), callback=callback, failed_call=failed_call
-    )
+    return SolveArguments(impulse, tol, max_iter, deadline, bool(history), callback, failed_call)
 
 
 def _call_in_original_tangents(
@@ -610,21 +587,11 @@ def same_structure(p: Problem, q: Problem) -> bool:
     if not (are_equal(p.cones.ptr, q.cones.ptr) and are_equal(p.cones.kind, q.cones.kind)) or p.law != q.law:
         return False
     if p.rows is not None and q.rows is not None:
-        return (
-            p.rows.n_bodies == q.rows.n_bodies
-            and are_equal(p.rows.joint_body, q.rows.joint_body)
-            and are_equal(p.rows.contact_body, q.rows.contact_body)
-        )
+        pairs = (p.rows.joint_body, q.rows.joint_body), (p.rows.contact_body, q.rows.contact_body)
+        return p.rows.n_bodies == q.rows.n_bodies and all(are_equal(*pair) for pair in pairs)
     if p.operator != q.operator:
         return False
     if p.generalized is not None and q.generalized is not None:
-        return all(
-            are_equal(x, y)
-            for name in ("jac", "mass")
-            for x, y in zip(
-                getattr(p.generalized.operator, name)[:2],
-                getattr(q.generalized.operator, name)[:2],
-                strict=True,
-            )
-        )
+        patterns = ((*g.operator.jac[:2], *g.operator.mass[:2]) for g in (p.generalized, q.generalized))
+        return all(map(are_equal, *patterns))
     return all(map(are_equal, p._compressed[:2], q._compressed[:2]))

@@ -29,9 +29,7 @@ def check_velocity_tolerance(velocity_tol: float, tol: float) -> float:
     """Return `velocity_tol` [m/s] as a float."""
     velocity_tol = check_float("velocity_tol", velocity_tol, above=0.0)
     if tol != DEFAULT_TOLERANCE:
-        raise InputError(
-            f"tol is {tol:g} and velocity_tol is {velocity_tol:g}; a solve has one stopping test: leave one of them out"
-        )
+        raise InputError(f"tol is {tol:g} and velocity_tol is {velocity_tol:g}; one of them is needed alone")
     return velocity_tol
 
 
@@ -42,9 +40,8 @@ def relative_tolerance(problem: Problem, velocity_tol: float, tol: float) -> flo
     """
     velocity_tol = check_velocity_tolerance(velocity_tol, tol)
     reference = residual(problem, problem.start()).velocity_at_zero if problem.m else 0.0
-    return (
-        min(velocity_tol / reference, MAX_VELOCITY_TOLERANCE) if reference > 0.0 else MAX_VELOCITY_TOLERANCE
-    )
+    ratio = velocity_tol / reference if reference > 0.0 else MAX_VELOCITY_TOLERANCE
+    return min(ratio, MAX_VELOCITY_TOLERANCE)
 
 
 def accept_velocity(solution: Solution, velocity_tol: float) -> Solution:

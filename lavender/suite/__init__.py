@@ -41,75 +41,28 @@ from lavender.suite.steps import (
 )
 
 __all__ = [
-    "FAMILIES",
-    "LICENCES",
-    "MAX_SIZE",
-    "SETS",
-    "Case",
-    "Reference",
-    "box_stack",
-    "boxed_friction",
-    "case",
-    "cases",
-    "chain",
-    "default",
-    "engine_step",
-    "explain_missing_packages",
-    "families",
-    "friction",
-    "get_case_names_of_set",
-    "get_package_name_of_case",
-    "get_package_versions",
-    "granular",
-    "hang",
-    "hard",
-    "parse_case_name",
-    "pyramid",
-    "random_spd",
-    "robot",
-    "stack",
-    "toy_stack",
-    "two_particles",
-    "walking",
-]
+    "FAMILIES", "LICENCES", "MAX_SIZE", "SETS", "Case", "Reference", "box_stack", "boxed_friction", "case", "cases",
+    "chain", "default", "engine_step", "explain_missing_packages", "families", "friction", "get_case_names_of_set",
+    "get_package_name_of_case", "get_package_versions", "granular", "hang", "hard", "parse_case_name", "pyramid",
+    "random_spd", "robot", "stack", "toy_stack", "two_particles", "walking",
+]  # fmt: skip
 __dir__ = sorted(__all__).copy  # Completion shows public names only.
 
 # Models of each package in the set "robots".
 ROBOTS = {
     "gymnasium": ("ant", "half_cheetah", "hopper", "humanoid", "humanoidstandup", "pusher_v5", "walker2d_v5"),
-    "dm_control": (
-        "cheetah",
-        "dog",
-        "humanoid",
-        "humanoid_CMU",
-        "manipulator",
-        "quadruped",
-        "stacker",
-        "walker",
-    ),
-}
+    "dm_control": ("cheetah", "dog", "humanoid", "humanoid_CMU", "manipulator", "quadruped", "stacker", "walker"),
+}  # fmt: skip
 
 #: Sets of cases by name. `lavender report` without files runs "default": one case for each property that separates
 #: solvers, small enough for all of them.
 SETS: dict[str, tuple[str, ...]] = {
     "default": (
-        "two_particles",
-        "toy_stack",
-        "stack(n=64)",
-        "chain(n=33, tip_mass=1e4)",
-        "hang(n=33)",
-        "random_spd(n=100, condition=1e4)",
-        "box_stack(n=10)",
-        "box_stack(n=10, mass_ratio=1e6)",
-        "pyramid(k=10)",
-        "pyramid(k=10, mass_ratio=1e3)",
-        "granular(n=4)",
-        "granular(n=9)",
-        "boxed_friction(n=3, scene=granular)",
-        "box_stackF(n=10)",
-        "pyramidF(k=6, sliding=0.5)",
-        "granularF(n=3, sliding=0.5)",
-        "granular(n=4, friction=cone)",
+        *("two_particles", "toy_stack", "stack(n=64)", "chain(n=33, tip_mass=1e4)", "hang(n=33)"),
+        *("random_spd(n=100, condition=1e4)", "box_stack(n=10)", "box_stack(n=10, mass_ratio=1e6)"),
+        *("pyramid(k=10)", "pyramid(k=10, mass_ratio=1e3)", "granular(n=4)", "granular(n=9)"),
+        *("boxed_friction(n=3, scene=granular)", "box_stackF(n=10)", "pyramidF(k=6, sliding=0.5)"),
+        *("granularF(n=3, sliding=0.5)", "granular(n=4, friction=cone)"),
     ),
     "hard": hard.SET,
     # Coulomb's law on about 3,000 and 20,000 rows, at rest and sliding.
@@ -145,11 +98,8 @@ def families() -> dict[str, str]:
     """Return {"name(parameter=default, ...)": one-line summary} of every family."""
     out = {}
     for f in FAMILIES.values():
-        shown = [
-            f"{n}={format_parameter_value(p.default)}"
-            for n, p in f.signature.parameters.items()
-            if n not in f.preset
-        ]
+        free = ((n, p.default) for n, p in f.signature.parameters.items() if n not in f.preset)
+        shown = [f"{n}={format_parameter_value(value)}" for n, value in free]
         out[f"{f.name}({', '.join(shown)})"] = f.summary
     return out
 

@@ -45,9 +45,8 @@ class Bodies:
                 "contact_body": contacts.body,
             }
         inv_inertia = np.zeros((len(self.mass), 3, 3))
-        inv_inertia[:, [0, 1, 2], [0, 1, 2]] = (
-            (1.0 / self.inertia).reshape(len(self.mass), -1) if np.all(self.inertia > 0.0) else 0.0
-        )
+        if np.all(self.inertia > 0.0):
+            inv_inertia[:, [0, 1, 2], [0, 1, 2]] = (1.0 / self.inertia).reshape(len(self.mass), -1)
         return Rows(1.0 / self.mass, inv_inertia, self.v_free, copy=False, **more)
 
 

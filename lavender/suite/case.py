@@ -161,13 +161,9 @@ def register_family(**aliases: Mapping[str, Any]) -> Callable[[Callable[P, Draft
                     f"{text}: there is not enough memory ({str(error) or 'none left'}); give smaller parameters"
                 ) from None
             return Case(
-                name=text,
-                problem=replace(draft.problem, name=text, copy=False),
-                reason=draft.reason,
-                family=name,
-                parameters=MappingProxyType(values),
-                solve_reference=draft.reference,
-            )
+                name=text, problem=replace(draft.problem, name=text, copy=False), reason=draft.reason, family=name,
+                parameters=MappingProxyType(values), solve_reference=draft.reference,
+            )  # fmt: skip
 
         for alias, preset in {name: {}, **aliases}.items():
             FAMILIES[alias] = Family(alias, make, signature, MappingProxyType(dict(preset)), summary)
@@ -194,18 +190,14 @@ def _convert_parameter(name: str, parameter: inspect.Parameter, value: Any) -> A
 
 def _format_case_name(name: str, values: Mapping[str, Any], explicit: frozenset[str]) -> str:
     """Return the canonical name of a case; it has the parameters that are `explicit` or differ from their defaults."""
-    best = name
-    preset: Mapping[str, Any] = {}
+    best, preset = name, FAMILIES[name].preset
     for alias in FAMILIES.values():
         fixed = alias.preset
         if alias.make.__name__ == name and fixed and all(values.get(n) == v for n, v in fixed.items()):
             best, preset = alias.name, fixed
     parameters = FAMILIES[name].signature.parameters
-    shown = [
-        f"{n}={format_parameter_value(v)}"
-        for n, v in values.items()
-        if n not in preset and (n in explicit or v != parameters[n].default)
-    ]
+    own = {n: v for n, v in values.items() if n in explicit or v != parameters[n].default}
+    shown = [f"{n}={format_parameter_value(v)}" for n, v in own.items() if n not in preset]
     return f"{best}({', '.join(shown)})" if shown else best
 
 

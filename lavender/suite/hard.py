@@ -256,15 +256,10 @@ def units(kg: float = 1e12, m: float = 1.0, s: float = 1.0, n: int = 5) -> Draft
     arm_a, arm_b = contacts.compute_arms(bodies.position)
     speed = np.repeat([m / s, 1.0 / s], 3)
     rows = Rows(
-        1.0 / (bodies.mass * kg),
-        np.eye(3) / (BOX * kg * m * m) * np.ones((n, 1, 1)),
-        bodies.v_free * speed,
-        normal=contacts.normal,
-        tangent=contacts.compute_tangents(),
-        arm_a=arm_a * m,
-        arm_b=arm_b * m,
+        1.0 / (bodies.mass * kg), np.eye(3) / (BOX * kg * m * m) * np.ones((n, 1, 1)), bodies.v_free * speed,
+        normal=contacts.normal, tangent=contacts.compute_tangents(), arm_a=arm_a * m, arm_b=arm_b * m,
         contact_body=contacts.body,
-    )
+    )  # fmt: skip
     problem = Problem.from_rows(rows)
 
     def closed_form() -> Reference:

@@ -106,12 +106,8 @@ def get_package_name_of_case(name: str) -> str:
 
 def explain_missing_packages(package: str) -> str:
     """Return a message about packages that must be installed for the models of `package`; empty if none is missing."""
-    absent = [name for name in ("mujoco", package) if package and find_spec(name) is None]
-    return (
-        f"robots of {package} need {' and '.join(absent)}: pip install 'lavender-contact[robots]'"
-        if absent
-        else ""
-    )
+    absent = " and ".join(name for name in ("mujoco", package) if package and find_spec(name) is None)
+    return f"robots of {package} need {absent}: pip install 'lavender-contact[robots]'" if absent else ""
 
 
 def get_package_versions(package: str) -> str:

@@ -240,8 +240,8 @@ GOOD = encoded(W, -2)
         ({"W": GOOD | {"m": np.array([2**40])}}, "32-bit integer"),
         ({"W": GOOD | {"nz": np.array([-3], np.int32)}}, "nz must be -2"),
         ({"W": GOOD | {"nz": np.array([5], np.int32), "p": np.zeros(4, np.int32)}}, "nz announces 5 triplets"),
-        ({"W": GOOD | {"nz": np.array([3], np.int32), "p": np.array([0, 1, 3], np.int32)}}, "3 rows and 3 columns are"),
-        ({"mu": [-0.5]}, "mu"), ({"spacedim": 2}, "has 3 rows, which is not a multiple of spacedim = 2"),
+        ({"W": GOOD | {"nz": np.array([3], np.int32), "p": np.array([0, 1, 3], np.int32)}}, "outside of the matrix"),
+        ({"mu": [-0.5]}, "mu"), ({"spacedim": 2}, "has 3 rows; a multiple of spacedim = 2"),
         ({"spacedim": 5}, "2 or 3 is needed"),
     ],
 )  # fmt: skip

@@ -85,7 +85,7 @@ def test_recorder_accepts_single_problems_and_pairs(tmp_path):
             recorder.add([problem], np.ones(2))
     assert recorder.files == ("step_000000_world_0000.npz", "step_000001_world_0000.npz")
     assert lv.io.read_recorded_state(tmp_path / "a", recorder.files[0])["time"] == 0.5
-    with pytest.raises(lv.InputError, match="recorded without state"):
+    with pytest.raises(lv.InputError, match="recorded with state="):
         lv.io.read_recorded_state(tmp_path / "a", recorder.files[1])
 
 
