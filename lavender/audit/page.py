@@ -149,13 +149,15 @@ class AuditCounts:
         self.errors = np.where(audit.is_judged, audit.numbers[0], np.nan)
         at_floor = audit.verdict == VERDICTS.index(AT_FLOOR)
         self.sizes = np.where(at_floor, 0.0, self.errors)  # Steps at their floor never count.
+        errors = self.errors[audit.is_judged & ~at_floor]
+        close, within = (int((errors <= limit).sum()) for limit in (audit.threshold, self.limit))
         with np.errstate(invalid="ignore"):
             self.is_above = self.sizes > self.limit
         self.n, self.above = audit.n_judged, int(self.is_above.sum())
         self.classes = [
             ("rounding only", int((at_floor & audit.is_judged).sum())),
-            (f"up to {format_speed(audit.threshold)}", self._count(0.0, audit.threshold, at_floor)),
-            (f"up to {format_speed(self.limit)}: the limit", self._count(audit.threshold, self.limit, at_floor)),
+            (f"up to {format_speed(audit.threshold)}", close),
+            (f"up to {format_speed(self.limit)}: the limit", max(within - close, 0)),
             (f"more than {format_speed(self.limit)}", self.above),
         ]  # fmt: skip
         self.largest = float(np.nanmax(self.sizes)) if self.n else 0.0
@@ -163,12 +165,6 @@ class AuditCounts:
         self.world, self.step = map(int, np.unravel_index(place, self.sizes.shape))
         own = next((w for w in audit.worst if (w.world, w.step) == (self.world, self.step)), None)
         self.row, self.unit = split_row_unit("" if own is None else own.where)
-
-    def _count(self, low: float, high: float, at_floor: Any) -> int:
-        """Count the steps that are not at their floor with an error in (low, high], or at 0 if low is 0."""
-        with np.errstate(invalid="ignore"):
-            inside = (self.errors <= high) & ((self.errors > low) | (low == 0.0))
-        return int((inside & ~at_floor).sum())
 
     # -- sentences -----------------------------------------------------------------------------------------
 

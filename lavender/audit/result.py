@@ -330,16 +330,13 @@ class Audit:
     @property
     def errors(self) -> pd.DataFrame:
         """Quantiles of the errors over all steps judged, and over unconverged and wrong ones."""
-        columns: dict[str, Any] = {"quantile": QUANTILE_NAMES}
-        for name, selected, x in (
-            ("velocity [m/s]", self.is_judged, self.numbers[0]),
-            ("impulse [N s]", self.is_judged, self.numbers[1]),
-            ("velocity, unconverged [m/s]", self.is_unconverged, self.numbers[0]),
-        ):
-            known = x[selected & np.isfinite(x)]
-            if len(known):
-                columns[name] = np.quantile(known, QUANTILES, method="higher")
-        return _make_frame(columns if len(columns) > 1 else {})
+        return _tabulate_quantiles(
+            {
+                "velocity [m/s]": self.numbers[0][self.is_judged],
+                "impulse [N s]": self.numbers[1][self.is_judged],
+                "velocity, unconverged [m/s]": self.numbers[0][self.is_unconverged],
+            }
+        )
 
     @property
     def worst_rows(self) -> pd.DataFrame:
@@ -389,13 +386,9 @@ class Audit:
         """Errors and counts of this model and of the other one on the same states."""
         if self.against is None:
             return _make_frame({})
-        columns: dict[str, Any] = {"quantile": QUANTILE_NAMES}
-        both = self.is_judged & self.against.is_judged
-        for prefix, one in (("", self), ("against ", self.against)):
-            if both.any():
-                errors = one.numbers[0][both]
-                columns[f"{prefix}{one.runs.name} [m/s]"] = np.quantile(errors, QUANTILES, method="higher")
-        return _make_frame(columns if both.any() else {})
+        other, both = self.against, self.is_judged & self.against.is_judged
+        names = f"{self.runs.name} [m/s]", f"against {other.runs.name} [m/s]"
+        return _tabulate_quantiles({names[0]: self.numbers[0][both], names[1]: other.numbers[0][both]})
 
     # -- files ---------------------------------------------------------------------------------------------
 
@@ -474,6 +467,13 @@ class Audit:
         short = [self.comparison, self.claims, classes, self.worst_rows.head(3), self.worst_steps]
         last = format_provenance(self.provenance)
         return ResultPage(partial(make_audit_page, self), self.totals, short, self.is_stopped, last)
+
+
+def _tabulate_quantiles(errors: dict[str, Any]) -> pd.DataFrame:
+    """Build the table of `QUANTILES` of some errors; columns without a finite error are left out."""
+    known = {name: x[np.isfinite(x)] for name, x in errors.items()}
+    columns = {name: np.quantile(x, QUANTILES, method="higher") for name, x in known.items() if len(x)}
+    return _make_frame({"quantile": QUANTILE_NAMES, **columns} if columns else {})
 
 
 def _make_frame(columns: Any, rows: Sequence[Any] | None = None) -> pd.DataFrame:

@@ -111,7 +111,15 @@ def report(
     check_columns(options["columns"])
     for kind in options["figure_kinds"]:
         check_choice("figure-kinds", kind, FILE_KINDS)
-    _reject_unused_options(context, files, options)
+    shows_records = any(f.endswith(".jsonl") for f in files)
+    has_model = any(Path(f).suffix.lower() in MODEL_SUFFIXES for f in files)
+    reject_options_without_effect(
+        context, shows_records=shows_records, is_campaign=not shows_records and is_campaign(context),
+        sweeps=options["sweeps"], without_model=not has_model,
+        without_random=has_model and context.params["control"] != "random",
+        # Records may contain solvers that are not installed.
+        **describe_solvers(None if shows_records else options["solvers"]),
+    )  # fmt: skip
     check_writable(out, folder=True)
     used_folders: set[Path] = set()
     recording = {name: options[name] for name in RECORDING_NAMES}
@@ -192,21 +200,6 @@ def _list_suite() -> None:
     for name, names in suite.SETS.items():
         print_escaped(f"@{name}", style="bold")
         print_escaped(f"    {len(names)} cases: {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}")
-
-
-def _reject_unused_options(
-    context: click.Context, files: tuple[str, ...], options: Mapping[str, Any]
-) -> None:
-    """Raise InputError for each option that would be ignored."""
-    shows_records = any(f.endswith(".jsonl") for f in files)
-    has_model = any(Path(f).suffix.lower() in MODEL_SUFFIXES for f in files)
-    reject_options_without_effect(
-        context, shows_records=shows_records, is_campaign=not shows_records and is_campaign(context),
-        sweeps=options["sweeps"], without_model=not has_model,
-        without_random=has_model and context.params["control"] != "random",
-        # Records may contain solvers that are not installed.
-        **describe_solvers(None if shows_records else options["solvers"]),
-    )  # fmt: skip
 
 
 def _record_model(word: str, out: Path, used_folders: set[Path], recording: Mapping[str, Any]) -> str:

@@ -77,23 +77,12 @@ def _check_head(own: State, new: State, sweeps: tuple[int, int], is_lost: bool) 
     n, top = int(own.size[SIZE["bodies"]]), 2**31 - 1
     contacts = int(new.size[CAP_CONTACT])
     per = int(own.size[SIZE["rows_per_contact"]])
+    counters = dict.fromkeys(("step", "need_pairs", "need_contacts", "rebuilds", "projected"), (0, top))
     ranges = {
-        "contacts": (0, contacts),
-        "contact_rows": (0, contacts * per),
-        "pairs": (0, int(new.size[CAP_PAIR])),
-        "pairs_valid": (0, 1),
-        "matches": (0, contacts),
-        "cached": (0, contacts),
-        "iterations": sweeps,
-        "warm_start": (0, 1),
-        "step": (0, top),
-        "need_pairs": (0, top),
-        "need_contacts": (0, top),
-        "rebuilds": (0, top),
-        "projected": (0, top),
-        "lost": (0, n - 1) if is_lost else (-1, -1),
-        "solved": (0, 1),
-    }
+        **counters, **dict.fromkeys(("contacts", "matches", "cached"), (0, contacts)),
+        **dict.fromkeys(("pairs_valid", "warm_start", "solved"), (0, 1)), "contact_rows": (0, contacts * per),
+        "pairs": (0, int(new.size[CAP_PAIR])), "iterations": sweeps, "lost": (0, n - 1) if is_lost else (-1, -1),
+    }  # fmt: skip
     for name, (low, high) in ranges.items():
         value = new.head[HEAD[name]]
         require_intact(low <= value <= high, f"{name} is {value}, not {low} to {high}")

@@ -183,16 +183,13 @@ class State:
 def _put_parameters(state: State, p: Parameters) -> None:
     """Write the parameters of a scene to `head` and `setting`."""
     head, setting = state.head, state.setting
-    setting[SETTING["h"]] = p.dt / p.substeps
     setting[SETTING["gravity"] : SETTING["gravity"] + 3] = p.gravity
-    setting[SETTING["slop"]] = p.slop
-    setting[SETTING["margin"]] = p.margin
-    setting[SETTING["skin"]] = 5.0 * p.margin
-    setting[SETTING["beta"]] = BETA
-    setting[SETTING["max_push"]] = MAX_PUSH
-    setting[SETTING["bounce"]] = p.restitution_threshold
-    setting[SETTING["match"]] = 5.0 * p.margin
-    setting[SETTING["rolling"]] = p.rolling_radius
+    numbers = {
+        "h": p.dt / p.substeps, "slop": p.slop, "margin": p.margin, "skin": 5.0 * p.margin, "beta": BETA,
+        "max_push": MAX_PUSH, "bounce": p.restitution_threshold, "match": 5.0 * p.margin, "rolling": p.rolling_radius,
+    }  # fmt: skip
+    for name, x in numbers.items():
+        setting[SETTING[name]] = x
     head[HEAD["iterations"]] = p.solver_iterations
     head[HEAD["warm_start"]] = p.warm_start
     head[HEAD["position_iterations"]] = p.position_iterations

@@ -327,13 +327,11 @@ class Scene:
         world_axis = (
             check_unit_vector(f"axis of {label}", axis) if kind == HINGE else np.array([0.0, 0.0, 1.0])
         )
-        if (motor_speed is not None or motor_torque is not None) and kind != HINGE:
+        motor = motor_speed is not None, motor_torque is not None
+        if any(motor) and not (all(motor) and kind == HINGE):
             raise InputError(
-                f"{label}: motor_speed and motor_torque are given, but only a hinge has a motor: leave them "
-                "out, or make it a hinge"
+                f"{label}: motor_speed and motor_torque need each other, and a hinge: give both or none"
             )
-        if (motor_speed is None) != (motor_torque is None):
-            raise InputError(f"{label}: one of motor_speed and motor_torque is given; a motor needs both")
         joint = Joint(
             kind=kind,
             name=label,

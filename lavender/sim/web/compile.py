@@ -39,14 +39,8 @@ from typing import Any
 
 #: Modules of lavender_ext that the page uses.
 MODULES = (
-    "core.order",
-    "engine.arrays",
-    "engine.substep",
-    "driver.memory",
-    "judge.measure",
-    "sweep.packed",
-    "sweep.pgs",
-)
+    "core.order", "engine.arrays", "engine.substep", "driver.memory", "judge.measure", "sweep.packed", "sweep.pgs",
+)  # fmt: skip
 #: Largest size of a finished module [bytes].
 MAX_MODULE_BYTES = 270_000
 
@@ -62,20 +56,11 @@ class Part:
 #: Modules of the page by name; the first is independent.
 PARTS = {
     "lavender": Part(MODULES),
-    "newton": Part(
-        (
-            "core.order",
-            "engine.newton_substep",
-            "factor.linear",
-            "factor.symbolic",
-            "judge.measure",
-            "newton.solve",
-            "newton.warm_start",
-            "sweep.pgs",
-        ),
-        imports_memory=True,
-    ),
-}
+    "newton": Part((
+        "core.order", "engine.newton_substep", "factor.linear", "factor.symbolic", "judge.measure", "newton.solve",
+        "newton.warm_start", "sweep.pgs",
+    ), imports_memory=True),
+}  # fmt: skip
 EXTRACT_C: dict[str, Any] = runpy.run_path(str(Path(__file__).resolve().with_name("extract_c.py")))
 #: Name of the custom section with the hash of the sources, the last section of the file.
 SOURCES_SECTION = "lavender.sources"
@@ -123,13 +108,9 @@ def is_current(path: Path, root: Path, part: Part) -> bool:
 
 
 def build(
-    out: Path,
-    root: Path,
-    modules: Iterable[str | Path] = MODULES,
-    *,
-    max_bytes: int | None = None,
+    out: Path, root: Path, modules: Iterable[str | Path] = MODULES, *, max_bytes: int | None = None,
     imports_memory: bool = False,
-) -> Built:
+) -> Built:  # fmt: skip
     """Build one WebAssembly module from the core functions of several kernel modules.
 
     Parameters
@@ -165,14 +146,13 @@ def build(
             raise BuildFailed(str(error)) from None
         data = _compile_to_wasm(source, names, ["--import-memory"] if imports_memory else [])
     _check_module(data, MAX_MODULE_BYTES if max_bytes is None else max_bytes)
-    data += make_custom_section(SOURCES_SECTION, hash_sources(root, modules).encode())
-    out = out.resolve()  # If `out` is a symbolic link, replace its target and keep the link.
-    if out.exists() and not out.is_file():
-        raise BuildFailed(
-            f"cannot write {out}: it is not a file, and is not replaced; give the name of a file"
-        )
+    # A custom section has the number 0 and its length, one byte in LEB128 below 128.
+    section = bytes([len(SOURCES_SECTION)]) + SOURCES_SECTION.encode() + hash_sources(root, modules).encode()
+    data += bytes([0, len(section)]) + section
     try:
-        write_atomically(out, data)
+        write_atomically(
+            out.resolve(), data
+        )  # If `out` is a symbolic link, replace its target and keep the link.
     except OSError as error:
         raise BuildFailed(f"cannot write {out}: {error.strerror or error}") from None
     return Built(len(data), tuple(sorted(names)), shlex.join(_find_tools()[0]))
@@ -256,14 +236,6 @@ def _check_module(module: bytes, max_bytes: int) -> None:
             f"the module has {len(module)} bytes; below {max_bytes} bytes are allowed: remove kernels from "
             "its list, or raise MAX_MODULE_BYTES"
         )
-
-
-def make_custom_section(name: str, content: bytes) -> bytes:
-    """Return a custom section to append to a module. Its size must be below 128 bytes, one byte in LEB128."""
-    body = bytes([len(name)]) + name.encode() + content
-    if len(body) >= 128:
-        raise ValueError("a custom section longer than 127 bytes")
-    return bytes([0, len(body)]) + body
 
 
 if __name__ == "__main__":
