@@ -220,11 +220,13 @@ class NewtonScene:
         """Return whether all worlds have equal numbers of bodies and joints, so that states fit one array per name."""
         return self.n > 0 and all(len(getattr(self.before, name)) % self.n == 0 for name in NEWTON_STATE)
 
+    def _require_equal_worlds(self, advice: str) -> None:
+        if not self._has_equal_worlds:
+            raise InputError(f"the worlds of this scene have different bodies or joints, so {advice}")
+
     def set_state(self, state: EngineState) -> None:
         """Set the state of all worlds, arrays (n, ...), and clear the solver's warm start."""
-        if not self._has_equal_worlds:
-            reason = "states cannot be set in one array for all worlds: leave states out"
-            raise InputError(f"the worlds of this scene have different bodies or joints, so {reason}")
+        self._require_equal_worlds("states cannot be set in one array for all worlds: leave states out")
         given = [group for group in NEWTON_GROUPS if all(name in state for name in group)]
         if not given:
             raise InputError(
@@ -249,11 +251,9 @@ class NewtonScene:
         """Add noise to the velocities of the worlds from number `first`."""
         name = "joint_qd" if len(self.before.joint_qd) else "body_qd"
         velocity = getattr(self.before, name)
+        self._require_equal_worlds("noise cannot be added to their velocities: give spread=0")
         values = velocity.numpy().copy()
-        by_world = values.reshape(self.n, -1) if self._has_equal_worlds else None
-        if by_world is None:
-            reason = "noise cannot be added to their velocities: give spread=0"
-            raise InputError(f"the worlds of this scene have different bodies or joints, so {reason}")
+        by_world = values.reshape(self.n, -1)
         for world in range(first, self.n):
             by_world[world] += spread * np.random.default_rng([seed, world]).standard_normal(
                 by_world.shape[1]

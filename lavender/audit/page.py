@@ -102,14 +102,10 @@ def make_audit_page(audit: Any, folder: Path | None) -> Page:
 
         tables = [*counts.make_sizes_table(), *counts.make_rows_table()]
         if audit.worst:
-            rows: list[Any] = [
-                [
-                    f"worst_{i}.npz",
-                    (f"world {w.world}, step {w.step}", "q", ""),
-                    (split_row_unit(w.where)[0], "text", ""),
-                ]
-                for i, w in enumerate(audit.worst, 1)
-            ]
+            rows: list[Any] = []
+            for i, w in enumerate(audit.worst, 1):
+                place, row = f"world {w.world}, step {w.step}", split_row_unit(w.where)[0]
+                rows.append([f"worst_{i}.npz", (place, "q", ""), (row, "text", "")])
             command = f"lavender check {folder.parent / 'worst' / 'worst_1.npz'}"
             tables += [make_table(rows, title="Look at the worst steps"), {"code": command}]
         blocks.append({"pair": [[Markup(counts.draw_errors(folder))], tables]})
@@ -287,11 +283,8 @@ class AuditCounts:
             lines = []
             for b in bins:
                 some = errors[:, b][has_rows[:, b] & np.isfinite(errors[:, b])]
-                lines.append(
-                    np.quantile(some, quantiles, method="higher")
-                    if len(some)
-                    else np.full(len(quantiles), np.nan)
-                )
+                empty = np.full(len(quantiles), np.nan)
+                lines.append(np.quantile(some, quantiles, method="higher") if len(some) else empty)
             q = np.array([*lines, lines[-1]]).T
             return np.where(q < low, low / 2.0, q)
 
@@ -325,16 +318,8 @@ class AuditCounts:
             strip.set_xlabel("step")
             strip.set_yticks([])
             if self.largest:
-                strip.plot(
-                    [self.step + 0.5],
-                    [max(worlds / 60.0, 0.5)],
-                    "v",
-                    ms=6,
-                    color=INK,
-                    mfc="none",
-                    mew=1.2,
-                    clip_on=False,
-                )
+                style = {"ms": 6, "color": INK, "mfc": "none", "mew": 1.2, "clip_on": False}
+                strip.plot([self.step + 0.5], [max(worlds / 60.0, 0.5)], "v", **style)
             ends = ", ".join(
                 f"{name} {format_speed(float(y))}" for name, y in zip(QUANTILE_LINES, q[:, -1], strict=True)
             )

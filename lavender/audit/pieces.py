@@ -142,9 +142,8 @@ def judge_steps(
     residuals = residual_many(
         batch, frame.impulse, precision=judging.precision, threshold=judging.threshold, errors="status"
     )
-    errors = residuals.velocity_error, residuals.impulse_error, residuals.relative, residuals.roundoff_floor
-    numbers = np.array(errors)
-    verdicts = residuals.verdict
+    r, verdicts = residuals, residuals.verdict
+    numbers = np.array([r.velocity_error, r.impulse_error, r.relative, r.roundoff_floor])
     verdict = np.full(len(verdicts), NOT_JUDGED, np.int8)
     measured = np.isfinite(numbers[0])
     for i, word in enumerate(VERDICTS):

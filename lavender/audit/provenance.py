@@ -50,15 +50,8 @@ def format_provenance(entries: dict[str, Any]) -> str:
     timestep = [] if entries["timestep"] is None else [f"{entries['timestep']:g} s"]
     model = " ".join(filter(None, (entries["model"], entries["model_hash"])))
     engine = " ".join(filter(None, (entries["engine"], entries["engine_version"])))
-    parts = [
-        engine,
-        f"lavender {entries['lavender']}",
-        *settings,
-        *timestep,
-        model,
-        entries["date"],
-        entries["command"],
-    ]
+    parts = [engine, f"lavender {entries['lavender']}", *settings, *timestep, model]
+    parts += [entries["date"], entries["command"]]
     return ", ".join(filter(None, parts))
 
 

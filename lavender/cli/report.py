@@ -45,22 +45,15 @@ from lavender.io.stored import check_writable
               help="Treat each FOLDER as consecutive steps of a simulation, and carry impulses from step to step. "
               "Default: only folders of recorded steps, as `lavender run --record` and `lavender record` write them.",
 )  # fmt: skip
-@click.option(
-    "--workers",
-    type=int,
-    default=None,
-    help="Measure error and robustness without times, with this number of processes; -1: one for each core.",
-)
+@click.option("--workers", type=int,
+              help="Measure error and robustness without times, with this number of processes; -1: one for each core.",
+)  # fmt: skip
 @click.option("--backend", default="loky", show_default=True,
               help="The same with the workers of a backend of joblib, such as dask.")  # fmt: skip
 @click.option("--compare", type=PATH, help="Compare with earlier records (.jsonl, or their folder).")
-@click.option(
-    "--time-budgets",
-    type=ListType(float),
-    default=(),
-    metavar="S,S,...",
-    help="Times in seconds for which the report lists the best solver; default: three decades about the fastest.",
-)
+@click.option("--time-budgets", type=ListType(float), default=(), metavar="S,S,...",
+              help="Times in seconds for which the report lists the best solver; default: three decades about the "
+              "fastest.")  # fmt: skip
 @click.option("--sweeps", is_flag=True,
               help="Answer how many sweeps a step needs: measure only fixed numbers of sweeps (--budgets) of the "
               "solvers that sweep, on recorded steps in sequence.")  # fmt: skip
@@ -150,15 +143,8 @@ def report(
         engines = read_engine_answers(files, measured.lines)
         limit = options["max_velocity_error"]
         limit = DEFAULT_ERROR_LIMIT if limit is None else limit
-        shown = Report(
-            measured.lines,
-            old,
-            options["time_budgets"],
-            engines,
-            limit,
-            options["figure_kinds"],
-            options["columns"],
-        )
+        kinds, columns = options["figure_kinds"], options["columns"]
+        shown = Report(measured.lines, old, options["time_budgets"], engines, limit, kinds, columns)
         # Write the files before printing, as a closed pipe can end the command while it prints. After Ctrl-C, the page
         # has no figures, so that the prompt is back soon.
         try:
@@ -182,10 +168,7 @@ def report(
         print_escaped(f"nothing was measured: {reasons}", style="yellow")
         raise click.exceptions.Exit(EXIT_UNMET)
     if (n_left_out := sum(map(len, shown.left_out.values()))) and not records_files:
-        print_escaped(
-            f"{format_count(n_left_out, 'case')} left out of all numbers",
-            style="yellow",
-        )
+        print_escaped(f"{format_count(n_left_out, 'case')} left out of all numbers", style="yellow")
         raise click.exceptions.Exit(EXIT_UNMET)
 
 

@@ -32,12 +32,9 @@ from lavender.io.stored import check_figure_path, check_writable
               "Default: alternating.")  # fmt: skip
 @click.option("--solver", shell_complete=complete_solver,
               help="Solver of each step, by name. Default: sequential_impulses.")  # fmt: skip
-@click.option(
-    "--velocity-tol",
-    type=float,
-    metavar="M/S",
-    help="With --solver: velocity error that each solve must reach [m/s, rad/s], in place of its tolerance.",
-)
+@click.option("--velocity-tol", type=float, metavar="M/S",
+              help="With --solver: velocity error that each solve must reach [m/s, rad/s], in place of its tolerance.",
+)  # fmt: skip
 @click.option("--set", "parameters", multiple=True, metavar="NAME=VALUE",
               help="Set a parameter of the scene, e.g. n=20 or friction=0.3; may be repeated.")  # fmt: skip
 @click.option("--residual", is_flag=True, help="Also measure the judge's residual of all rows in every step.")

@@ -90,13 +90,8 @@ def record(
 @click.option(
     "--list", "list_only", is_flag=True, help="List the requirements that apply to the solver; run nothing."
 )
-@click.option(
-    "--out",
-    type=FOLDER,
-    default=Path("lavender-contract"),
-    show_default=True,
-    help="Folder for the problems on which requirements are not met; created for the first one.",
-)
+@click.option("--out", type=FOLDER, default=Path("lavender-contract"), show_default=True,
+              help="Folder for the problems on which requirements are not met; created for the first one.")  # fmt: skip
 @click.pass_context
 def contract(context: click.Context, name: str, list_only: bool, out: Path) -> None:
     """Check that a solver meets the requirements on every solver.
@@ -173,11 +168,7 @@ def _print_facts(results: dict[str, Any]) -> None:
     missing = [name for name, text in backends.items() if text.startswith("needs ")]
     wrong = {name: result for name, result in self_test.items() if result != "same"}
     shown = {
-        **{
-            key: value
-            for key, value in results.items()
-            if key not in ("self_test", "same_bits", "memory_bytes")
-        },
+        **{key: x for key, x in results.items() if key not in ("self_test", "same_bits", "memory_bytes")},
         "memory": f"{results['memory_bytes'] / 2**30:.1f} GiB",
         "load": "" if results["load"] is None else f"{results['load']:.1f}",
         "backends": "; ".join(f"{name}: {text}" for name, text in backends.items() if name not in missing),

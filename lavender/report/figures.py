@@ -184,11 +184,5 @@ def draw_error_against_time(
     error = "" if is_program else "; its error is that of the worst row"
     note = f"{slowest}{case} ({format_size(report.cases.loc[case])}). A mark is a run{error} (records.csv)."
     texts = ["time of the last run", *(f"{name} {format_time(own[-1, 0])}" for name, own in lines.items())]
-    return draw_figure(
-        "error-against-time",
-        fill,
-        FIGURE_SIZE,
-        fit_margins(texts, 0.07, left_margin=0.14),
-        note=note,
-        folder=folder,
-    )
+    margins = fit_margins(texts, 0.07, left_margin=0.14)
+    return draw_figure("error-against-time", fill, FIGURE_SIZE, margins, note=note, folder=folder)

@@ -523,12 +523,9 @@ class Report(Contents):
                 "run": f"{run['run']}, started {run['started']}; {', '.join(counts)}",
                 "machine": f"{run['cpu']}, {run['cores']} cores; {run['platform']}",
                 "threads": f"{run['threads']} for BLAS and OpenMP while timing; runs are serial",
-                **{
-                    name: "; ".join(f"{key} {x}" for key, x in some.items())
-                    for name, some in lists.items()
-                    if some
-                },
             }
+            texts = {name: "; ".join(f"{key} {x}" for key, x in some.items()) for name, some in lists.items()}
+            facts |= {name: text for name, text in texts.items() if text}
         return pd.DataFrame(facts.items(), columns=["fact", "value"], dtype=object)
 
     def _make_footer(self) -> list[Any]:

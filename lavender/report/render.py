@@ -45,20 +45,15 @@ def format_cells(frame: pd.DataFrame) -> pd.DataFrame:
     columns = [values.tolist() for _, values in frame.items()]
     is_float = [values.dtype.kind == "f" for _, values in frame.items()]
     times = [i for i, head in enumerate(heads) if is_float[i] and head.endswith(" [s]")]
-    sizes = [
-        i for i, head in enumerate(heads) if is_float[i] and re.search(r"\[[^%]+\]$", head) and i not in times
-    ]
-    texts = [
-        [
-            NONE
-            if x is None or x != x or x in (math.inf, -math.inf)
-            else f"{x:g}"
-            if is_float[i]
-            else escape_unprintable(str(x))
-            for x in column
-        ]
-        for i, column in enumerate(columns)
-    ]
+    sizes = [i for i, head in enumerate(heads) if is_float[i] and re.search(r"\[[^%]+\]$", head)]
+    sizes = [i for i in sizes if i not in times]
+
+    def write(x: Any, number: bool) -> str:
+        if x is None or x != x or x in (math.inf, -math.inf):
+            return NONE
+        return f"{x:g}" if number else escape_unprintable(str(x))
+
+    texts = [[write(x, number) for x in column] for column, number in zip(columns, is_float, strict=True)]
     unit, texts_of_times = format_times_in_one_unit([x for i in times for x in columns[i]])
     texts_of_sizes, n = format_sizes([x for i in sizes for x in columns[i]]), len(frame)
     for group, written in ((times, texts_of_times), (sizes, texts_of_sizes)):

@@ -41,10 +41,11 @@ from lavender.report.store import (
 from lavender.report.timing import (
     CampaignPlan,
     Plan,
-    Task,
+    Target,
     add_times,
     limit_to_one_thread,
     list_passes,
+    make_task,
     measure_task,
 )
 from lavender.report.workers import check_workers, connect_backend, map_unordered
@@ -304,12 +305,11 @@ class Runner:
             if spec is not None:
                 for target in list_passes(self.plan, spec):
                     self.report_progress(items[0].sequence, spec.name)
-                    limit = self.plan.time_limit
-                    tasks = [Task.of_case(case, spec.name, *target, limit, repeats) for case in cases]
-                    self.measure_pass(loaded, spec, tasks)
+                    tasks = [make_task(case, spec.name, *target, self.plan.time_limit) for case in cases]
+                    self.measure_pass(loaded, spec, tasks, repeats)
             self.done += len(items)
 
-    def measure_pass(self, problems: list[Item], spec: SolverSpec, tasks: list[Task]) -> None:
+    def measure_pass(self, problems: list[Item], spec: SolverSpec, tasks: list[Row], repeats: int) -> None:
         """Measure one pass. It ends, with a note, when its steps have taken `Plan.sequence_time_limit` together."""
         call, stride = tasks[0], -(-len(tasks) // MAX_MOTION_STEPS)
         limit, spent, made = self.plan.sequence_time_limit, 0.0, 0
@@ -319,30 +319,32 @@ class Runner:
                 break
             spent, made = spent + _get_elapsed_time(row), made + 1
             self.out.append(row)
-            self.report_progress(task.case, spec.name, row, True)
+            self.report_progress(task["case"], spec.name, row, True)
         before: tuple[Problem, FloatArray] | None = None
-        if call.start == "carried" and 0 < made < len(tasks) and spent <= limit:
+        if call["start"] == "carried" and 0 < made < len(tasks) and spent <= limit:
             # If an earlier run was stopped in this pass, repeat its steps without records for the last step's impulses.
             for item, task in zip(problems[:made], tasks, strict=False):
-                again = replace(task, repeats=1)
-                before = self.measure_step(item, again, spec, before)[1]
+                before = self.measure_step(item, task, spec, before)[1]
         while made < len(tasks) and spent <= limit:
-            task = tasks[made]
-            if row and row["times"] and max(row["times"]) < UNGUARDED_TIME_RATIO * self.plan.time_limit:
-                task = replace(task, guarded=False)
-            row, before = self.measure_step(problems[made], task, spec, before, made % stride == 0)
+            is_quick = (
+                row and row["times"] and max(row["times"]) < UNGUARDED_TIME_RATIO * self.plan.time_limit
+            )
+            how = {"repeats": repeats, "is_guarded": not is_quick}
+            row, before = self.measure_step(
+                problems[made], tasks[made], spec, before, made % stride == 0, **how
+            )
             self.add_row(row)
             self.report_progress(row["case"], spec.name, row)
             spent, made = spent + _get_elapsed_time(row), made + 1
         if made < len(tasks):
-            target = describe_target(call.mode, call.tol, call.max_iter)
+            target = describe_target(call["mode"], call["tol"], call["max_iter"])
             took = f"which took more than the pass limit of {limit:.3g} s together (--sequence-time-limit)"
             reason = f"stopped after {made} of {len(tasks)} steps, {took}"
-            self.add_skip(f"{problems[0].sequence}, {target}, {call.start}", spec.name, reason)
+            self.add_skip(f"{problems[0].sequence}, {target}, {call['start']}", spec.name, reason)
 
     def measure_step(
-        self, item: Item, task: Task, spec: SolverSpec, before: tuple[Problem, FloatArray] | None,
-        with_motion: bool = False,
+        self, item: Item, task: Row, spec: SolverSpec, before: tuple[Problem, FloatArray] | None,
+        with_motion: bool = False, **how: Any,
     ) -> tuple[Row, tuple[Problem, FloatArray] | None]:  # fmt: skip
         """Measure one step; if its task has start "carried", start from the previous problem and impulses.
 
@@ -351,16 +353,17 @@ class Runner:
         been carried for long. `with_motion` adds the error of the motion, which is not timed.
         """
         start, problem = None, item.problem
-        is_first = task.start == "carried" and task.mode == "budget" and before is None
-        if task.start == "carried":
+        is_carried, is_budget = task["start"] == "carried", task["mode"] == "budget"
+        is_first = is_carried and is_budget and before is None
+        if is_carried:
             begun = perf_counter()
             if is_first and problem.guess is not None:
                 start = problem.guess
             else:
                 start = problem.start() if before is None else carry_impulses(*before, problem)
-            task = replace(task, carry_time=perf_counter() - begun)
-        row, impulse = self.measure_task(problem, task, spec, start)
-        if with_motion and task.mode == "budget" and spec.order and impulse is not None:
+            task = task | {"carry_time": perf_counter() - begun}
+        row, impulse = self.measure_task(problem, task, spec, start, **how)
+        if with_motion and is_budget and spec.order and impulse is not None:
             error = motion_error(problem, impulse)
             # Without bodies, the largest difference of a row's velocity counts.
             speed = error.rows if error.speed is None else error.speed
@@ -394,25 +397,28 @@ class Runner:
         if spec is None:
             return
 
-        def measure_or_reuse(task: Task) -> Row:
-            """Measure one task, or return its row if an earlier run stored it."""
+        def measure_or_reuse(target: Target, repeats: int) -> Row:
+            """Measure one target, or return its row if an earlier run stored it."""
+            task = make_task(case, spec.name, *target, self.plan.time_limit)
             row = self.known.get(get_key(task))
             reused = row is not None
             if row is not None:
                 self.out.append(row)
             else:
-                row = self.measure_task(problem, task, spec, None)[0]
+                row = self.measure_task(problem, task, spec, None, repeats=repeats)[0]
                 self.add_row(row)
             self.report_progress(case["case"], spec.name, row, reused)
             return row
 
         self.plan.measure_solver(case, spec, measure_or_reuse)
 
-    def measure_task(self, problem: Problem, task: Task, spec: SolverSpec, impulse: Any) -> tuple[Row, Any]:
+    def measure_task(
+        self, problem: Problem, task: Row, spec: SolverSpec, impulse: Any, **how: Any
+    ) -> tuple[Row, Any]:  # fmt: skip
         """Solve a task; return its row and impulses (m,) [N s]."""
         if self.plan.campaign and not (spec.external or spec.requires or spec.distribution):
-            task = replace(task, time_limit=math.inf)
-        row, found = measure_task(problem, task, impulse)
+            task = task | {"time_limit": math.inf}
+        row, found = measure_task(problem, task, impulse, **how)
         if found is not None:
             row["solution_hash"] = hashlib.sha256(found.tobytes()).hexdigest()[:16]
         if self.plan.campaign:  # Without times, and with the plan's limit, rows are equal on all machines.

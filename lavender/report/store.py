@@ -64,9 +64,9 @@ def describe_target(mode: str, tol: float, max_iter: int) -> str:
     return f"{max_iter} iterations" if mode == "budget" else f"to {format_tolerance(tol)}"
 
 
-def get_key(row: Any) -> tuple[Any, ...]:
-    """Return the key of a measurement from its row or task: the values of the columns `KEY`."""
-    return tuple(row[name] if isinstance(row, Mapping) else getattr(row, name) for name in KEY)
+def get_key(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Return the key of a measurement from its row: the values of the columns `KEY`."""
+    return tuple(row[name] for name in KEY)
 
 
 def to_jsonable(value: Any) -> Any:

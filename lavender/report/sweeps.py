@@ -179,25 +179,19 @@ class SweepStudy:
                 return errors.where(errors.isna() | (errors >= low), low / 2.0)
 
             for i, group in enumerate(self.groups):
-                own, name = (
-                    self.errors.loc[group[0]],
-                    group[0] + f" (+{len(group) - 1} equal)" * (len(group) > 1),
-                )
+                own, equal = self.errors.loc[group[0]], f" (+{len(group) - 1} equal)" * (len(group) > 1)
                 axes.plot(self.budgets, place(own), color=colors[i], marker=MARKERS[i % 6], ms=4.5, clip_on=False,
                           lw=1.4 if i else 2.4, ls="-" if i < 5 else "--")  # fmt: skip
                 if (last := own.last_valid_index()) is not None:
-                    labels.append(Label(float(place(own)[last]), name, colors[i], "normal" if i else "bold"))
+                    labels.append(
+                        Label(float(place(own)[last]), group[0] + equal, colors[i], "normal" if i else "bold")
+                    )
             if self.start == "carried" and self.first in self.cold.index:
                 axes.plot(self.budgets, place(self.cold.loc[self.first]), color=BLUE, lw=0.9, ls=(0, (3, 2)))
             best = self._find_smallest(self.first)
             if best is not None:
-                axes.plot(
-                    [best, best],
-                    [low / 4.0, place(self.errors.loc[self.first])[best]],
-                    color=BLUE,
-                    lw=0.8,
-                    ls=":",
-                )
+                drop = [low / 4.0, place(self.errors.loc[self.first])[best]]
+                axes.plot([best, best], drop, color=BLUE, lw=0.8, ls=":")
             iterations = self.answers["iterations"].dropna()
             if len(iterations):
                 x, y = float(iterations.max()), max(float(self.answers["velocity"].max()), low / 2.0)

@@ -13,11 +13,11 @@ import json
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cache
 from statistics import median
 from time import perf_counter
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -40,6 +40,7 @@ DEFAULT_SEQUENCE_TIME_LIMIT = 5.0  # [s] Time limit of one pass over a sequence.
 UNLIMITED_ITERATIONS = 10_000_000  # Iteration limit of a run to a tolerance; the time limit ends it first.
 HANG_LIMIT = 60.0  # [s] Time limit of a solver of another package in a campaign.
 LONG_TIME = 0.05  # [s] A call that took longer is not repeated: caches and the clock hardly affect its time.
+Target: TypeAlias = tuple[str, float, int, str]  # Mode, tol, max_iter and start of a run.
 CLAIM_STATUSES = (Status.CONVERGED, Status.ROUNDOFF_LIMIT, Status.INFEASIBLE)
 # A run that missed its tolerance with one of these reaches no tighter tolerance either.
 HOPELESS_STATUSES = ("TIME_LIMIT", "ERROR", "INFEASIBLE")
@@ -52,43 +53,13 @@ CARRIED_START = (
 )
 
 
-@dataclass(frozen=True)
-class Task:
-    """One measurement of a solver on a case.
-
-    If `guarded` is true, the first call has the time limit; without it no call has. `carry_time` [s] is the time that
-    was spent before the call to map the impulses of the previous step. For the other fields see the columns of runs.
-    """
-
-    run: str
-    case: str
-    sha: str
-    solver: str
-    mode: str
-    tol: float
-    max_iter: int
-    time_limit: float
-    start: str = "cold"
-    repeats: int = 1
-    step: int = -1
-    guarded: bool = True
-    carry_time: float = math.nan
-
-    @classmethod
-    def of_case(
-        cls, case: Row, solver: str, mode: str, tol: float, max_iter: int, start: str, limit: float, repeats: int = 1
-    ) -> Task:  # fmt: skip
-        """Create the task of a solver on a case."""
-        own = case["run"], case["case"], case["sha"], solver
-        return cls(*own, mode, tol, max_iter, limit, start, repeats=repeats, step=case["step"])
-
-    def make_row(self, times: Sequence[float] = (), **results: Any) -> Row:
-        """Return the row of this task with the times [s] of its repetitions and other results."""
-        shared = {"kind": "run", **{name: getattr(self, name) for name in _SHARED}}
-        return add_times(RUN_COLUMNS | shared | results, times)
-
-
-_SHARED = tuple(f.name for f in fields(Task) if f.name in RUN_COLUMNS)
+def make_task(
+    case: Row, solver: str, mode: str, tol: float, max_iter: int, start: str, time_limit: float
+) -> Row:  # fmt: skip
+    """Return the row of a measurement of a solver on a case before it is made."""
+    own = {name: case[name] for name in ("run", "case", "sha", "step")}
+    target = {"solver": solver, "mode": mode, "tol": tol, "max_iter": max_iter, "start": start}
+    return {"kind": "run"} | RUN_COLUMNS | own | target | {"time_limit": time_limit}
 
 
 def add_times(row: Row, times: Sequence[float]) -> Row:
@@ -138,15 +109,15 @@ def _import_solver_code(solver: str, call: str) -> None:
             make_case(tiny).solve(solver, time_limit=limit)
 
 
-def _start_workers(case: ContactCase, task: Task) -> None:
+def _start_workers(case: ContactCase, solver: str) -> None:
     """Start the processes that a call with a time limit uses: a process was ended if its call exceeded the limit."""
-    spec = registry.get(task.solver)
+    spec = registry.get(solver)
     if spec.delegates and case.problem.qp is not None:
         solvers = [backend.load()() for backend in program_backends()]
     else:
         solvers = [spec.load()()] if spec.external and spec.builtin else []
-    for solver in solvers:
-        solver.start_workers(None, 0.0)
+    for backend in solvers:
+        backend.start_workers(None, 0.0)
 
 
 @cache
@@ -182,30 +153,34 @@ def _stabilise_timing(solver: str) -> Iterator[None]:
             gc.enable()
 
 
-def measure_task(problem: Problem, task: Task, impulse: Any = None) -> tuple[Row, FloatArray | None]:
+def measure_task(
+    problem: Problem, task: Row, impulse: Any = None, repeats: int = 1, is_guarded: bool = True
+) -> tuple[Row, FloatArray | None]:  # fmt: skip
     """Make one measurement; return its row and the final impulses (m,) [N s] or None.
 
-    An exception of the solver becomes a row of status ERROR. `impulse` is the start for `start="carried"`; "cold"
-    starts from Pi(0), "warm" from the problem's guess.
+    An exception of the solver becomes a row of status ERROR. `impulse` is the start for the start "carried"; "cold"
+    starts from Pi(0), "warm" from the problem's guess. With `is_guarded`, the first of the repeated calls has the time
+    limit; else no call has.
     """
     times: list[float] = []
     calibration_times: list[float] = []
     try:
         case = make_case(problem)
-        _import_solver_code(task.solver, case.call)
-        with _stabilise_timing(task.solver):
+        _import_solver_code(task["solver"], case.call)
+        with _stabilise_timing(task["solver"]):
             begun = perf_counter()
-            while len(times) < max(1, task.repeats):
+            while len(times) < repeats:
                 calibration_times.append(measure_calibration_time())
-                solution, elapsed = _time_call(case, task, impulse, limited=task.guarded and not times)
+                solution, elapsed = _time_call(case, task, impulse, limited=is_guarded and not times)
                 times.append(elapsed)
-                late = elapsed > LONG_TIME or perf_counter() - begun > task.time_limit
+                late = elapsed > LONG_TIME or perf_counter() - begun > task["time_limit"]
                 if late or solution.status is Status.TIME_LIMIT:
                     break
     except Exception as error:
         # A backend may raise any exception; only its own record is lost.
-        return task.make_row(status=ERROR, message=f"{type(error).__name__}: {error}".strip()[:500]), None
-    row = make_row(problem, task, solution, times, min(calibration_times))
+        message = f"{type(error).__name__}: {error}".strip()[:500]
+        return add_times(task | {"status": ERROR, "message": message}, ()), None
+    row = add_times(make_row(problem, task, solution) | {"calibration_time": min(calibration_times)}, times)
     return row, solution.impulse if np.isfinite(solution.impulse).all() else None
 
 
@@ -223,43 +198,40 @@ def measure_calibration_time() -> float:
     return perf_counter() - start_time
 
 
-def _time_call(case: ContactCase, task: Task, impulse: Any, limited: bool) -> tuple[Solution, float]:
+def _time_call(case: ContactCase, task: Row, impulse: Any, limited: bool) -> tuple[Solution, float]:
     """Make the call once, with the time limit if `limited`, and return its solution and time [s].
 
     A plug-in may not test convergence and would then use all iterations: it runs with its default limit first.
     """
-    spec = registry.get(task.solver)
-    arguments: dict[str, Any] = {"tol": task.tol, "max_iter": task.max_iter or None}
+    solver, largest, arguments = task["solver"], task["max_iter"] or None, {"tol": task["tol"]}
     if limited:
-        arguments["time_limit"] = task.time_limit
-        _start_workers(case, task)
-    if task.start == "carried":
+        arguments["time_limit"] = task["time_limit"]
+        _start_workers(case, solver)
+    if task["start"] == "carried":
         arguments["impulse"] = case.problem.start() if impulse is None else impulse
-    limits = [None] if task.mode == "tol" and not spec.builtin and task.max_iter else []
-    for max_iter in (*limits, task.max_iter or None):
-        fresh = case.copy(task.start)
+    limits = [None] if task["mode"] == "tol" and not registry.get(solver).builtin and largest else []
+    for max_iter in (*limits, largest):
+        fresh = case.copy(task["start"])
         start_time = perf_counter()
-        solution = fresh.solve(task.solver, **{**arguments, "max_iter": max_iter})
+        solution = fresh.solve(solver, **arguments, max_iter=max_iter)
         elapsed = perf_counter() - start_time
         if raise_if_interrupted(solution).status is not Status.MAX_ITERATIONS:
             break
     return solution, elapsed
 
 
-def make_row(
-    problem: Problem, task: Task, s: Solution, times: Sequence[float], calibration_time: float
-) -> Row:
-    """Return the row of a measurement. `times` [s] has its repeats, of which the last returned the solution `s`."""
+def make_row(problem: Problem, task: Row, s: Solution) -> Row:
+    """Return the row of a measurement that returned the solution `s`, without times of calls."""
     is_false = s.claim_check == CONTRADICTED
-    observed = explain_contradicted_claim(task.solver, problem, s.status) if is_false else ""
-    return task.make_row(
-        times, status=s.status.name, success=bool(s.success) and task.mode == "tol", claim_check=s.claim_check,
-        status_conflict="; ".join(filter(None, (s.status_conflict, observed))),
-        claims=s.status in CLAIM_STATUSES, iterations=int(s.iterations),
-        work=json.dumps({k: int(v) for k, v in s.work.items()}), form=s.solver.form, message=s.message[:500],
-        setup_time=s.setup_time, solve_time=s.solve_time, calibration_time=calibration_time,
-        load=machine.count_runnable_processes(), **make_case(problem).judge(s),
-    )  # fmt: skip
+    observed = explain_contradicted_claim(task["solver"], problem, s.status) if is_false else ""
+    results = {
+        "status": s.status.name, "success": bool(s.success) and task["mode"] == "tol", "claim_check": s.claim_check,
+        "status_conflict": "; ".join(filter(None, (s.status_conflict, observed))),
+        "claims": s.status in CLAIM_STATUSES, "iterations": int(s.iterations),
+        "work": json.dumps({k: int(v) for k, v in s.work.items()}), "form": s.solver.form, "message": s.message[:500],
+        "setup_time": s.setup_time, "solve_time": s.solve_time, "load": machine.count_runnable_processes(),
+    }  # fmt: skip
+    return task | results | make_case(problem).judge(s)
 
 
 # -- plans -------------------------------------------------------------------------------------------------
@@ -323,33 +295,27 @@ class Plan:
         for name in ("warm", "campaign"):
             check_bool(name, getattr(self, name))
 
-    def measure_solver(self, case: Row, spec: SolverSpec, make: Callable[[Task], Row]) -> None:
+    def measure_solver(self, case: Row, spec: SolverSpec, make: Callable[[Target, int], Row]) -> None:
         """Measure one solver on one case; each row decides the next measurement.
 
         Runs to a tolerance come first. An exact solver runs once, at the tightest tolerance; other solvers run at each
         tolerance, the loosest first. After a missed tolerance, a resumable solver does not run at tighter tolerances,
         since its iterates would be the same, nor does a solver that ran out of time. Then follow runs with fixed
-        budgets.
+        budgets, which are timed once.
         """
-
-        def measure_one(mode: str, tol: float, max_iter: int, start: str) -> Row:
-            """Make one measurement; a fixed number of iterations is timed once."""
-            repeats = 1 if mode == "budget" else self.repeats
-            return make(Task.of_case(case, spec.name, mode, tol, max_iter, start, self.time_limit, repeats))
-
         starts = ["cold"]
         if self.warm and case["guess"] == "start" and spec.impulse and not spec.exact:
             starts.append("warm")
         max_iterations = self.cap if spec.resumable else 0
         for start in starts:
             for tolerance in self.tolerances[-1:] if spec.exact else self.tolerances:
-                row = measure_one("tol", tolerance, max_iterations, start)
+                row = make(("tol", tolerance, max_iterations, start), self.repeats)
                 is_last = spec.resumable or str(row["status"]).startswith(HOPELESS_STATUSES)
                 if is_last and not row["relative"] <= tolerance:
                     break
             if spec.resumable and not spec.exact:
                 for n in self.budgets:
-                    measure_one("budget", 0.0, n, start)
+                    make(("budget", 0.0, n, start), 1)
 
 
 @dataclass(frozen=True)
@@ -367,8 +333,8 @@ class CampaignPlan(Plan):
     cap: int = 20_000
 
 
-def list_passes(plan: Plan, spec: SolverSpec) -> list[tuple[str, float, int, str]]:
-    """Return (mode, tol, max_iter, start) of each pass over a sequence, cold and with carried impulses."""
+def list_passes(plan: Plan, spec: SolverSpec) -> list[Target]:
+    """Return the target of each pass over a sequence, cold and with carried impulses."""
     max_iterations = UNLIMITED_ITERATIONS if spec.resumable else 0
     tolerances = plan.tolerances[-1:] if spec.exact else plan.tolerances
     targets = [("tol", tolerance, max_iterations) for tolerance in tolerances]

@@ -153,7 +153,7 @@ def test_tuning_choice_does_not_depend_on_the_worlds_held_back():
         held = [measured(10.0, 31.0), replace(first, error=np.full(100, error))]
         after = replace(before, held=held, held_errors={m.setting: float(m.error.max()) for m in held})
         assert (after.faster, after.closer) == (before.faster, before.closer) == (first, first)
-        assert after.choices["held back: time"].tolist()[1] == "0.90"
+        assert after.choices["time, held back"].tolist()[1] == "0.90"
 
 
 @pytest.mark.parametrize(("limit", "is_met"), [(1e-6, True), (0.0, False)])
@@ -168,7 +168,7 @@ def test_tune_with_an_error_limit_meets_it_on_held_back_worlds(boxes, monkeypatc
         if is_met and m.mean_step_time < 0.95 * choice.mean_step_time and not m.setting.changes_problem:
             assert max(m.error.max(), found.held_errors.get(m.setting, 0.0)) > limit
     shown = found.choices[found.choices["choice"].str.startswith(("most accurate", "fastest"))]
-    assert len(shown) == 1 and "–" not in shown["held back: time"].tolist()
+    assert len(shown) == 1 and "–" not in shown["time, held back"].tolist()
 
 
 def test_settings_that_are_judged_in_part_do_not_change_the_choice(boxes, monkeypatch):
@@ -230,7 +230,7 @@ def test_tune_stopped_by_ctrl_c_returns_the_measured_settings(boxes, monkeypatch
     found = tune(boxes(EARLY), worlds=2, steps=10, repeats=1, watch=watch)
     assert found.stopped and len(found.measured) == 5 and not found.held
     assert "Stopped before the end" in html_of(found, tmp_path)
-    assert (found.choices["held back: time"] == "–").all()
+    assert (found.choices["time, held back"] == "–").all()
 
 
 def test_ctrl_c_before_the_first_round_stops_tune(boxes, monkeypatch):

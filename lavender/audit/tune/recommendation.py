@@ -292,7 +292,7 @@ class Tuning:
             time = f"{m.mean_step_time / now.mean_step_time:.2f}"
             worst = format_speed(self._compute_largest_error(m))
             rows.append((name, m.setting.short_name, time, format_speed(m.worst_error), worst, *texts))
-        heads = ["choice", "option", "time", "1 %", "worst", "held back: time", "worst error"]
+        heads = ["choice", "option", "time", "1 %", "worst", "time, held back", "worst, held back"]
         return pd.DataFrame(rows, columns=heads)
 
     def draw_settings(self, folder: Path) -> str:
@@ -332,16 +332,9 @@ class Tuning:
             axes.set_ylabel("error that 1 % of the steps exceed [m/s]")
             label_ends(axes, labels)
             for i, (solver, (color, mark)) in enumerate(styles.items()):
-                axes.plot(
-                    [1.06],
-                    [0.97 - 0.07 * i],
-                    mark,
-                    color=color,
-                    ms=5,
-                    transform=axes.transAxes,
-                    clip_on=False,
-                )
-                write_label(axes, 1.1, 0.97 - 0.07 * i, solver, color=color)
+                y, style = 0.97 - 0.07 * i, {"transform": axes.transAxes, "clip_on": False}
+                axes.plot([1.06], [y], mark, color=color, ms=5, **style)
+                write_label(axes, 1.1, y, solver, color=color)
             fastest = self.pareto_front[0].mean_step_time / now.mean_step_time
             numbers = f"{len(points)} settings, fastest {fastest:.2f} of the time"
             return f"Error against time of {numbers}. {self.headline[0]}"

@@ -21,14 +21,10 @@ SCENE_ORDERS = (*ENGINE_ORDERS, "alternating")
 ON_FAILURE = ("use", "keep", "damp", "raise")
 #: Ranges of the numeric parameters.
 PARAMETER_RANGES: dict[str, dict[str, float]] = {
-    "dt": {"above": 0.0},
-    "friction": {"low": 0.0},
-    "restitution": {"low": 0.0, "high": 1.0},
-    **{
-        key: {"low": 0.0}
-        for key in ("patch_radius", "rolling_radius", "slop", "restitution_threshold", "margin")
-    },
-}
+    "dt": {"above": 0.0}, "restitution": {"low": 0.0, "high": 1.0},
+    **{key: {"low": 0.0} for key in ("friction", "patch_radius", "rolling_radius", "slop", "margin")},
+    "restitution_threshold": {"low": 0.0},
+}  # fmt: skip
 # Largest number of substeps that is computed from `max_substep`; more must be given as `substeps`.
 MAX_DEFAULT_SUBSTEPS = 10_000
 MIN_SWEEPS, MAX_SWEEPS = 4, 64  # Range of `solver_iterations` of sequential impulses.

@@ -10,7 +10,7 @@ from calls import BACKENDS
 import lavender as lv
 from lavender.external import backends
 from lavender.report.check import compare_with_reference
-from lavender.report.timing import Task, make_row
+from lavender.report.timing import make_row
 from lavender.solvers import registry
 
 OBSERVED = {b.name: b for b in backends.BACKENDS if b.behaviour is not None}
@@ -75,7 +75,7 @@ def test_note_of_a_contradicted_row_of_the_check_quotes_the_table():
     contradicted = replace(solution, status=lv.Status.CONVERGED, claim_check="contradicted", status_conflict="x")
     row = compare_with_reference(problem, "daqp", contradicted, None)
     assert "observed with daqp" in row.note and "x2 = 0.03" in row.note
-    task = Task(run="", case="", sha="", solver="daqp", mode="tol", tol=1e-6, max_iter=0, time_limit=1.0)
+    task = {"solver": "daqp", "mode": "tol"}
     for judged, is_quoted in ((contradicted, True), (solution, False)):
-        conflict = make_row(problem, task, judged, [1.0], 1e-3)["status_conflict"]
+        conflict = make_row(problem, task, judged)["status_conflict"]
         assert ("observed with daqp" in conflict and "x2 = 0.03" in conflict) == is_quoted
