@@ -47,7 +47,6 @@ cdef enum:
     MAX_CERTIFICATE_FACTORS = 4     # Factors of (1); each factor has fewer elements than the one before.
     CONE_END_FACTORISATIONS = 12    # Budget of the damped Newton phase that ends an interior point of cones.
     MAX_HYBRID_STEPS = 60           # Limit of an interior point with Newton trials; more steps rarely help.
-    MAX_HYBRID_STEPS_AT_REST = 30   # Its limit if few contacts must slide; those that it solves take up to 25.
     MAX_SHORT_STEPS = 4             # Such an interior point ends after this many short steps in a row: the path has turned back.
     TRIAL_INNER_STEPS = 2           # Newton steps of one attempt to end De Saxce's interior point.
     AUGMENTED_TRIAL_STEPS = 4       # Newton steps on the augmented system in one attempt.
@@ -190,21 +189,6 @@ cdef inline double compute_fraction_near_sliding(const elements_t* e, const doub
     return <double>near / loaded if loaded else 1.0
 
 
-cdef inline double compute_overloaded_fraction(const elements_t* e, const double* z) noexcept nogil:
-    """Return the part of the load at z, the impulse that holds all contacts, on contacts whose friction exceeds its bound."""
-    cdef double load = 0.0, overload = 0.0
-    cdef int32_t i, j, g
-    for i in range(e.n):
-        j = e.ptr[i]
-        if not is_row(e, i):
-            load += fabs(z[j])
-            for g in range(e.part[i], e.part[i + 1]):
-                if euclidean_norm(z + e.first[g], e.size[g]) > e.reach[g] * z[j]:
-                    overload += fabs(z[j])
-                    break
-    return overload / load if load > 0.0 else 0.0
-
-
 cdef inline void end_interior_steps(newton_t* n, bint may_continue) noexcept nogil:
     """Judge the best z and end the phase.
 
@@ -288,8 +272,7 @@ cdef inline void step_interior_with_newton(newton_t* n) noexcept nogil:
     cdef bint succeeded
     if not k.trial_runs:
         n.s.augmented = k.augmented
-        succeeded = (k.steps < (MAX_HYBRID_STEPS_AT_REST if n.is_at_rest else MAX_HYBRID_STEPS) and not is_finished(n)
-                     and take_interior_point_step(n))
+        succeeded = k.steps < MAX_HYBRID_STEPS and not is_finished(n) and take_interior_point_step(n)
         n.s.augmented = 0
         if not succeeded:
             pop_phase(n)

@@ -105,6 +105,7 @@ cdef enum:                      # outcomes of a correction
 
 cdef enum:
     MAX_PATH_FACTORISATIONS = 600   # Budget of one path; most end within 300.
+    PATH_PATIENCE = 100         # Euler steps follow if so many factorisations do not halve the residual; heaps take up to 80.
     MAX_START_STEPS = 15        # Newton steps at one first tau.
     MAX_TAU_RAISES = 3          # The first tau is raised up to this often: contacts of towers carry up to some hundred times g.
     MAX_CORRECTIONS = 4         # Newton steps of one point; if more are needed, the step is halved instead.
@@ -329,10 +330,23 @@ cdef inline void begin_path(newton_t* n) noexcept nogil:
     x.eps = path_compliance()
     x.trial_residual = 1e-2
     x.h = 0.3                   # change of the fastest coordinate in the first step
+    x.since, x.lowest = n.s.factorisations, 1.0 / 0.0
     x.last = n.s.factorisations + MAX_PATH_FACTORISATIONS
     x.stage = x.factors = x.raises = x.n_saved = x.steps_since_return = x.halvings = 0
     if 0.0 < x.size < 1.0 / 0.0:
         push_phase(n, PATH)
+
+
+cdef inline bint continue_path(newton_t* n) noexcept nogil:
+    """Continue a path that has ended because its residual did not fall; return False if it ended otherwise."""
+    cdef path_t* x = &n.path
+    cdef int32_t end = x.since + PATH_PATIENCE
+    if x.stage != STEPPING or end >= x.last:
+        return False
+    x.last += n.s.factorisations - end
+    x.since = n.s.factorisations
+    push_phase(n, PATH)
+    return True
 
 
 cdef inline bint compute_path_directions(newton_t* n, const double* z, double tau) noexcept nogil:
@@ -480,6 +494,8 @@ cdef inline void accept_path_point(newton_t* n) noexcept nogil:
     x.h = x.h if x.h < 1.5 else 1.5
     x.stage = STEPPING
     residual = judge_and_keep_best_point(n, x.z)
+    if residual < 0.5 * x.lowest:
+        x.lowest, x.since = residual, n.s.factorisations
     if residual < x.trial_residual and not is_finished(n):
         x.trial_residual = 0.1 * residual
         x.stage = TRYING
@@ -551,6 +567,9 @@ cdef inline void step_path(newton_t* n) noexcept nogil:
             return
         x.stage = STEPPING
     if x.stage == STEPPING:
+        if n.s.factorisations - x.since > PATH_PATIENCE:
+            pop_phase(n)
+            return
         predict_path_point(n)
     outcome = correct_path_point(n)
     if outcome == ON_CURVE:

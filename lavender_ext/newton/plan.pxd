@@ -20,15 +20,14 @@
                     CONVEX_POINT              interior point of the convex law, judged under      CONVEX_FLOW
                                               Coulomb's law; ends if many contacts slide
                     CONVEX_FLOW               Euler steps from it, if few contacts slide          AUGMENTED_DE_SAXCE
-                    AUGMENTED_DE_SAXCE        De Saxce's interior point on the augmented system,  PATH_OR_FLOW
+                    AUGMENTED_DE_SAXCE        De Saxce's interior point on the augmented system,  BEGIN_PATH
                                               if joints are rigid and the best point is near
-                    PATH_OR_FLOW              path of smoothed problems; if the problem is at     FLOW_OR_PATH
-                                              rest, Euler steps from the best point
-                    FLOW_OR_PATH              the other of these two                              COULOMB_DAMPED_NEWTON
+                    BEGIN_PATH                path of smoothed problems, while its residual falls PATH_FLOW
+                    PATH_FLOW                 Euler steps from its last point                     CONTINUE_PATH
+                    CONTINUE_PATH             the same path from that point, if it has not ended  PATH_FLOW
+                                              the path has ended                                  LAST_FLOW
+                    LAST_FLOW                 Euler steps from the best point                     COULOMB_DAMPED_NEWTON
                     COULOMB_DAMPED_NEWTON     proximal damped Newton from the best point          COULOMB_END
-
-A large problem is at rest if the impulse that holds all contacts puts little load on contacts whose friction exceeds its
-bound. De Saxce's interior point, which computes this impulse, then takes fewer steps.
 
 Each state with a problem that needs it: without the state the problem is lost, or takes this many times as long. `python -m
 benchmarks scale --without STATE` measures this. A problem is a structure of benchmarks/scale_structures.py with rows, sliding
@@ -49,9 +48,10 @@ tol is 1e-6 unless the line names another one.
     FIRST_FLOW                cards 900 0.1 0: 5.0
     CONVEX_POINT              pile 3000 0.5 0
     CONVEX_FLOW               granularF(n=4, sliding=2, seed=10): 9
-    PATH_OR_FLOW              wall 3000 0.5 1
-    FLOW_OR_PATH              ragdolls 3000 0 1, seed 31
-    COULOMB_DAMPED_NEWTON     pyramid 3000 0.05 0.5, seed 151
+    BEGIN_PATH                heap 3000 0.1 1, seed 911
+    PATH_FLOW                 cards 3000 0.1 0, seed 911: 2.1
+    CONTINUE_PATH             pyramid 3000 0.2 1, seed 911
+    LAST_FLOW, COULOMB_DAMPED_NEWTON    granularF(n=6, sliding=1, seed=5): no solution, but a smaller residual
 
 Every state ends the solve as soon as the best point is within tol or at the round-off limit, a certificate is proven,
 or the budget is spent.
@@ -65,13 +65,13 @@ from lavender_ext.core.start cimport is_zero_impulse
 from lavender_ext.judge.score cimport relative_residual
 from lavender_ext.newton.cones cimport has_lower_bound, has_upper_bound
 from lavender_ext.newton.flow cimport begin_flow, step_flow
-from lavender_ext.newton.path cimport begin_path, step_path
+from lavender_ext.newton.path cimport begin_path, continue_path, step_path
 from lavender_ext.newton.active_set cimport begin_active_set, step_active_set
 from lavender_ext.newton.damped_newton cimport (begin_damped_newton, begin_damped_newton_stretches,
                                                 continue_damped_newton_stretches, push_damped_newton, step_damped_newton)
 from lavender_ext.newton.interior_phases cimport (augmented_shift, begin_interior_steps, begin_interior_with_newton,
-                                                  compute_overloaded_fraction, compute_sliding_fraction, step_augmented_newton,
-                                                  step_interior_point, step_interior_with_newton)
+                                                  compute_sliding_fraction, step_augmented_newton, step_interior_point,
+                                                  step_interior_with_newton)
 from lavender_ext.newton.run cimport (ACTIVE_SET, AUGMENTED_NEWTON, DAMPED_NEWTON, DAMPED_STRETCHES, FLOW,
                                       INTERIOR_POINT, INTERIOR_WITH_NEWTON, MAX_INNER_STEPS, N_COUNTED, N_REFINEMENTS,
                                       UNLIMITED, PLAN_CONVEX, PLAN_COULOMB, compute_slack, copy_vector, is_at_roundoff,
@@ -101,10 +101,12 @@ cdef enum:                      # states of PLAN_COULOMB
     CONVEX_POINT = 5
     CONVEX_FLOW = 6
     AUGMENTED_DE_SAXCE = 7
-    PATH_OR_FLOW = 8
-    FLOW_OR_PATH = 9
-    COULOMB_DAMPED_NEWTON = 10
-    COULOMB_END = 11
+    BEGIN_PATH = 8
+    PATH_FLOW = 9
+    CONTINUE_PATH = 10
+    LAST_FLOW = 11
+    COULOMB_DAMPED_NEWTON = 12
+    COULOMB_END = 13
 
 cdef enum:
     POINT_REFINEMENTS = 3       # Refinements of an interior point's first z with the factor of its weighted system.
@@ -112,7 +114,7 @@ cdef enum:
     MIN_CONVEX_ROWS = 300      # With fewer rows the paths cost less than the convex point.
     CONVEX_FLOW_FACTORISATIONS = 300  # Budget of Euler steps from the convex point; piles that they solve take up to 240.
     MIN_FLOW_ROWS = 900         # With fewer rows the paths take few factorisations.
-    FLOW_PATIENCE = 60          # Euler steps from a near point end if so many factorisations do not halve the residual.
+    FLOW_PATIENCE = 60          # Euler steps from a near point or a path end if so many factorisations do not halve the residual.
     LAST_FLOW_FACTORISATIONS = 1000     # Budget of the last Euler steps; sliding pyramids that they solve take up to 900.
     LAST_FLOW_PATIENCE = 300    # The last Euler steps end if so many factorisations do not halve the residual.
     FIRST_FLOW_FACTORISATIONS = 200     # Budget of Euler steps; walls and pyramids that they solve take up to 200.
@@ -144,14 +146,6 @@ cdef inline double max_sliding_fraction() noexcept nogil:
     Of piles of balls that it solves up to 4 % slide at the convex point; of towers, walls and pyramids 7 % to 80 %.
     """
     return 0.05
-
-
-cdef inline double max_overload_at_rest() noexcept nogil:
-    """Return the part of the load that the impulse which holds all contacts may put on contacts that must slide at rest.
-
-    At rest it is 0 to 0.1 (nine structures), sliding at 0.05 m/s 0.03 to 0.29, at 0.5 m/s 0.41 and more.
-    """
-    return 0.15
 
 
 cdef inline double max_start_residual() noexcept nogil:
@@ -325,14 +319,6 @@ cdef inline bint has_convex_law(const newton_t* n) noexcept nogil:
     return n.s.symmetric and n.s.e.m >= MIN_CONVEX_ROWS
 
 
-cdef inline void begin_path_or_flow(newton_t* n, bint is_flow) noexcept nogil:
-    """Begin Euler steps from the best point, or the path of smoothed problems."""
-    if is_flow:
-        begin_flow(n, n.best_z, LAST_FLOW_FACTORISATIONS, LAST_FLOW_PATIENCE)
-    else:
-        begin_path(n)
-
-
 cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
     """Enter the next state of Coulomb's law."""
     cdef int32_t state = n.stage
@@ -346,8 +332,6 @@ cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
             begin_damped_newton_stretches(n, START_FACTORISATIONS, 2.0 * max_start_residual_ratio() * n.best)
     elif state == DE_SAXCE:
         begin_interior_point(n, compute_proximal_weight(), derivative_fraction())
-        n.is_at_rest = (n.s.e.m >= MIN_FLOW_ROWS
-                        and compute_overloaded_fraction(n.s.e, n.ip.unbounded_z) < max_overload_at_rest())
         begin_interior_with_newton(n, 0)
     elif state == DE_SAXCE_END:
         if n.progress.lowest <= far_from_end():
@@ -371,10 +355,15 @@ cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
     elif state == AUGMENTED_DE_SAXCE:
         if may_need_augmented_system(n):
             begin_augmented_interior_point(n, augmented_derivative_fraction())
-    elif state == PATH_OR_FLOW:
-        begin_path_or_flow(n, n.is_at_rest)
-    elif state == FLOW_OR_PATH:
-        begin_path_or_flow(n, not n.is_at_rest)
+    elif state == BEGIN_PATH:
+        begin_path(n)
+    elif state == PATH_FLOW:
+        begin_flow(n, n.path.z, LAST_FLOW_FACTORISATIONS, FLOW_PATIENCE)
+    elif state == CONTINUE_PATH:
+        if continue_path(n):
+            n.stage = PATH_FLOW
+    elif state == LAST_FLOW:
+        begin_flow(n, n.best_z, LAST_FLOW_FACTORISATIONS, LAST_FLOW_PATIENCE)
     elif state == COULOMB_DAMPED_NEWTON:
         begin_damped_newton(n, n.best_z, COULOMB, start_alpha(), MAX_INNER_STEPS)
         push_damped_newton(n, UNLIMITED)
@@ -415,7 +404,7 @@ cdef inline void start_newton_solve(newton_t* n, const double* lam) noexcept nog
     cdef int32_t i
     cdef bint has_cones = n.s.e.n < n.s.e.m
     n.stop = n.needs_check = n.proven = n.depth = 0
-    n.mostly_slides = n.is_at_rest = 0
+    n.mostly_slides = 0
     n.s.augmented = n.s.factorisations = 0
     for i in range(N_COUNTED):
         n.counts[i] = 0

@@ -154,6 +154,8 @@ cdef struct path_t:             # a path of smoothed problems
     int32_t factors             # factorisations for the present point
     int32_t raises              # number of times that the first tau was raised
     int32_t n_saved
+    double lowest               # lowest residual, up to a factor of two
+    int32_t since               # factorisations at the last such progress
     int32_t last                # factorisations at which the path ends
 
 
@@ -185,7 +187,6 @@ cdef struct newton_t:           # bound to its workspace; it must not move
     int32_t is_cold             # the start is the zero impulse
     int32_t has_augmented       # the caller can factor the augmented system
     int32_t stage               # state of the plan (plan.pxd)
-    int32_t is_at_rest          # Coulomb's law: few contacts of a large problem must slide
     int32_t mostly_slides       # Coulomb's law: many contacts slide at the convex point
     int32_t keeps_matrix        # the caller starts again with the same A: a formed H stays
     int32_t has_matrix          # H is formed
