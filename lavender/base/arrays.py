@@ -55,14 +55,12 @@ def to_numpy(name: str, value: Any) -> np.ndarray:
         try:
             return np.asarray(value)
         except (TypeError, ValueError) as error:
-            raise InputError(
-                f"{name} cannot be read as an array ({error}); an array of numbers is needed"
-            ) from None
+            raise InputError(f"{name} cannot be read as an array ({error}); numbers are needed") from None
     if getattr(value, "requires_grad", False):
         raise InputError(f"{name} requires a gradient, which would be lost: give {name}.detach()")
     if hasattr(
         value, "resolve_neg"
-    ):  # PyTorch passes a view with the negative bit by DLPack with the wrong sign.
+    ):  # By DLPack, PyTorch passes a view with the negative bit with the wrong sign.
         value = value.resolve_neg()
     reason: Exception | None = None
     for read in (
@@ -79,9 +77,9 @@ def to_numpy(name: str, value: Any) -> np.ndarray:
             continue
         if isinstance(array, np.ndarray) and array.dtype != object:
             return array
+    kind, device = type(value).__name__, getattr(value, "device", "unknown")
     raise InputError(
-        f"{name} is a {type(value).__name__} on device {getattr(value, 'device', 'unknown')} that cannot be read "
-        f"({reason}): copy it to the host"
+        f"{name} is a {kind} on device {device} that cannot be read ({reason}): copy it to the host"
     )
 
 
@@ -190,9 +188,7 @@ def get_shape(name: str, value: Any) -> tuple[int, ...]:
     try:
         return np.shape(value)
     except ValueError as error:
-        raise InputError(
-            f"{name} cannot be read as an array ({error}); an array of numbers is needed"
-        ) from None
+        raise InputError(f"{name} cannot be read as an array ({error}); numbers are needed") from None
 
 
 def resolve_index(i: Any, n: int, thing: str = "world") -> int | list[int]:
@@ -328,9 +324,9 @@ def _raise_at_first(
     if csr is not None:
         row = np.searchsorted(csr.indptr, index[0], side="right") - 1
         index = np.array([row, csr.indices[index[0]]])
+    place = ", ".join(map(str, index))
     raise InputError(
-        f"{name} must {requirement}; entry [{', '.join(map(str, index))}] is {value:g} ({len(bad)} such "
-        f"entries){advice}"
+        f"{name} must {requirement}; entry [{place}] is {value:g} ({len(bad)} such entries){advice}"
     )
 
 

@@ -128,9 +128,7 @@ def diagnose_impulses(p: Problem, impulse: FloatArray) -> Iterator[Diagnostic]:
     # Forces are impulses divided by dt: with some dt they solve the problem better than zero. A true start can have
     # a large error, too: of a heavy body on a light one.
     if r.relative > 50.0 and any(residual(p, dt * impulse).relative < 0.5 for dt in TIME_STEPS):
-        reason = (
-            f"their error is {r.relative:.2g} times that of the zero impulse: are they forces [N], not [N s]?"
-        )
+        reason = f"their error is {r.relative:.2g} times that of the zero impulse: are they forces [N]?"
         yield make_diagnostic(p, "impulses", reason, [p.block_of(r.worst_row)], relative=r.relative)
         return
     if p.rows is not None:

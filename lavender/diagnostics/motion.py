@@ -71,10 +71,11 @@ def diagnose_targets(p: Problem) -> Iterator[Diagnostic]:
     normal, tangent = c.normal_rows, c.friction_rows
     joints = int(np.count_nonzero(~c.contact_rows))
     if joints and np.any(target[tangent]) and not np.any(np.roll(target, joints)[tangent]):
+        largest = np.abs(target[tangent]).max()
         reason = (
-            f"tangents have targets up to {np.abs(target[tangent]).max():.3g} m/s, and none if the {joints} "
+            f"tangents have targets up to {largest:.3g} m/s, and none if the {joints} targets of joints come "
         )
-        reason += "targets of joints come first, in the order of the rows"
+        reason += "first, in the order of the rows"
         yield make_diagnostic(p, "targets", reason)
         return
     tn = target[normal]

@@ -83,10 +83,9 @@ class Step:
                     out.append(g.mu[p.cones.is_contact])
                 else:
                     out.append(g.full(name) if name in ("J", "M") else getattr(g, name))
-        batched = (
-            np.array(x).reshape(*batch, *like.shape[1:]) for x, like in zip(gradients, flat, strict=True)
-        )
-        return tuple(_sum_to_shape(x, np.shape(like)) for x, like in zip(batched, arguments, strict=True))
+        shapes = ((x.shape[1:], np.shape(like)) for x, like in zip(flat, arguments, strict=True))
+        parts = zip(gradients, shapes, strict=True)
+        return tuple(_sum_to_shape(np.array(x).reshape(*batch, *own), shape) for x, (own, shape) in parts)
 
 
 def _flatten_batch(arrays: Sequence[Any]) -> tuple[list[FloatArray], tuple[int, ...]]:

@@ -407,11 +407,8 @@ def reuse_or_judge_impulse(
     problem: Problem, impulse: FloatArray, judged: measure.Judged | None = None
 ) -> measure.Judged:
     """Return `judged` if it belongs to this problem and impulse, bit for bit; else judge a copy of the impulse."""
-    if (
-        judged is not None
-        and judged.data is problem.metric
-        and measure.are_bit_identical(judged.impulse, impulse)
-    ):
+    is_known = judged is not None and judged.data is problem.metric
+    if judged is not None and is_known and measure.are_bit_identical(judged.impulse, impulse):
         return judged
     return judge_impulse(problem, impulse.copy())
 

@@ -428,9 +428,8 @@ class Solution:
     @property
     def _work_text(self) -> str:
         """Work that was done, in words."""
-        done = ", ".join(
-            format_work_count(n, k) for k, n in (self.work or {"iterations": self.iterations}).items()
-        )
+        work = self.work or {"iterations": self.iterations}
+        done = ", ".join(format_work_count(n, k) for k, n in work.items())
         order = f", order {self.solver.order}" if self.solver.order else ""
         return f"{done}{order}, from {self.start}" if self.start else f"{done}{order}"
 

@@ -113,7 +113,9 @@ class QPSolution:
 
     def __str__(self) -> str:
         if self.ray is not None:
-            return f"unbounded: the objective decreases along ray; at x it is {self.objective:.6g}"
+            return (
+                f"unbounded: the objective decreases without end along ray; at x it is {self.objective:.6g}"
+            )
         # Show the status only if the program is not solved.
         status = "" if self.solution is None or self.found else f"{self.solution.status.name}, "
         if status == "CONVERGED, ":

@@ -223,13 +223,10 @@ class _Task:
             self.judge.keep(np.zeros(len(self.qp.q)), np.zeros(len(self.qp.target)))
         is_stopped = self.runs[-1].status is Status.INTERRUPTED
         # Large x makes the violations of rows that contradict each other small: a proof has precedence.
-        if not self.judge.strict_error <= self.judge.tol and not is_stopped and self._may_search():
+        has_budget = self.max_iter is None and not self.deadline.has_passed() and len(self.qp.q) > 0
+        if not self.judge.strict_error <= self.judge.tol and not is_stopped and has_budget:
             self._search_proofs()
         return self._make_answer(begun)
-
-    def _may_search(self) -> bool:
-        """Return whether to search for proofs: not if the user's budget has ended the run."""
-        return self.max_iter is None and not self.deadline.has_passed() and len(self.qp.q) > 0
 
     def _list_steps(self) -> Iterator[Any]:
         """Yield the runs to do, one after the other, until a point meets tol."""

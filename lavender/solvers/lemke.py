@@ -29,9 +29,7 @@ from lavender.solvers.registry import Solver, SolverSpec
 from lavender_ext.pivot import lemke
 from lavender_ext.pivot.lemke import DONE, EXCHANGES, LATE, RAY
 
-RAY_MESSAGE = (
-    "ended on a secondary ray: this method cannot continue, but a solution may exist (auto tries others)"
-)
+RAY_MESSAGE = "ended on a secondary ray: this method cannot continue, but a solution may exist"
 MAX_LEMKE_ROWS = 2000  # Problems with more rows are refused; the dictionary of this many rows takes 32 MB.
 
 

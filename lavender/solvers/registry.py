@@ -292,9 +292,8 @@ class SolverSpec:
     def accepts(self) -> frozenset[str]:
         """Names of the options that `lavender.solve` passes on to the factory."""
         shared = {"order": ("order", "ground"), "seed": ("seed",)}
-        return frozenset(self.options) | {
-            o for flag, names in shared.items() if getattr(self, flag) for o in names
-        }
+        flags = [flag for flag in shared if getattr(self, flag)]
+        return frozenset(self.options).union(*(shared[flag] for flag in flags))
 
     def missing(self) -> str | None:
         """Return None if the solver can run here, else the reason and what to install."""

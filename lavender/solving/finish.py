@@ -142,23 +142,15 @@ def finish(run: FinishedRun) -> Solution:
         run = run._replace(claim=claim, impulse=impulse)
     impulse.setflags(write=False)
     values = {"impulse": impulse, "tol": tol, "setup_time": run.setup_time, "solve_time": run.solve_time}
-    is_met = judged.relative <= tol and (judged.roundoff_floor <= tol or tol == 0.0)
-    if claim.status is CONVERGED and is_met and not run.refutation:
+    make_late: Callable[..., dict[str, Any]] | None = None
+    if claim.status is CONVERGED and judged.relative <= tol and (judged.roundoff_floor <= tol or tol == 0.0):
+        make_late = make_fields
+    elif claim.status is TIME_LIMIT and not min(judged.relative, judged.float64_relative) <= tol:
+        make_late = make_checked_fields if claim.certificate is None else None  # No rule changes this status.
+    if make_late is not None and not run.refutation:
         # The other fields are computed when one of them is first read.
         late = make_residual, (problem, judged)
-        values |= {"status": CONVERGED, "_late_residual": late, "_rest": (make_fields, (run, judged))}
-    elif (
-        claim.status is TIME_LIMIT
-        and claim.certificate is None
-        and not run.refutation
-        and not min(judged.relative, judged.float64_relative) <= tol
-    ):  # No rule changes this status, so the message is made when it is first read.
-        late = make_residual, (problem, judged)
-        values |= {
-            "status": TIME_LIMIT,
-            "_late_residual": late,
-            "_rest": (make_checked_fields, (run, judged)),
-        }
+        values |= {"status": claim.status, "_late_residual": late, "_rest": (make_late, (run, judged))}
     else:
         verdict = check_claim(run, make_residual(problem, judged))
         values = make_fields(run, judged, verdict) | values | {"status": verdict.status}
@@ -207,10 +199,11 @@ def check_claim(run: FinishedRun, judged: Residual) -> Verdict:
             status, message = STALLED, _joined(message, proof.reason)
         elif status is INFEASIBLE:
             unproven = proof.reason
-        elif bound is not None and bound > max(np.abs(run.impulse).sum(), _contradicting_impulse(problem)):
-            message = _joined(
-                message, f"every solution has an impulse of at least {format_lower_bound(bound)} N s"
-            )
+        elif bound is not None:
+            usual = CONTRADICTING_IMPULSE_RATIO * float(np.sum(np.abs(problem.b) / problem.d))
+            if bound > max(np.abs(run.impulse).sum(), usual):
+                least = format_lower_bound(bound)
+                message = _joined(message, f"every solution has an impulse of at least {least} N s")
     if unproven:
         message = _joined(message, f"not proven: {unproven}")
         status_conflict = f"says INFEASIBLE, {refutation}" if refutation else ""
@@ -273,11 +266,6 @@ def name_lost_row(problem: Problem, impulse: FloatArray, claim: Claim) -> Claim:
     return replace(claim, status=DIVERGED, message=message)
 
 
-def _contradicting_impulse(problem: Problem) -> float:
-    """Impulse [N s] above which a lower bound of every solution's impulse means that constraints nearly contradict."""
-    return CONTRADICTING_IMPULSE_RATIO * float(np.sum(np.abs(problem.b) / problem.d))
-
-
 def _joined(message: str, addition: str) -> str:
     """Append `addition` to the message, unless the message contains it already."""
     return message if addition in message else f"{message}; {addition}".removeprefix("; ")
@@ -303,9 +291,9 @@ def _predict_iterations(run: FinishedRun, relative: float) -> str:
     It is empty if no more iterations than were done are predicted.
     """
     per_decade, tol = run.sweeps_per_decade, run.tol
-    remaining = (
-        per_decade * math.log10(relative / tol) if tol > 0.0 and 0.0 < relative < math.inf else math.nan
-    )
+    if not (tol > 0.0 and 0.0 < relative < math.inf):
+        return ""
+    remaining = per_decade * math.log10(relative / tol)
     if not run.claim.iterations < remaining < math.inf:
         return ""
     return (

@@ -150,16 +150,13 @@ def register_family(**aliases: Mapping[str, Any]) -> Callable[[Callable[P, Draft
             bound = signature.bind(*args, **kwargs)
             explicit = frozenset(bound.arguments)
             bound.apply_defaults()
-            values = {
-                n: _convert_parameter(name, signature.parameters[n], v) for n, v in bound.arguments.items()
-            }
+            known, given_values = signature.parameters, bound.arguments.items()
+            values = {n: _convert_parameter(name, known[n], v) for n, v in given_values}
             text = _format_case_name(name, values, explicit)
             try:
                 draft = function(**values)  # type: ignore[call-arg]
-            except MemoryError as error:
-                raise InputError(
-                    f"{text}: there is not enough memory ({str(error) or 'none left'}); give smaller parameters"
-                ) from None
+            except MemoryError:
+                raise InputError(f"{text}: there is not enough memory; give smaller parameters") from None
             return Case(
                 name=text, problem=replace(draft.problem, name=text, copy=False), reason=draft.reason, family=name,
                 parameters=MappingProxyType(values), solve_reference=draft.reference,
