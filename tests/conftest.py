@@ -26,7 +26,7 @@ for variable in ("COLUMNS", "LINES"):
 # A shared machine may take any time for an example, and a generator may reject any share of them. The examples of a
 # change are the same in every run; `--nightly` draws new ones, and .ci/fuzz (profile "search") draws many.
 free = hypothesis.settings(deadline=None, suppress_health_check=list(hypothesis.HealthCheck), print_blob=True)
-hypothesis.settings.register_profile("change", free, derandomize=True, max_examples=10)
+hypothesis.settings.register_profile("change", free, derandomize=True, max_examples=10, stateful_step_count=25)
 hypothesis.settings.register_profile("nightly", free, max_examples=200)
 hypothesis.settings.register_profile("search", free, max_examples=1000)
 

@@ -528,26 +528,3 @@ def test_residual_of_nan_is_infinite():
     nan = [np.nan, 0.0]
     assert lv.residual(LCP, nan).relative == lv.residual(LCP, nan, precision="float32").relative == np.inf
     assert np.isnan(GENERAL.generalized.force(nan)).any()
-
-
-@pytest.mark.parametrize(
-    ("call", "name"),
-    [
-        (lambda: lv.Scene(friction=1e-61), "friction"), (lambda: lv.Scene(gravity=1e61), "gravity"),
-        (lambda: lv.Scene().add_box(mass=1e-61), "mass"), (lambda: lv.Problem.lcp(EYE, [1.0, 1e61]), "b"),
-    ],
-)  # fmt: skip
-def test_number_beyond_1e60_is_rejected_by_name_and_limit(call, name):
-    with pytest.raises(lv.InputError, match=rf"{name}.*e[+-]60"):
-        call()
-
-
-def test_builders_that_make_the_cones_say_so_if_cones_are_given():
-    cones = lv.Cones.contacts([0.5])
-    for call in (
-        lambda: lv.Problem.linear(np.eye(3), np.ones(3), cones=cones),
-        lambda: lv.Problem.lcp(np.eye(3), np.ones(3), cones=cones),
-        lambda: lv.Problem.contact(np.eye(3), np.ones(3), mu=[0.5], cones=cones),
-    ):
-        with pytest.raises(lv.InputError, match="cones is a Cones; Problem"):
-            call()

@@ -478,38 +478,26 @@ def test_direct_of_an_ill_conditioned_asymmetric_matrix_ends_at_its_floor(seed):
     assert solution.residual.at_floor, str(solution)
 
 
-def test_registered_solver_that_worsens_its_start_returns_the_start(register):
-    class Worsens:
-        def prepare(self, problem):
-            return problem
+def test_registered_solver_that_worsens_its_start_returns_the_start(plug_in):
+    def worsen(problem, impulse):
+        impulse += 10.0
+        return lv.Claim(lv.Status.CONVERGED, 1)
 
-        def run(self, state, impulse, max_iter, tol, time_limit=None):
-            impulse += 10.0
-            return lv.Claim(lv.Status.CONVERGED, 1)
-
-    register(lv.SolverSpec("worsens", Worsens, {"lcp", "coulomb", "cone"}, summary="of a test"))
     problem = random_contact_problem(3)
     start = project_impulse(problem.cones, 0.99 * lv.solve(problem, tol=1e-12).impulse)
-    found = lv.solve(problem, "worsens", impulse=start, tol=1e-9)
+    found = lv.solve(problem, plug_in(worsen), impulse=start, tol=1e-9)
     np.testing.assert_array_equal(found.impulse, start)
     assert found.is_contradicted and found.status is not lv.Status.MAX_ITERATIONS
 
 
 @pytest.mark.parametrize("claimed", [lv.Status.CONVERGED, lv.Status.STALLED])
-def test_claim_at_the_round_off_floor_has_the_status_roundoff_limit(register, claimed):
-    class Ends:
-        def prepare(self, problem):
-            return problem
-
-        def run(self, state, impulse, max_iter, tol, time_limit=None):
-            return lv.Claim(claimed, 1)
-
-    register(lv.SolverSpec("ends", Ends, {"lcp", "coulomb", "cone"}, summary="of a test"))
+def test_claim_at_the_round_off_floor_has_the_status_roundoff_limit(plug_in, claimed):
     problem = random_contact_problem(3)
     start = project_impulse(problem.cones, lv.solve(problem, "newton", tol=1e-13).impulse)
     floor = lv.residual(problem, start)
     assert floor.relative > 0.0 and floor.above_floor == 0.0
-    found = lv.solve(problem, "ends", impulse=start, tol=0.5 * floor.relative)
+    ends = plug_in(lambda problem, impulse: lv.Claim(claimed, 1))
+    found = lv.solve(problem, ends, impulse=start, tol=0.5 * floor.relative)
     assert found.status is lv.Status.ROUNDOFF_LIMIT
 
 

@@ -111,7 +111,8 @@ class Calls(RuleBasedStateMachine):
 
     @rule(target=solutions)
     def solve_with_other_bounds(self):
-        self.problem = make_problem_with_other_numbers(self.problem)
+        other = make_problem_with_other_numbers(self.problem)
+        self.problem = replace(other, b=rounded(other.b))  # so that b + J v* has one value again
         return self.compare({"problem": self.problem})
 
     @rule(target=solutions, value=numbers, row=st.integers(0, 99))
@@ -140,10 +141,10 @@ class Calls(RuleBasedStateMachine):
         start = carry_by_keys(old, solution.impulse, self.problem)
         return self.compare({"problem": self.problem}, start, (old, solution.impulse) if pair else solution)
 
-    @rule(bad=st.sampled_from([{"b": [np.nan]}, {"tol": -1.0}, {"no_such": 1}, {"problem": 1}]))
-    def call_with_a_mistake(self, bad):
+    @rule(bad=st.sampled_from([{"b": [np.nan]}, {"tol": -1.0}, {"no_such": 1}, {"problem": 1}]), i=st.integers(0, 99))
+    def call_with_a_mistake(self, bad, i):
         with pytest.raises(lv.LavenderError):
-            self.prepared.solve(**bad)
+            self.prepared.solve(**{"problem": self.pool[i % len(self.pool)]} | bad)
 
     @rule(ends=st.sampled_from(["callback", "limit"]), b=st.booleans())
     def interrupt(self, ends, b):

@@ -73,10 +73,9 @@ def check_claims(name, law, condition, seed, tol):
         assert solution.success
 
 
-@pytest.mark.parametrize("condition", CONDITIONS)
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("name", OURS)
-@given(seed=seeds, tol=st.sampled_from([1e-6, 1e-9, 1e-12]))
+@given(condition=st.sampled_from(CONDITIONS), seed=seeds, tol=st.sampled_from([1e-6, 1e-9, 1e-12]))
 def test_solver_claims_with_any_condition_of_m_are_true(name, law, condition, seed, tol):
     check_claims(name, law, condition, seed, tol)
 

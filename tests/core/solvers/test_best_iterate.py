@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from random_problems import FORMS, random_contact_problem, random_lcp, spd
+from random_problems import FORMS, random_contact_problem, spd
 
 import lavender as lv
 from lavender.judge.residuals import choose_start, combine_best_islands
@@ -191,34 +191,6 @@ def test_newton_bounds_exclude_zero_keeps_its_solution_for_any_size_of_b(name, t
         found = lv.solve(problem, name, tol=tol)
         assert found.claim_check == "confirmed"
         assert found.residual.above_floor == 0.0
-
-
-# -- one start for every host ------------------------------------------------------------------------------------------
-
-HOSTS = {
-    "prepare": lambda p, name, start: lv.prepare(p, name).solve(impulse=start),
-    "solve_many": lambda p, name, start: lv.solve_many([p], name, impulses=[start])[0],
-    "max_iter": lambda p, name, start: lv.solve(p, name, impulse=start, max_iter=lv.get(name).max_iter),
-}
-
-
-@pytest.mark.parametrize("name", ["newton", "direct", "auto"])
-@pytest.mark.parametrize("kind", [*FORMS, "bounded rows"])
-def test_solve_prepare_and_solve_many_have_the_same_bits_from_starts_better_and_worse_than_zero(kind, name):
-    for seed in range(12):
-        if kind == "bounded rows":
-            problem = random_lcp(seed, 12, rank=None if seed % 2 else 7)
-        else:
-            problem = FORMS[kind](random_contact_problem(seed, ("coulomb", "cone")[seed % 2], bodies=6, contacts=6))
-        if name not in lv.available(problem):
-            pytest.skip("the solver takes another law")
-        rng = np.random.default_rng(seed)
-        solved = lv.solve(problem, name).impulse
-        for start in (solved * 1.001, 0.3 * solved, 10.0 * rng.standard_normal(problem.m)):
-            expected = lv.solve(problem, name, impulse=start)
-            for host, call in HOSTS.items():
-                found = call(problem, name, start)
-                np.testing.assert_array_equal(found.impulse, expected.impulse, err_msg=f"{host}, seed {seed}")
 
 
 @pytest.mark.parametrize("form", FORMS)

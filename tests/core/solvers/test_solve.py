@@ -21,23 +21,6 @@ from lavender.batch import solve as many
 TINY = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0])
 
 
-@pytest.mark.parametrize("name", ["pgs", "auto"])
-def test_prepared_solve_of_another_problem_keeps_it_unless_it_raises(name):
-    """Too late for an answer, too: the next solve is of the problem that was given last."""
-    other = dataclasses.replace(TINY, b=-2.0 * TINY.b)
-    right = [lv.solve(p, name, tol=1e-9).impulse for p in (TINY, other)]
-    assert (right[0] != right[1]).any()
-    prepared = lv.prepare(TINY, name)
-    for options in ({"tol": -1.0}, {"impulse": np.ones(TINY.m + 1)}, {"max_iter": -1}):
-        with pytest.raises(lv.InputError):
-            prepared.solve(other, **options)
-        np.testing.assert_array_equal(prepared.solve(tol=1e-9).impulse, right[0])
-    with pytest.raises(lv.InputError, match="Problem"):
-        prepared.solve(TINY.matrix, time_limit=1.0)
-    prepared.solve(other, time_limit=1e-9)
-    np.testing.assert_array_equal(prepared.solve(tol=1e-9).impulse, right[1])
-
-
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals of POSIX")
 @pytest.mark.parametrize("solver", ["pgs", "auto"])
 def test_ctrl_c_during_solve_many_starts_no_more_problems(solver, monkeypatch):

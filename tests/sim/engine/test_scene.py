@@ -84,9 +84,7 @@ def test_scene_contacts_have_only_the_rows_of_their_friction():
 #: Calls of a scene with a ball and a plane, or of no scene, and words of their errors.
 REFUSED = [
     (lambda s: s.add_box(mass=0.0), "mass"),
-    (lambda s: s.add_box(mass=-1.0), "mass"),
     (lambda s: s.add_box((1, 0, 1)), "positive"),
-    (lambda s: s.add_box((1, -1, 1)), "positive"),
     (lambda s: s.add_sphere(0.0), "radius"),
     (lambda s: s.add_plane((0, 0, 0)), "direction"),
     (lambda s: s.add_plane(position=(0, 0, 1)), "position"),
@@ -98,7 +96,6 @@ REFUSED = [
     (lambda s: s.add_body(shape=Plane((0.0, 0.0, 1.0), np.nan)), "offset"),
     (lambda s: s.add_body(shape=Plane((0.0, 0.0, 0.0), 0.0)), "direction"),
     (lambda s: s.add_body(inertia=(1, 1, 0)), "positive"),
-    (lambda s: s.add_body(inertia=(1, 1, -1)), "positive"),
     (lambda s: s.add_body(inertia=(1, 2.1, 1)), "at most the sum of the others"),
     (lambda s: s.add_body(inertia=(1, 1, 1e-15)), "positive"),
     (lambda s: s.add_body(inertia=[[1, 2, 0], [0, 1, 0], [0, 0, 1]]), "symmetric"),
@@ -121,10 +118,9 @@ REFUSED = [
     (lambda s: s.add_joint("ball", 0, -1, anchor=(0, 0, 0), hertz=-1), "hertz"),
     (lambda s: s.add_joint("slider", 0, -1), "joint 'slider'"),
     *((lambda s, more=more: lv.Scene("stack", **more), words) for more, words in (
-        ({"dt": 0.0}, "dt"), ({"dt": -0.01}, "dt"), ({"substeps": 0}, "substeps"), ({"friction": -1.0}, "friction"),
+        ({"dt": 0.0}, "dt"), ({"substeps": 0}, "substeps"), ({"friction": -1.0}, "friction"),
         ({"restitution": 2.0}, "restitution"), ({"rolling_radius": -0.1}, "rolling_radius"),
-        ({"max_substep": 0.0}, "max_substep"), ({"max_substep": -1.0}, "max_substep"),
-        ({"max_substep": 1e-60}, "substeps"), ({"dt": 50.0}, "substeps"), ({"dt": 1e60}, "substeps"),
+        ({"max_substep": 0.0}, "max_substep"), ({"max_substep": 1e-60}, "substeps"), ({"dt": 1e60}, "substeps"),
         ({"friction_shape": "square"}, "friction_shape"),
         ({"solver": "pgz"}, "did you mean 'pgs'"), ({"order": "bottomup"}, "bottom_up"),
         ({"on_failure": "ignore"}, "on_failure"), ({"solver_options": {"omega": 1}}, "solver_options"),
