@@ -12,6 +12,7 @@ from random_problems import (
     as_matrix,
     nearly_singular,
     random_contact_problem,
+    random_generalized_problem,
     random_lcp,
     seeds,
     side_by_side,
@@ -81,21 +82,6 @@ def bounded_blocks(seed):
     return lv.Problem(rng.normal(size=m), cones, a @ a.T)
 
 
-def round_cones(seed):
-    """Build one or two cones of three to five rows behind the normal, over J and M."""
-    rng = np.random.default_rng(seed)
-    k, size = int(rng.integers(1, 3)), int(rng.integers(4, 7))
-    m, n = k * size, int(rng.integers(1, 10))
-    ends = np.full(m, np.inf)
-    mu = rng.choice([0.0, 0.5, 1.0, 1e-3, 10.0], k)
-    cones = lv.Cones(np.arange(k + 1) * size, np.full(k, lv.ROUND), -ends, ends, mu, np.zeros(k))
-    half = rng.normal(size=(n, n))
-    return lv.Problem.from_jacobian(
-        rng.normal(size=(m, n)), half @ half.T + 0.1 * np.eye(n), rng.normal(size=n), cones=cones,
-        compliance=rng.choice([0.0, 1e-6, 1.0]) * rng.random(m), friction="cone",
-    )  # fmt: skip
-
-
 def many_islands(seed):
     """Build 10 to 24 small problems beside each other, more than `auto` solves as one."""
     rng, law = np.random.default_rng(seed), ("coulomb", "cone")[seed % 2]
@@ -123,8 +109,11 @@ MAKERS = {
     **{f"{kind}, {form}": contacts(kind, form) for kind in CONTACTS for form in FORMS},
     "lcp": lambda seed: random_lcp(seed, m=1 + seed % 12),
     "singular lcp": lambda seed: random_lcp(seed, m=4 + seed % 9, rank=1 + seed % 3), "linear": linear,
-    "bounded blocks": bounded_blocks, "round cones": round_cones, "nearly singular M": nearly_singular,
+    "bounded blocks": bounded_blocks, "nearly singular M": nearly_singular,
     "many islands": many_islands,
+    "round cones": lambda seed: random_generalized_problem(
+        seed, "cone", 1 + seed % 9, seed % 4 > 0, contacts=1 + seed % 2, tangents=3 + seed % 3
+    ),
 }  # fmt: skip
 
 

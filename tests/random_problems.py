@@ -148,6 +148,18 @@ CONTACTS = {
     "boxes": random_box_friction_contacts,
     "ellipses": random_ellipse_friction_contacts,
 }
+#: Kind of contact -> function (mu (n,), arms [m] or second coefficients (n,)) that makes the cones of n such contacts.
+CONES = {
+    "normal": lambda mu, arm: Cones.contacts(0.0 * mu, 0), "one tangent": lambda mu, arm: Cones.contacts(mu, 1),
+    "disk": lambda mu, arm: Cones.contacts(mu), "spin alone": lambda mu, arm: Cones.contacts(mu, 0, arm),
+    "one tangent and spin": lambda mu, arm: Cones.contacts(mu, 1, arm),
+    "spin": lambda mu, arm: Cones.contacts(mu, patch_radius=arm),
+    "box": lambda mu, arm: Cones.contacts(np.stack([mu, 2.0 * arm], 1), shape="box"),
+    "ellipse": lambda mu, arm: Cones.contacts(np.stack([mu + 0.1, 0.3 + 0.5 * arm], 1)),
+    "rolling": lambda mu, arm: Cones.contacts(mu, rolling=arm),
+    "rolling and spin": lambda mu, arm: Cones.contacts(mu, patch_radius=0.2 + 0.0 * mu, rolling=arm),
+    "round": lambda mu, arm: Cones.contacts(mu, 5),
+}  # fmt: skip
 
 
 def make_problem_with_other_numbers(problem):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from random_problems import CONES
 
 import lavender as lv
 
@@ -67,20 +68,6 @@ def test_block_gauss_seidel_sweeps_blocks_of_many_rows_row_by_row():
     assert solution.work["fallbacks"] == solution.iterations
 
 
-#: Cones of contacts of each kind, of friction mu and an arm [m] for what turns.
-ALONE = {
-    "normal": lambda mu, arm: lv.Cones.contacts(0.0 * mu, 0),
-    "one tangent": lambda mu, arm: lv.Cones.contacts(mu, 1),
-    "disk": lambda mu, arm: lv.Cones.contacts(mu),
-    "spin alone": lambda mu, arm: lv.Cones.contacts(mu, 0, arm),
-    "one tangent and spin": lambda mu, arm: lv.Cones.contacts(mu, 1, arm),
-    "spin": lambda mu, arm: lv.Cones.contacts(mu, patch_radius=arm),
-    "box": lambda mu, arm: lv.Cones.contacts(np.stack([mu, 2.0 * arm], 1), shape="box"),
-    "ellipse": lambda mu, arm: lv.Cones.contacts(np.stack([mu + 0.1, 0.3 + 0.0 * mu], 1)),
-    "rolling": lambda mu, arm: lv.Cones.contacts(mu, rolling=arm),
-    "rolling and spin": lambda mu, arm: lv.Cones.contacts(mu, patch_radius=0.2 + 0.0 * mu, rolling=arm),
-    "round": lambda mu, arm: lv.Cones.contacts(mu, 5),
-}
 #: Which matrices a contact may have.
 MATRICES = ("full", "asymmetric", "diag(1, 100)", "rank one", "condition 1e6")
 
@@ -88,13 +75,13 @@ MATRICES = ("full", "asymmetric", "diag(1, 100)", "rank one", "condition 1e6")
 @pytest.mark.parametrize("matrix", MATRICES)
 @pytest.mark.parametrize(
     ("kind", "law"),
-    [(kind, law) for kind in ALONE for law in ("coulomb", "cone") if (kind, law) != ("round", "coulomb")],
+    [(kind, law) for kind in CONES for law in ("coulomb", "cone") if (kind, law) != ("round", "coulomb")],
 )
 def test_block_gauss_seidel_solves_separate_contacts_in_one_sweep(kind, law, matrix):
     """As many as no other meets, by the judge's error of each; what no exact answer is found for is counted."""
     rng, n = np.random.default_rng(1), 4000
     mu = np.where(np.arange(n) % 10 == 0, 0.0, 10.0 ** rng.uniform(-2, 1, n))
-    cones = ALONE[kind](mu, np.where(np.arange(n) % 7 == 0, 0.0, rng.uniform(0.0, 1.0, n)))
+    cones = CONES[kind](mu, np.where(np.arange(n) % 7 == 0, 0.0, rng.uniform(0.0, 1.0, n)))
     m = cones.n_rows // n
     w, b = blocks_of(matrix, rng, n, m), rng.standard_normal((n, m))
     if matrix == "rank one":  # a contact can stick only where b_t lies in the range of W_tt

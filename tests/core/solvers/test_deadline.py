@@ -311,12 +311,7 @@ def test_modules_are_imported_before_the_clock_of_the_first_limit(name, tmp_path
 
 def draw_jacobian_problem(seed, m=240, n=150, law="coulomb"):
     """Contacts, or bounded rows, over a full J and M."""
-    rng = np.random.default_rng(seed)
-    half, jac, free = rng.normal(size=(n, n)), rng.normal(size=(m, n)), rng.normal(size=n)
-    cones = lv.Cones.contacts(np.full(m // 3, 0.5), 2)
-    if law == "lcp":
-        cones = lv.Cones.bounded(np.zeros(m), np.full(m, np.inf))
-    return lv.Problem.from_jacobian(jac, half @ half.T / n + np.eye(n), free, cones=cones)
+    return over_velocities(m, n, seed, cones=lv.Cones.bounded(np.zeros(m), np.inf) if law == "lcp" else None)
 
 
 @pytest.mark.parametrize("law", ["coulomb", "lcp"])
