@@ -225,7 +225,8 @@ class FirstSweeps:
 @np.errstate(all="ignore")  # Results that overflow are judged.
 def solve(log: SolveLog, tree: DecisionTree) -> None:
     """Run the stages of the tree until one solves the problem or no stage remains. Then search for a certificate."""
-    is_late = not (tree.has_time("newton", tree.min_newton_cost) or log.problem.cones.has_round)
+    has_time = not log.deadline.is_set or tree.has_time("newton", tree.min_newton_cost)
+    is_late = not (has_time or log.problem.cones.has_round)
     stages = iter(tree)
     # Check `done` first, because the tree computes costs before it yields the next stage.
     while not (is_late or log.done()) and (stage := next(stages, None)) is not None:

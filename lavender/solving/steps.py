@@ -27,14 +27,14 @@ from lavender_ext.judge.measure import all_finite, residuals_by_island
 
 def make_solver(name: str, problem: Problem) -> Any:
     """Create the solver of a step, whose name begins with that of the solver."""
-    solver = name.split()[0]
-    if solver == "direct" and problem.law == "linear":
+    spec = get(name.split()[0])
+    if name == "direct" and problem.law == "linear":
         return SufficientDirect()  # `auto` needs no refinement of a solution that meets tol.
-    if solver == "nncg":
-        return get(solver).load()(restart="against")
+    if name == "nncg":
+        return spec.load()(restart="against")
     # Solve blocks exactly under the cone law, and for a matrix: rows of a contact may differ in unit.
     exact = problem.law == "cone" or (problem.law == "coulomb" and problem.matrix is not None)
-    return get(solver).load()(**({"sweep": "blocks"} if exact and "sweep" in get(solver).options else {}))
+    return spec.load()(**({"sweep": "blocks"} if exact and "sweep" in spec.options else {}))
 
 
 def estimate_cost(name: str, problem: Problem) -> Cost:
@@ -55,7 +55,7 @@ def prepare_sweeps(solver: Any, problem: Problem, deadline: Deadline) -> Any:
 class Step:
     """A solver on the problem of a log. It runs in turns, and continues at the end of its last turn.
 
-    `tree` is the `DecisionTree` of the solve. `over` is true if the step cannot continue, `late` if it has no time to
+    The `DecisionTree` of the solve creates it. `over` is true if the step cannot continue, `late` if it has no time to
     continue. The step stops if it predicts that more than `least` iterations are still needed.
     """
 
@@ -65,8 +65,10 @@ class Step:
     impulse: FloatArray  # Present iterate (m,) [N s].
 
     def __init__(self, name: str, log: SolveLog, tree: Any) -> None:
-        self.name, self.log, self.tree = name, log, tree
+        self.name, self.log, self.is_large = name, log, tree.is_large
         self.solver = make_solver(name, log.problem)
+        if self.name.startswith("newton"):
+            self.analysed, self.started_from_zero = tree.newton_state, tree.started_from_zero
 
     def run(self, n: float) -> None:
         """Run at most n iterations and record the stage in the log."""
@@ -109,10 +111,6 @@ class Newton(Step):
 
     is_second_start = has_stalled = False
 
-    def __init__(self, name: str, log: SolveLog, tree: Any) -> None:
-        super().__init__(name, log, tree)
-        self.state, self.started_from_zero = tree.newton_state, tree.started_from_zero
-
     def run(self, n: float) -> None:
         """Run at most n iterations, with a second start from zero and over rows of A if the method stalls."""
         log, end = self.log, self.log.iterations + n
@@ -131,8 +129,9 @@ class Newton(Step):
 
     def advance(self, n: int) -> Claim:
         """Run about n iterations, on large problems with friction more; choose the start at the first call."""
-        log, is_large, done, work = self.log, self.tree.is_large, 0, dict[str, int]()
+        log, is_large, done, work = self.log, self.is_large, 0, dict[str, int]()
         extension = int(DECISIONS.turn_extension)
+        self.state = self.state or self.analysed
         if not self.state.begun:
             self.impulse = log.problem.start() if self.is_second_start else log.impulse.copy()
             self.started_from_zero = self.started_from_zero or not (self.impulse - log.problem.start()).any()
@@ -157,7 +156,7 @@ class RelaxedNewton(Step):
         """Run at most n factorisations, and compare both laws after each from the first possible end on."""
         log = self.log
         if self.state is None:  # The elimination order of the problem's own state is reused.
-            self.state = self.solver.update(self.tree.newton_state, get_relaxation(log.problem))
+            self.state = self.solver.update(self.analysed, get_relaxation(log.problem))
             self.impulse = log.problem.start()
         system, trial, slips = self.state.system, self.impulse.copy(), False
         claim, done, work = Claim(Status.MAX_ITERATIONS, 0), 0, dict[str, int]()
@@ -193,7 +192,7 @@ class Iterations(Step):
     def advance(self, n: int) -> Claim:
         """Run at most n iterations and offer the last and the best iterate to the log."""
         log, left = self.log, self.log.deadline.get_remaining_seconds()
-        restarts = self.name == "admm" and self.tree.is_large
+        restarts = self.name == "admm" and self.is_large
         if self.state is None or (restarts and log.best < self.state.best[0]):
             self.prepare_and_set_start()
         is_whole = left is None or self.time_fraction == 1.0
@@ -258,7 +257,7 @@ class Sweeps(Iterations):
 
     def run_loop(self, loop: Loop, n: int) -> Claim:
         """Run at most n sweeps; predict how many remain at intervals."""
-        is_large, log = self.tree.is_large, self.log
+        is_large, log = self.is_large, self.log
         first = int(DECISIONS.large_sweeps if is_large else DECISIONS.first_sweeps)
         growth, tol = 1.0 if is_large else 0.5, max(log.tol, DECISIONS.predicted_residual)
         done, due = self.state.watch.total, 0
@@ -296,7 +295,7 @@ class Sweeps(Iterations):
     def is_hopeless(self, max_remaining: float) -> bool:
         """Return whether more than `max_remaining` sweeps are predicted; large problems first make some of these."""
         done = 0.0 if self.state is None else self.state.watch.total
-        is_early = self.tree.is_large and done < DECISIONS.sweep_fraction * max_remaining
+        is_early = self.is_large and done < DECISIONS.sweep_fraction * max_remaining
         return self.predicted > max_remaining and not is_early
 
 
