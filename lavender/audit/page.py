@@ -13,16 +13,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.io.stored import format_json
 from lavender.judge.residuals import AT_FLOOR, UNCONVERGED, VERDICTS, WRONG
-from lavender.report.drawing import (
-    BLUE,
-    INK,
-    PINK,
-    Label,
-    draw_error_strip,
-    draw_figure,
-    label_ends,
-    mark_errors,
-)
+from lavender.report import drawing
 from lavender.report.page import Page, fold_table, make_table
 from lavender.report.render import print_table, write_files
 from lavender.report.text import (
@@ -291,34 +282,42 @@ class AuditCounts:
         q = compute_quantiles(self.errors, list(QUANTILE_LINES.values()))
 
         def fill(axes: Any, strip: Any) -> str:
-            labels = mark_errors(axes, low, float(np.nanmax(q)) if np.isfinite(q).any() else 0.0, self.limit)
+            labels = drawing.mark_errors(
+                axes, low, float(np.nanmax(q)) if np.isfinite(q).any() else 0.0, self.limit
+            )
             axes.set_xlim(0, steps)
             for i, alpha in enumerate((0.38, 0.24, 0.12)):
-                axes.fill_between(x, q[i], q[i + 1], step="post", color=BLUE, alpha=alpha, lw=0)
+                axes.fill_between(x, q[i], q[i + 1], step="post", color=drawing.BLUE, alpha=alpha, lw=0)
             for i, width in ((0, 1.2), (3, 0.7)):
-                axes.step(x, q[i], where="post", color=BLUE, lw=width)
+                axes.step(x, q[i], where="post", color=drawing.BLUE, lw=width)
             labels += [
-                Label(y, name, BLUE) for name, y in zip(QUANTILE_LINES, q[:, -1], strict=True) if y == y
+                drawing.Label(y, name, drawing.BLUE)
+                for name, y in zip(QUANTILE_LINES, q[:, -1], strict=True)
+                if y == y
             ]
             if audit.against is not None:
                 other = np.where(audit.against.is_judged, audit.against.numbers[0], np.nan)
                 for y, name in zip(compute_quantiles(other, [0.99, 1.0]), ("99 %", "worst"), strict=True):
-                    axes.step(x, y, where="post", color=PINK, lw=1.0, ls="-" if name == "worst" else "--")
-                    labels += [Label(y[-1], f"against, {name}", PINK)] if y[-1] == y[-1] else []
+                    axes.step(
+                        x, y, where="post", color=drawing.PINK, lw=1.0, ls="-" if name == "worst" else "--"
+                    )
+                    labels += (
+                        [drawing.Label(y[-1], f"against, {name}", drawing.PINK)] if y[-1] == y[-1] else []
+                    )
             axes.set_ylabel("velocity error [m/s]")
-            label_ends(axes, labels)
+            drawing.label_ends(axes, labels)
             order = np.argsort(-np.nan_to_num(self.sizes).max(axis=1), kind="stable")
             rows = np.array_split(order, min(worlds, MAX_STRIP_WORLDS))
             columns = np.array_split(np.arange(steps), min(steps, MAX_STRIP_STEPS))
             filled = np.where(np.isnan(self.sizes), -1.0, self.sizes)
             errors = np.array([[filled[np.ix_(r, c)].max() for c in columns] for r in rows])
             errors = np.where(errors < 0.0, np.nan, errors)
-            draw_error_strip(strip, errors, audit.threshold, self.limit, (0, steps, worlds, 0))
+            drawing.draw_error_strip(strip, errors, audit.threshold, self.limit, (0, steps, worlds, 0))
             strip.set_ylabel(f"{worlds} worlds, worst first" if worlds > 1 else "one world")
             strip.set_xlabel("step")
             strip.set_yticks([])
             if self.largest:
-                style = {"ms": 6, "color": INK, "mfc": "none", "mew": 1.2, "clip_on": False}
+                style = {"ms": 6, "color": drawing.INK, "mfc": "none", "mew": 1.2, "clip_on": False}
                 strip.plot([self.step + 0.5], [max(worlds / 60.0, 0.5)], "v", **style)
             ends = ", ".join(
                 f"{name} {format_speed(float(y))}" for name, y in zip(QUANTILE_LINES, q[:, -1], strict=True)
@@ -332,7 +331,7 @@ class AuditCounts:
             f"{format_power(low)} m/s rounding decides. Below: each line is a world, ▽ the worst step (records.npz)."
         )
         margins = {"left": 0.13, "right": 0.75, "top": 0.985, "bottom": 0.085, "hspace": 0.1}
-        return draw_figure("errors", fill, (4.9, 4.9), margins, note=note, folder=folder, nrows=2, sharex=True,
+        return drawing.draw_figure("errors", fill, (4.9, 4.9), margins, note=note, folder=folder, nrows=2, sharex=True,
                            height_ratios=[1.45, 1.0])  # fmt: skip
 
     def make_sizes_table(self) -> list[Any]:

@@ -111,16 +111,11 @@ class SlipOfStates:
             parts = {cause: float(first[cause]) for cause in CAUSES.values()}
             total = sum(parts.values()) or 1.0
             colors = [f"var(--s{i})" for i in range(len(parts))]
-            bar = [
-                (f"{100.0 * x / total:.1f}", color) for x, color in zip(parts.values(), colors, strict=True)
-            ]
-            rows: list[Any] = [
-                [
-                    Markup('<span class="swatch" style="background:{}"></span> {}').format(color, cause),
-                    format_speed(x),
-                ]
-                for (cause, x), color in zip(parts.items(), colors, strict=True)
-            ]
+            shares = (f"{100.0 * x / total:.1f}" for x in parts.values())
+            bar = list(zip(shares, colors, strict=True))
+            swatch = Markup('<span class="swatch" style="background:{}"></span> {}')
+            named = zip(parts.items(), colors, strict=True)
+            rows: list[Any] = [[swatch.format(color, cause), format_speed(x)] for (cause, x), color in named]
             alt = ", ".join(f"{cause} {format_speed(x)}" for cause, x in parts.items())
             title = "Causes of this slip"
             causes = [make_table(rows, title=title, classes="full"), {"bar": bar, "alt": alt}]

@@ -7,19 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lavender.report.drawing import (
-    INK,
-    ORANGE,
-    QUIET,
-    FigureFolder,
-    Label,
-    draw_figure,
-    fit_margins,
-    label_ends,
-    mark_errors,
-    style_line,
-    write_label,
-)
+from lavender.report import drawing
 from lavender.report.tables import ENGINE_NAME, Contents, format_size, is_plug_in, rank_solvers
 from lavender.report.text import format_count, format_power, format_residual, format_speed, format_time
 
@@ -40,7 +28,7 @@ def select_drawn_solvers(ranking: Sequence[str]) -> list[str]:
     return [n for n in ranking if n in first or n in (*ALWAYS_DRAWN, ENGINE_NAME) or is_plug_in(n)]
 
 
-def draw_time_to_accuracy(report: Contents, names: Sequence[str], folder: FigureFolder | None) -> str:
+def draw_time_to_accuracy(report: Contents, names: Sequence[str], folder: drawing.FigureFolder | None) -> str:
     """Draw the mean time of each solver to each tolerance, with values at the ends of the lines."""
     tolerances = report.tolerances
     means = {t: rank_solvers(report, t, report.subject)["mean"] for t in tolerances}
@@ -53,16 +41,16 @@ def draw_time_to_accuracy(report: Contents, names: Sequence[str], folder: Figure
         axes.set_ylim(max(every.min(), 1e-9) / 1.3, every.max() * 1.25)
         labels = []
         for i, (name, own) in enumerate(times.items()):
-            style = style_line(i)
+            style = drawing.style_line(i)
             axes.plot(range(len(own)), own, clip_on=False, **style)
             weight = "normal" if i else "bold"
-            labels.append(Label(own[-1], f"{name} {format_time(own[-1])}", style["color"], weight))
+            labels.append(drawing.Label(own[-1], f"{name} {format_time(own[-1])}", style["color"], weight))
         axes.set_xticks(range(len(tolerances)), list(map(format_power, tolerances)))
         axes.set_xlabel("residual to reach (1: no impulse)")
         axes.yaxis.set_major_formatter(lambda t, _: format_time(t))
         axes.yaxis.set_minor_formatter(lambda t, _: format_time(t) if f"{t:e}"[0] in "25" else "")
         axes.grid(True, axis="y")
-        label_ends(axes, labels)
+        drawing.label_ends(axes, labels)
         return "Mean time. " + "; ".join(
             f"{name}: "
             + ", ".join(
@@ -73,14 +61,14 @@ def draw_time_to_accuracy(report: Contents, names: Sequence[str], folder: Figure
 
     n, limit = len(report.subject), format_time(report.time_limit)
     note = f"Mean time over {format_count(n, 'problem')}, unsolved ones at {limit} (tables/solvers.csv)."
-    margins = fit_margins([f"{name} {format_time(own[-1])}" for name, own in times.items()])
-    return draw_figure("time-to-accuracy", fill, FIGURE_SIZE, margins, note=note, folder=folder)
+    margins = drawing.fit_margins([f"{name} {format_time(own[-1])}" for name, own in times.items()])
+    return drawing.draw_figure("time-to-accuracy", fill, FIGURE_SIZE, margins, note=note, folder=folder)
 
 
 def draw_profile(
     times: pd.DataFrame,
     names: Sequence[str],
-    folder: FigureFolder | None,
+    folder: drawing.FigureFolder | None,
     name: str = "profile",
     **style: Any,
 ) -> str:
@@ -100,9 +88,9 @@ def draw_profile(
             r = np.maximum(r[r <= high], 1.0)
             x = np.r_[1.0, r, high]
             y = np.searchsorted(r, x * (1.0 + 1e-9), side="right") / n
-            line = style_line(i) | {"marker": ""} | style
+            line = drawing.style_line(i) | {"marker": ""} | style
             axes.step(x, y, where="post", gid=f"{solver}--{i}", **line)
-            labels.append(Label(y[-1], str(solver), line["color"], "normal" if i else "bold"))
+            labels.append(drawing.Label(y[-1], str(solver), line["color"], "normal" if i else "bold"))
         axes.set_xlabel("at most this many times slower than the fastest")
         axes.xaxis.set_major_formatter(lambda x, _: f"{x:g}×")
         axes.minorticks_off()
@@ -110,7 +98,7 @@ def draw_profile(
         axes.yaxis.set_major_formatter(lambda y, _: f"{100.0 * y:.0f} %")
         axes.tick_params(axis="y", pad=7)
         axes.grid(True)
-        label_ends(axes, labels[::-1])
+        drawing.label_ends(axes, labels[::-1])
         return "Performance profile. Solved within twice the fastest time: " + ", ".join(
             f"{solver} {100.0 * (own <= 2.0).sum() / n:.0f} %" for solver, own in ratios.iterrows()
         )
@@ -119,11 +107,11 @@ def draw_profile(
         "Share of the problems solved within a factor of the fastest solver (performance profile). Left end: how often "
         "a solver is the fastest; right end: how many it solves (tables/matrix.csv)."
     )
-    return draw_figure(name, fill, FIGURE_SIZE, fit_margins(names), note=note, folder=folder)
+    return drawing.draw_figure(name, fill, FIGURE_SIZE, drawing.fit_margins(names), note=note, folder=folder)
 
 
 def draw_error_against_time(
-    report: Contents, case: str, names: Sequence[str], folder: FigureFolder | None
+    report: Contents, case: str, names: Sequence[str], folder: drawing.FigureFolder | None
 ) -> str:
     """Draw the error that each solver reached on one case by a time; an engine's own answer is a star.
 
@@ -150,14 +138,16 @@ def draw_error_against_time(
         points = np.concatenate(list(lines.values()))
         axes.set_xscale("log")
         axes.set_xlim(points[:, 0].min() / 1.3, points[:, 0].max() * 1.3)
-        mark_errors(axes, low, float(points[:, 1].max()), limit)
-        write_label(axes, 1.02, 0.035, f"below {format_power(low)}", fontsize=8.2, color=QUIET)
+        drawing.mark_errors(axes, low, float(points[:, 1].max()), limit)
+        drawing.write_label(
+            axes, 1.02, 0.035, f"below {format_power(low)}", fontsize=8.2, color=drawing.QUIET
+        )
         place = axes.transAxes.inverted().transform(axes.transData.transform((1.0, 1.35 * limit)))[1]
         text = f"to reach: {format_power(limit)}" if is_program else f"limit {format_speed(limit)}"
-        write_label(axes, 0.015, place, text, color=ORANGE, va="bottom", fontsize=8.2)
+        drawing.write_label(axes, 0.015, place, text, color=drawing.ORANGE, va="bottom", fontsize=8.2)
         for i, (name, own) in enumerate(lines.items()):
-            style = style_line(i) | (
-                {"marker": "*", "markersize": 12, "color": INK} if name == ENGINE_NAME else {}
+            style = drawing.style_line(i) | (
+                {"marker": "*", "markersize": 12, "color": drawing.INK} if name == ENGINE_NAME else {}
             )
             axes.plot(own[:, 0], np.where(own[:, 1] < low, low / 2.0, own[:, 1]), **style)
         axes.xaxis.set_major_formatter(lambda t, _: format_time(t))
@@ -165,17 +155,17 @@ def draw_error_against_time(
         axes.set_xlabel("time of a call")
         axes.set_ylabel("error of the program" if is_program else "largest velocity error [m/s]")
         axes.grid(True, axis="x")
-        write_label(axes, 1.04, 1.0, "time of the last run", fontsize=8.2, color=QUIET)
+        drawing.write_label(axes, 1.04, 1.0, "time of the last run", fontsize=8.2, color=drawing.QUIET)
         order = sorted(lines, key=lambda name: lines[name][-1, 0])
         for k, name in enumerate(order):
-            style, y = style_line(list(lines).index(name)), 0.93 - 0.07 * k
+            style, y = drawing.style_line(list(lines).index(name)), 0.93 - 0.07 * k
             mark = "*" if name == ENGINE_NAME else style["marker"]
             axes.plot(
                 [1.06], [y], mark, ms=4.5, color=style["color"], transform=axes.transAxes, clip_on=False
             )
             weight = "bold" if name == next(iter(lines)) else "normal"
             text = f"{name} {format_time(lines[name][-1, 0])}"
-            write_label(axes, 1.1, y, text, color=style["color"], weight=weight)
+            drawing.write_label(axes, 1.1, y, text, color=style["color"], weight=weight)
         return f"Error against time on {case}. " + ", ".join(
             f"{name} reaches {show(own[-1, 1])} in {format_time(own[-1, 0])}" for name, own in lines.items()
         )
@@ -184,5 +174,5 @@ def draw_error_against_time(
     error = "" if is_program else "; its error is that of the worst row"
     note = f"{slowest}{case} ({format_size(report.cases.loc[case])}). A mark is a run{error} (records.csv)."
     texts = ["time of the last run", *(f"{name} {format_time(own[-1, 0])}" for name, own in lines.items())]
-    margins = fit_margins(texts, 0.07, left_margin=0.14)
-    return draw_figure("error-against-time", fill, FIGURE_SIZE, margins, note=note, folder=folder)
+    margins = drawing.fit_margins(texts, 0.07, left_margin=0.14)
+    return drawing.draw_figure("error-against-time", fill, FIGURE_SIZE, margins, note=note, folder=folder)

@@ -337,11 +337,8 @@ class Report(Contents):
         changes = [fold_table(*sections["changes"], is_open=True)] if "changes" in sections else []
         if "runs" in sections:  # The file has all columns.
             runs = sections["runs"].frame
-            few = [
-                c
-                for c in runs
-                if not c.endswith("median [s]") and c not in ("form", "floor [-]", "iterations", "worst row")
-            ]
+            hidden = ("form", "floor [-]", "iterations", "worst row")
+            few = [c for c in runs if c not in hidden and not c.endswith("median [s]")]
             sections = sections | {"runs": sections["runs"]._replace(frame=runs[few])}
         folded = [
             fold_table(*sections[name], is_grouped=name == "runs") for name in order if name in sections
@@ -697,14 +694,8 @@ def _join(names: Any, most: int = 3) -> str:
 def _limit(kind: str, texts: Sequence[str], most: int = 1) -> Iterator[str]:
     """Yield the first texts of a kind of warnings, with their number if there are more."""
     for i, text in enumerate(texts[:most], 1):
-        place = (
-            ""
-            if len(texts) == 1
-            else f" ({i} of {len(texts)})"
-            if most > 1
-            else f", the first of {len(texts)}"
-        )
-        yield f"{kind}{place}: {text}"
+        place = f" ({i} of {len(texts)})" if most > 1 else f", the first of {len(texts)}"
+        yield f"{kind}{place * (len(texts) > 1)}: {text}"
 
 
 def list_energy_gains(report: Report) -> list[str]:

@@ -8,20 +8,7 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
-from lavender.report.drawing import (
-    BLUE,
-    INK,
-    MARKERS,
-    PAPER,
-    QUIET,
-    SERIES,
-    FigureFolder,
-    Label,
-    draw_error_strip,
-    draw_figure,
-    label_ends,
-    mark_errors,
-)
+from lavender.report import drawing
 from lavender.report.page import make_table
 from lavender.report.tables import Contents, list_plain_sweeps, read_own_answers
 from lavender.report.text import format_count, format_percent, format_speed, format_time, split_row_unit
@@ -155,17 +142,17 @@ class SweepStudy:
             return [*lines, " ".join(f"{text}." for text in ("; ".join(texts), same) if text)]
         return [*lines, f"{'; '.join(texts)}."] if texts else lines
 
-    def make_blocks(self, folder: FigureFolder | None, with_figures: bool) -> list[Any]:
+    def make_blocks(self, folder: drawing.FigureFolder | None, with_figures: bool) -> list[Any]:
         """Make the figures and the table of sweeps × solvers."""
         table = self._make_sweeps_table()
         if not with_figures:
             return [table]
         return [{"pair": [[Markup(self._draw_errors(folder))], [Markup(self._draw_steps(folder)), table]]}]
 
-    def _draw_errors(self, folder: FigureFolder | None) -> str:
+    def _draw_errors(self, folder: drawing.FigureFolder | None) -> str:
         """Draw the largest error against the number of sweeps, with the engine's own answers as a star."""
         low = SWEEPS_SHOWN_RATIO * self.limit
-        colors = [BLUE, *SERIES[2:], INK, *[QUIET] * len(self.groups)]
+        colors = [drawing.BLUE, *drawing.SERIES[2:], drawing.INK, *[drawing.QUIET] * len(self.groups)]
 
         def fill(axes: Any) -> str:
             axes.set_xscale("log", base=2)
@@ -173,42 +160,56 @@ class SweepStudy:
             high = max(
                 float(self.errors.max(axis=None)), float(self.cold.max(axis=None)) if len(self.cold) else 0.0
             )
-            labels = mark_errors(axes, low, high, self.limit)
+            labels = drawing.mark_errors(axes, low, high, self.limit)
 
             def place(errors: pd.Series[float]) -> Any:
                 return errors.where(errors.isna() | (errors >= low), low / 2.0)
 
             for i, group in enumerate(self.groups):
                 own, equal = self.errors.loc[group[0]], f" (+{len(group) - 1} equal)" * (len(group) > 1)
-                axes.plot(self.budgets, place(own), color=colors[i], marker=MARKERS[i % 6], ms=4.5, clip_on=False,
-                          lw=1.4 if i else 2.4, ls="-" if i < 5 else "--")  # fmt: skip
+                dash = {"lw": 1.4 if i else 2.4, "ls": "-" if i < 5 else "--", "ms": 4.5, "clip_on": False}
+                axes.plot(self.budgets, place(own), color=colors[i], marker=drawing.MARKERS[i % 6], **dash)
                 if (last := own.last_valid_index()) is not None:
                     labels.append(
-                        Label(float(place(own)[last]), group[0] + equal, colors[i], "normal" if i else "bold")
+                        drawing.Label(
+                            float(place(own)[last]), group[0] + equal, colors[i], "normal" if i else "bold"
+                        )
                     )
             if self.start == "carried" and self.first in self.cold.index:
-                axes.plot(self.budgets, place(self.cold.loc[self.first]), color=BLUE, lw=0.9, ls=(0, (3, 2)))
+                axes.plot(
+                    self.budgets, place(self.cold.loc[self.first]), color=drawing.BLUE, lw=0.9, ls=(0, (3, 2))
+                )
             best = self._find_smallest(self.first)
             if best is not None:
                 drop = [low / 4.0, place(self.errors.loc[self.first])[best]]
-                axes.plot([best, best], drop, color=BLUE, lw=0.8, ls=":")
+                axes.plot([best, best], drop, color=drawing.BLUE, lw=0.8, ls=":")
             iterations = self.answers["iterations"].dropna()
             if len(iterations):
                 x, y = float(iterations.max()), max(float(self.answers["velocity"].max()), low / 2.0)
                 x = min(max(x, self.budgets[0]), self.budgets[-1])
-                axes.plot([x], [y], "*", ms=13, color=INK, mec=PAPER, mew=0.8, zorder=9, clip_on=False)
+                axes.plot(
+                    [x],
+                    [y],
+                    "*",
+                    ms=13,
+                    color=drawing.INK,
+                    mec=drawing.PAPER,
+                    mew=0.8,
+                    zorder=9,
+                    clip_on=False,
+                )
                 axes.annotate(
                     f"your engine\n{iterations.max():.0f} iterations: {format_speed(y)}", (x, y), xytext=(12, 16),
                     textcoords="offset points", fontsize=8.6, fontweight="bold", va="bottom",
                     ha="left" if x < self.budgets[len(self.budgets) // 2] else "right",
-                    arrowprops={"arrowstyle": "-", "lw": 0.6, "color": QUIET, "shrinkB": 5},
+                    arrowprops={"arrowstyle": "-", "lw": 0.6, "color": drawing.QUIET, "shrinkB": 5},
                 )  # fmt: skip
             axes.set_xticks(self.budgets, list(map(str, self.budgets)))
             axes.minorticks_off()
             axes.grid(True)
             axes.set_xlabel("sweeps in each step")
             axes.set_ylabel("largest velocity error of all steps [m/s]")
-            label_ends(axes, labels)
+            drawing.label_ends(axes, labels)
             return "Largest velocity error against sweeps. " + "; ".join(
                 f"{g[0]}: "
                 + ", ".join(f"{b} sweeps {format_speed(e)}" for b, e in self.errors.loc[g[0]].items())
@@ -221,9 +222,9 @@ class SweepStudy:
         ]
         margins = {"left": 0.135, "right": 0.72, "top": 0.96, "bottom": 0.14}
         note = " ".join([*notes, "(tables/sweeps.csv)"])
-        return draw_figure("sweeps", fill, (4.9, 3.5), margins, note=note, folder=folder)
+        return drawing.draw_figure("sweeps", fill, (4.9, 3.5), margins, note=note, folder=folder)
 
-    def _draw_steps(self, folder: FigureFolder | None) -> str:
+    def _draw_steps(self, folder: drawing.FigureFolder | None) -> str:
         """Draw the error of each step after each number of sweeps of the first solver, the engine's answers first."""
         runs = self.runs[(self.runs["solver"] == self.first) & (self.runs["start"] == self.start)]
         table = runs.pivot_table(index="max_iter", columns="case", values="velocity", sort=False).sort_index()
@@ -237,9 +238,9 @@ class SweepStudy:
         height = 0.27 * n + 0.75
 
         def fill(axes: Any) -> str:
-            draw_error_strip(axes, errors, 1e-6, self.limit, (-0.5, len(cases) - 0.5, n - 0.5, -0.5))
+            drawing.draw_error_strip(axes, errors, 1e-6, self.limit, (-0.5, len(cases) - 0.5, n - 0.5, -0.5))
             for i in range(1, n):
-                axes.axhline(i - 0.5, color=PAPER, lw=5 if len(self.answers) and i == 1 else 2)
+                axes.axhline(i - 0.5, color=drawing.PAPER, lw=5 if len(self.answers) and i == 1 else 2)
             axes.set_yticks(range(n), list(map(str, table.index)))
             shown = np.unique(np.linspace(0, len(cases) - 1, 6).astype(int))
             axes.set_xticks(shown, list(map(str, steps[shown])))
@@ -253,7 +254,7 @@ class SweepStudy:
         note = f"Which steps need them: error of each step with {self.first}" + (
             "; first line: your engine's answers (records.csv)." if len(self.answers) else " (records.csv)."
         )
-        return draw_figure("sweeps-by-step", fill, (4.9, height), margins, note=note, folder=folder)
+        return drawing.draw_figure("sweeps-by-step", fill, (4.9, height), margins, note=note, folder=folder)
 
     def _make_sweeps_table(self) -> dict[str, Any]:
         """Make the table of the largest errors: sweeps × solvers, motion error and, if valid, the time last."""

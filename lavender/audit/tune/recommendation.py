@@ -14,19 +14,7 @@ from lavender.audit.provenance import format_provenance
 from lavender.audit.settings import MERGE_NOTE, MujocoSetting
 from lavender.audit.tune.measured import Measured
 from lavender.problem.derived import cached_property
-from lavender.report.drawing import (
-    BLUE,
-    GREEN,
-    INK,
-    OLIVE,
-    PAPER,
-    PINK,
-    QUIET,
-    draw_figure,
-    label_ends,
-    mark_errors,
-    write_label,
-)
+from lavender.report import drawing
 from lavender.report.page import DEFAULT_ERROR_LIMIT, Page, fold_table, tabulate_frame
 from lavender.report.text import NONE, format_count, format_speed
 
@@ -300,7 +288,8 @@ class Tuning:
         now, limit = self.present_result, self.shown_limit
         low = SHOWN_RATIO * limit
         solvers = list(dict.fromkeys(m.solver for m in self._same_problem))
-        styles = {s: ((BLUE, GREEN, PINK, OLIVE)[i % 4], "osDv"[i % 4]) for i, s in enumerate(solvers)}
+        colors = [color for color in drawing.SERIES if color != drawing.ORANGE]  # The limit is orange.
+        styles = {solver: (colors[i % 4], "osDv"[i % 4]) for i, solver in enumerate(solvers)}
 
         def place(m: Measured) -> tuple[float, float]:
             """Return the relative time and the shown error of a setting."""
@@ -308,40 +297,40 @@ class Tuning:
 
         def fill(axes: Any) -> str:
             points = np.array(list(map(place, self._same_problem)))
-            labels = mark_errors(axes, low, float(points[:, 1].max()), limit)
+            labels = drawing.mark_errors(axes, low, float(points[:, 1].max()), limit)
             low_x, high_x = float(points[:, 0].min()), max(float(np.quantile(points[:, 0], 0.97)), 1.05)
             axes.set_xlim(low_x - 0.04, high_x + 0.04)
-            axes.axvline(1.0, color=QUIET, lw=0.7, ls=":")
+            axes.axvline(1.0, color=drawing.QUIET, lw=0.7, ls=":")
             for solver, (color, mark) in styles.items():
                 own = np.array([place(m) for m in self._same_problem if m.solver == solver])
                 axes.plot(*own.T, mark, color=color, ms=4.5, alpha=0.75, mew=0)
             front = np.array(list(map(place, self.pareto_front)))
-            axes.step(*front.T, where="post", color=QUIET, lw=0.8, zorder=1)
+            axes.step(*front.T, where="post", color=drawing.QUIET, lw=0.8, zorder=1)
             x, y = place(now)
-            axes.plot([x], [y], "*", ms=14, color=INK, mec=PAPER, mew=0.8, zorder=9)
+            axes.plot([x], [y], "*", ms=14, color=drawing.INK, mec=drawing.PAPER, mew=0.8, zorder=9)
             more = {"textcoords": "offset points", "fontweight": "bold", "fontsize": 8.8}
             is_left = x < np.mean(axes.get_xlim())
             side, dx = ("left", 8) if is_left else ("right", -8)
             axes.annotate("your option", (x, y), xytext=(dx, 8), ha=side, **more)
             if self.advised is not None:
                 x, y = place(self.advised)
-                arrow = {"arrowstyle": "-", "lw": 0.6, "color": QUIET}
-                axes.plot([x], [y], "o", ms=10, mfc="none", mec=INK, mew=1.4, zorder=9)
+                arrow = {"arrowstyle": "-", "lw": 0.6, "color": drawing.QUIET}
+                axes.plot([x], [y], "o", ms=10, mfc="none", mec=drawing.INK, mew=1.4, zorder=9)
                 axes.annotate("set this", (x, y), xytext=(14, 26), arrowprops=arrow, **more)
             axes.set_xlabel("time of a step, your option = 1")
             axes.set_ylabel("error that 1 % of the steps exceed [m/s]")
-            label_ends(axes, labels)
+            drawing.label_ends(axes, labels)
             for i, (solver, (color, mark)) in enumerate(styles.items()):
                 y, style = 0.97 - 0.07 * i, {"transform": axes.transAxes, "clip_on": False}
                 axes.plot([1.06], [y], mark, color=color, ms=5, **style)
-                write_label(axes, 1.1, y, solver, color=color)
+                drawing.write_label(axes, 1.1, y, solver, color=color)
             fastest = self.pareto_front[0].mean_step_time / now.mean_step_time
             numbers = f"{len(points)} settings, fastest {fastest:.2f} of the time"
             return f"Error against time of {numbers}. {self.headline[0]}"
 
         note = "Each mark is a setting of <option> for the same problem; line: fastest for its error (numbers.json)."
         margins = {"left": 0.13, "right": 0.75, "top": 0.96, "bottom": 0.14}
-        return draw_figure("settings", fill, (4.9, 3.5), margins, note=note, folder=folder)
+        return drawing.draw_figure("settings", fill, (4.9, 3.5), margins, note=note, folder=folder)
 
     def make_page(self, folder: Path | None) -> Page:
         """Make the page; without a folder for figures, only its head."""
