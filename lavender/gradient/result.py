@@ -136,17 +136,17 @@ class Gradient(GradientArrays):
             )
             pairs = self._list_outer_product_pairs(name)
             return _sum_on_pattern(pattern, *pairs) if issparse(pattern) else np.outer(*pairs[0])
-        rows = derivative._coefficient_rows
-        first, second, rolling = (
-            rows.select_rows_or_zero(self._by_row_coefficient, at)
-            for at in (rows.first, rows.second, rows.rolling)
-        )
+        rows, gradient = derivative._coefficient_rows, self._by_row_coefficient
+        if name == "rolling":
+            return rows.select_rows_or_zero(gradient, rows.rolling)
+        second = rows.select_rows_or_zero(gradient, rows.second)
+        if name == "patch_radius":
+            return rows.mu * second
+        first = rows.select_rows_or_zero(gradient, rows.first)
         if name == "mu":
             return first + rows.radius * second
-        if name == "coefficients":
-            pair = np.where(rows.has_pair, first, self.mu), np.where(rows.has_pair, second, 0.0)
-            return np.stack(pair, axis=1)
-        return rows.mu * second if name == "patch_radius" else rolling
+        pair = np.where(rows.has_pair, first, self.mu), np.where(rows.has_pair, second, 0.0)
+        return np.stack(pair, axis=1)
 
     @cached_property
     def _by_fixed_impulse(self) -> FloatArray:
