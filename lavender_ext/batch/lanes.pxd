@@ -1,18 +1,19 @@
-"""Worlds in the lanes of vectors: 8, 4 or 2 worlds of equal size, with contacts of three rows over a full M, at once.
+"""Worlds in the lanes of vectors: 8, 4 or 2 worlds of equal structure at once, with bounded rows and contacts of three rows.
 
 Entry i of an array holds entry i of every world: x[width i + lane]. A world's arithmetic is that of one problem by the functions
-of core and judge, with the same bits: no sum runs over lanes, so that the width changes no bit. Worlds that a lane does not cover
-are processed alone: invalid numbers, a zero impulse that is a solution, results that judge/refine.pxd refines or that are above
-tol. Such contacts are solved from the zero impulse by sweeps over blocks, then Newton steps on the natural map, in batches as in
-single calls (`solve_in_one_lane`). To change a width, only the list of `LAVENDER_LANES` changes.
+of core and judge, with the same bits: no sum runs over lanes, so that the width changes no bit. Zeros of J, M and Y are processed
+as numbers, or left out where every lane has them. Worlds that a lane does not cover are processed alone: invalid numbers,
+several islands, a zero impulse that is a solution or violates bounds, results that judge/refine.pxd refines or that are above
+tol. From the zero impulse such problems are solved by sweeps over blocks, then Newton steps on the natural map, in batches as in
+single calls (`solve_in_one_lane`, with vectors over rows). To change a width, only the list of `LAVENDER_LANES` changes.
 """
 from libc.math cimport fabs, sqrt
-from libc.stdint cimport int32_t, int64_t
-from libc.string cimport memset
+from libc.stdint cimport int32_t, int64_t, uint64_t
+from libc.string cimport memmove, memset
 
-from lavender_ext.batch.world cimport (BLOCK, BLOCKS, FREE, JAC, MASS, MU, PLACES, ROWS, SOFT, TARGET, VELOCITIES, AT_ROW,
-                                       worlds_t)
-from lavender_ext.core.block_types cimport blocks_t, is_disk_friction_contact
+from lavender_ext.batch.world cimport (BLOCK, BLOCKS, CONE_ROW, FREE, JAC, MASS, MU, PLACES, ROWS, SOFT, TARGET, VELOCITIES,
+                                       AT_ROW, worlds_t)
+from lavender_ext.core.block_types cimport ROW, blocks_t, has_independent_rows, is_disk_friction_contact
 from lavender_ext.core.method cimport workspace_t
 from lavender_ext.core.view cimport generalized_t
 from lavender_ext.factor.factors cimport has_wide
@@ -25,47 +26,87 @@ cdef extern from *:
     r"""
     #include <math.h>
     typedef struct {
-        int m, n, law;
-        double asymmetry;                       /* permitted asymmetry of M, as in `worlds_t` */
-        double *jac, *mass, *free, *target, *soft, *mu, *full;      /* data; `full`: columns of a block's panel in fours */
+        int m, n, law, k;
+        const int *ptr, *kind;                  /* blocks of every lane: first rows (k + 1), 0 for bounded rows (k) */
+        double asymmetry;                       /* permitted asymmetry of M, as in `worlds_t`; below 0: M is a lower triangle */
+        double *jac, *mass, *free, *target, *soft, *mu, *lower, *upper;         /* data */
         double *inverse, *root, *y, *d, *b, *zero, *w, *e, *lam, *push, *size, *out;
         double *a, *g, *step, *change, *kept;   /* for `solve`, to the relative residual `tol` */
         double tol;
+        unsigned long long *fours, *last;       /* (k) sets of the columns of each block: all but the last, and these */
     } lavender_lanes_t;
-    enum { LANE_IS_PLAIN, LANE_START_ENERGY, LANE_START_SPEED, LANE_RHS, LANE_DETERMINANT, LANE_ENERGY, LANE_SPEED, LANE_WORST,
-           LANE_FLOOR_ENERGY, LANE_FLOOR_SPEED, LANE_WORK, LANE_HEAVIEST, LANE_STEPS, LANE_NUMBERS };
-    #define LAVENDER_LANES(N, V, I, ISA, ROOT, PICK, ABS) \
+    enum { LANE_IS_PLAIN, LANE_START_ENERGY, LANE_START_SPEED, LANE_RHS, LANE_CONDITION, LANE_ENERGY, LANE_SPEED, LANE_WORST,
+           LANE_FLOOR_ENERGY, LANE_FLOOR_SPEED, LANE_WORK, LANE_HEAVIEST, LANE_STEPS, LANE_NUMBERS, LANE_ROWS = 48,
+           LANE_VELOCITIES = 40 };
+    /* List the columns of each block of a lane: those of J and their ancestors. Return 0 if blocks may be several islands, 1 if
+     * they are one, 2 if M is also full. */
+    static int lavender_list_columns(const lavender_lanes_t* x, int width, int lane) {
+        const int n = x->n;
+        const unsigned long long one = 1;
+        unsigned long long above[LANE_VELOCITIES], roots = 0, common = ~(unsigned long long)0;
+        int full = 1;
+        for (int i = 0; i < n; i++) {
+            above[i] = 0;
+            for (int j = 0; j < i; j++) above[i] |= (unsigned long long)(x->mass[(i * n + j) * width + lane] != 0.0) << j;
+            full &= above[i] == (one << i) - 1;
+        }
+        for (int i = n - 1; i > 0; i--) {               /* the pattern of L; row i is added to that of its last column */
+            int j = i - 1;
+            while (j >= 0 && !(above[i] >> j & 1)) j--;
+            if (j >= 0) above[j] |= above[i] & ((one << j) - 1);
+        }
+        for (int i = 0; i < n; i++) {                   /* sets of ancestors */
+            int j = i - 1;
+            while (j >= 0 && !(above[i] >> j & 1)) j--;
+            if (j < 0) roots |= one << i;
+            above[i] = (j >= 0 ? above[j] : 0) | one << i;
+        }
+        for (int i = 0; i < x->k; i++) {
+            unsigned long long columns = 0, last = 0;
+            int count = 0;
+            for (int r = x->ptr[i]; r < x->ptr[i + 1]; r++)
+                for (int k = 0; k < n; k++)
+                    if (x->jac[(r * n + k) * width + lane] != 0.0) columns |= above[k];
+            for (int k = 0; k < n; k++) count += columns >> k & 1;
+            count &= 3;
+            for (int k = n - 1; count > 0; k--)
+                if (columns >> k & 1) {
+                    last |= one << k;
+                    count--;
+                }
+            x->fours[i * width + lane] = columns ^ last;
+            x->last[i * width + lane] = last;
+            common &= columns;
+        }
+        return (common & roots) ? (n < LANE_VELOCITIES || full) + full : 0;
+    }
+    /* One lane has vectors over rows: places of n numbers in fours, and a place from which all numbers after j are reached. */
+    #define LAVENDER_PLACES(V, n) (sizeof(V) == sizeof(double) ? ((n) + 3) & ~3 : (n))
+    #define LAVENDER_FROM(V, j) (sizeof(V) == sizeof(double) ? ((j) + 1) & ~3 : (j) + 1)
+    #define LAVENDER_SOLVER(N, V, I, ISA, ROOT, PICK, ABS, ANY) \
     ISA static inline V pick_##N(I mask, V a, V b) { return PICK(V, I, mask, a, b); } \
     ISA static inline V larger_##N(V a, V b) { return PICK(V, I, (I)(a > b), a, b); } \
+    ISA static inline V clip_##N(V a, V low, V high) { return pick_##N((I)(a < low), low, pick_##N((I)(a > high), high, a)); } \
     ISA static inline V abs_##N(V a) { return ABS(V, I, a); } \
     ISA static inline V root_##N(V a) { return ROOT; } \
-    ISA static inline int any_##N(I mask) { \
-        long long bits = 0; \
-        for (int l = 0; l < N; l++) bits |= ((const long long*)&mask)[l]; \
-        return bits != 0; \
-    } \
-    \
-    /* Interleave n numbers from each of N arrays, of float if `narrow`. */ \
-    ISA static void interleave_##N(const void* const* from, int narrow, long long n, double* to) { \
-        const float* single[N]; \
-        const double* wide[N]; \
-        for (int l = 0; l < N; l++) { \
-            single[l] = from[l]; \
-            wide[l] = from[l]; \
-        } \
-        for (long long i = 0; narrow && i < n; i++) \
-            for (int l = 0; l < N; l++) to[N * i + l] = single[l][i]; \
-        for (long long i = 0; !narrow && i < n; i++) \
-            for (int l = 0; l < N; l++) to[N * i + l] = wide[l][i]; \
-    } \
+    ISA static inline int any_##N(I mask) { return ANY; } \
     \
     /* The judge's errors e (m) of impulses with slack w, and sum d e^2, the largest nu d e^2 and its row (judge/tally.pxd). */ \
     ISA static void errors_##N(const lavender_lanes_t* x, const V* lam, const V* w, V* e, V* energy, V* fast, V* worst) { \
         const V *d = (const V*)x->d, *mu = (const V*)x->mu; \
         const V zero = {0.0}; \
         V sum = zero, most = zero - 1.0, at = zero - 1.0; \
-        for (int r = 0; r < x->m; r += 3) { \
-            const V dn = d[r], dt = d[r + 1], f = mu[r / 3]; \
+        for (int i = 0; i < x->k; i++) { \
+            int r = x->ptr[i]; \
+            for (; !x->kind[i] && r < x->ptr[i + 1]; r++) { \
+                e[r] = clip_##N(w[r] / d[r], lam[r] - ((const V*)x->upper)[r], lam[r] - ((const V*)x->lower)[r]); \
+                const V v = d[r] * e[r], square = v * v; \
+                sum += v * e[r]; \
+                at = pick_##N((I)(square > most), zero + (double)r, at); \
+                most = larger_##N(square, most); \
+            } \
+            if (!x->kind[i]) continue; \
+            const V dn = d[r], dt = d[r + 1], f = mu[i]; \
             const V un = w[r] / dn, u1 = w[r + 1] / dt, u2 = w[r + 2] / dt; \
             if (x->law) { \
                 const V rn = root_##N(dn), rt = root_##N(dt), yn = rn * (lam[r] - un), a = f * rt / rn; \
@@ -102,176 +143,6 @@ cdef extern from *:
         *energy = sum; \
         *fast = most; \
         *worst = at; \
-    } \
-    \
-    /* Check the data; M = L^T D L, Y = J L^-1 D^-1/2, d, b, and the errors of the zero impulse. LANE_IS_PLAIN receives 1 if \
-     * no number is out of range, M has no zero entry, and the zero impulse does not solve the world. */ \
-    ISA static void prepare_##N(const lavender_lanes_t* x) { \
-        const int m = x->m, n = x->n; \
-        V *l = (V*)x->mass, *y = (V*)x->y, *d = (V*)x->d, *b = (V*)x->b, *inverse = (V*)x->inverse, *root = (V*)x->root; \
-        V *w = (V*)x->w, *e = (V*)x->e, *lam = (V*)x->zero, *push = (V*)x->push, *out = (V*)x->out; \
-        const V *jac = (const V*)x->jac, *free = (const V*)x->free, *target = (const V*)x->target, *soft = (const V*)x->soft; \
-        const V *mu = (const V*)x->mu, *full = (const V*)x->full; \
-        const V zero = {0.0}, one = zero + 1.0; \
-        V largest = zero, determinant = one, right = zero, energy, fast, worst; \
-        I good = (I)(zero == zero), moves = (I)(zero != zero); \
-        for (int i = 0; i < m * n; i++) good &= (I)(abs_##N(jac[i]) <= 1e60); \
-        for (int i = 0; i < n; i++) good &= (I)(abs_##N(free[i]) <= 1e60); \
-        for (int i = 0; i < m; i++) \
-            good &= (I)(abs_##N(target[i]) <= 1e60) & (I)(soft[i] <= 1e60) & ((I)(soft[i] >= 1e-60) | (I)(soft[i] == 0.0)); \
-        for (int i = 0; i < m / 3; i++) good &= (I)(mu[i] <= 1e60) & ((I)(mu[i] >= 1e-60) | (I)(mu[i] == 0.0)); \
-        for (int i = 0; i < n; i++) \
-            for (int j = 0; j <= i; j++) \
-                good &= (I)(abs_##N(l[i * n + j]) <= 1e60) & (I)(l[i * n + j] != 0.0); \
-        for (int i = 0; i < n; i++)                             /* just within `asymmetry`, so that squares may round */ \
-            for (int j = 0; j < i; j++) { \
-                const V gap = l[i * n + j] - l[j * n + i], size = l[i * n + i] * l[j * n + j]; \
-                good &= (I)(gap == 0.0) | (I)(gap * gap <= 0.99 * x->asymmetry * x->asymmetry * size); \
-            } \
-        /* factor of M; the diagonal of l keeps D */ \
-        for (int i = 0; i < n; i++) inverse[i] = l[i * n + i]; \
-        for (int k = n - 1; k >= 0; k--) { \
-            V* row = l + k * n; \
-            const V size = inverse[k]; \
-            good &= (I)(row[k] > 8.8817841970012523e-16 * size) & (I)(row[k] >= 1e-60); \
-            inverse[k] = 1.0 / row[k]; \
-            root[k] = root_##N(inverse[k]); \
-            for (int j = k - 1; j >= 0; j--) { \
-                V *to = l + j * n; \
-                const V z = row[j] * inverse[k]; \
-                to[j] -= z * row[j]; \
-                for (int i = 0; i < j; i++) to[i] -= z * row[i]; \
-                row[j] = z; \
-            } \
-            push[k] = size;                                     /* M_kk for the determinant below */ \
-        } \
-        for (int k = 0; k < n; k++) determinant *= inverse[k] * push[k]; \
-        /* Y and b */ \
-        for (int r = 0; r < m; r++) { \
-            V *row = y + r * n, sum = zero; \
-            for (int k = 0; k < n; k++) { \
-                row[k] = jac[r * n + k]; \
-                sum += row[k] * free[k]; \
-            } \
-            b[r] = target[r] - sum; \
-            largest = larger_##N(abs_##N(b[r]), largest); \
-        } \
-        good &= (I)(largest <= 1e60) & ((I)(largest >= 1e-60) | (I)(largest == 0.0)); \
-        for (int k = n - 1; k >= 0; k--) { \
-            const V *from = l + k * n, scale = root[k]; \
-            for (int r = 0; r < m; r++) { \
-                V* row = y + r * n; \
-                const V z = row[k]; \
-                for (int i = 0; i < k; i++) row[i] -= from[i] * z; \
-                row[k] = z * scale; \
-            } \
-        } \
-        /* d: four running sums over the columns of a panel, and its last columns in the first sum (core/dot.pxd) */ \
-        for (int r = 0; r < m; r++) { \
-            V sum[4] = {zero, zero, zero, zero}; \
-            for (int k = 0; k < n; k++) { \
-                const V square = y[r * n + k] * y[r * n + k]; \
-                const I in = (I)(full[r / 3] > (double)k); \
-                sum[k & 3] += pick_##N(in, square, zero); \
-                sum[0] += pick_##N(in, zero, square); \
-            } \
-            d[r] = ((sum[0] + sum[1]) + (sum[2] + sum[3])) + soft[r]; \
-            good &= (I)(d[r] >= 1e-60) & (I)(d[r] <= 1e60); \
-        } \
-        for (int r = 0; r < m; r += 3) d[r + 1] = d[r + 2] = 0.5 * (d[r + 1] + d[r + 2]); \
-        /* the zero impulse */ \
-        for (int r = 0; r < m; r++) { \
-            lam[r] = zero; \
-            w[r] = -b[r]; \
-            right += (b[r] / d[r]) * b[r]; \
-        } \
-        errors_##N(x, lam, w, e, &energy, &fast, &worst); \
-        for (int r = 0; r < m; r++) moves |= (I)(d[r] * abs_##N(e[r]) > 3.5527136788005009e-15 * abs_##N(b[r])); \
-        good &= moves & (I)(energy > 0.0) & (I)(fast > 0.0) & (I)(energy < 1e300) & (I)(fast < 1e300); \
-        out[LANE_START_ENERGY] = root_##N(energy); \
-        out[LANE_START_SPEED] = root_##N(fast); \
-        out[LANE_RHS] = root_##N(right); \
-        out[LANE_DETERMINANT] = determinant; \
-        out[LANE_IS_PLAIN] = pick_##N(good, one, zero); \
-    } \
-    \
-    /* Judge lam: slack, errors, norms, floors, and the sums of judge/refine.pxd. */ \
-    ISA static void judge_##N(const lavender_lanes_t* x) { \
-        const int m = x->m, n = x->n; \
-        const V *l = (const V*)x->mass, *y = (const V*)x->y, *d = (const V*)x->d, *b = (const V*)x->b, *lam = (const V*)x->lam; \
-        const V *inverse = (const V*)x->inverse, *jac = (const V*)x->jac, *soft = (const V*)x->soft, *mu = (const V*)x->mu; \
-        V *w = (V*)x->w, *e = (V*)x->e, *push = (V*)x->push, *out = (V*)x->out, *size = (V*)x->size; \
-        const V zero = {0.0}, one = zero + 1.0; \
-        V energy, fast, worst, sum[2] = {zero, zero}, heaviest = zero; \
-        const double unit = 1.1102230246251565e-16; \
-        I good = (I)(out[LANE_IS_PLAIN] > 0.0); \
-        /* push = M^-1 J^T lam, w = J push + soft lam - b */ \
-        for (int k = 0; k < n; k++) push[k] = size[k] = zero; \
-        for (int r = 0; r < m; r++) { \
-            const V* row = jac + r * n; \
-            for (int k = 0; k < n; k++) push[k] += row[k] * lam[r]; \
-        } \
-        for (int k = n - 1; k >= 0; k--) { \
-            const V z = push[k]; \
-            for (int i = 0; i < k; i++) push[i] -= l[k * n + i] * z; \
-        } \
-        for (int k = 0; k < n; k++) { \
-            V z = push[k] * inverse[k]; \
-            for (int i = 0; i < k; i++) z -= l[k * n + i] * push[i]; \
-            push[k] = z; \
-        } \
-        for (int r = 0; r < m; r++) { \
-            V s = zero; \
-            for (int k = 0; k < n; k++) s += jac[r * n + k] * push[k]; \
-            w[r] = s + (soft[r] * lam[r] - b[r]); \
-            good &= (I)(abs_##N(w[r]) <= 1.7976931348623157e308) & (I)(abs_##N(lam[r]) <= 1e60); \
-        } \
-        errors_##N(x, lam, w, e, &energy, &fast, &worst); \
-        good &= (I)(energy < 1e300) & (I)(fast < 1e300); \
-        out[LANE_ENERGY] = root_##N(energy); \
-        out[LANE_SPEED] = pick_##N((I)(fast > 0.0), root_##N(larger_##N(fast, zero)), zero); \
-        out[LANE_WORST] = worst; \
-        /* rounding: |Y| |Y|^T |lam| + soft |lam| and |b| (judge/forms.pxd, add_block_floor of judge/tally.pxd) */ \
-        for (int r = 0; r < m; r++) \
-            for (int k = 0; k < n; k++) size[k] += abs_##N(y[r * n + k] * lam[r]); \
-        energy = fast = zero; \
-        for (int r = 0; r < m; r += 3) { \
-            V terms[3], rounding, gap = w[r]; \
-            I none = (I)(lam[r] == 0.0) & (I)(lam[r + 1] == 0.0) & (I)(lam[r + 2] == 0.0); \
-            for (int i = 0; i < 3; i++) { \
-                V s = zero; \
-                for (int k = 0; k < n; k++) s += abs_##N(y[(r + i) * n + k]) * size[k]; \
-                terms[i] = s + soft[r + i] * abs_##N(lam[r + i]); \
-            } \
-            rounding = unit * (terms[0] + abs_##N(b[r])); \
-            if (x->law) { \
-                gap -= mu[r / 3] * root_##N(w[r + 1] * w[r + 1] + w[r + 2] * w[r + 2]); \
-                for (int i = 1; i < 3; i++) rounding += mu[r / 3] * (unit * (terms[i] + abs_##N(b[r + i]))); \
-            } \
-            none &= (I)(gap > rounding); \
-            for (int i = 0; i < 3; i++) { \
-                V s = terms[i], t; \
-                if (i) { \
-                    const V own = d[r + i] * abs_##N(lam[r + i]); \
-                    s = pick_##N((I)(e[r + i] != w[r + i] / d[r + i]) & (I)(own > s), own, s); \
-                } \
-                rounding = unit * (s + abs_##N(b[r + i])); \
-                t = rounding / d[r + i]; \
-                energy += pick_##N(none, zero, t * rounding); \
-                t = d[r + i] * t * rounding; \
-                fast = pick_##N(none, fast, larger_##N(t, fast)); \
-            } \
-        } \
-        out[LANE_FLOOR_ENERGY] = root_##N(energy); \
-        out[LANE_FLOOR_SPEED] = root_##N(fast); \
-        /* `estimate_factor_loss` in two sums, an odd last row in the first */ \
-        for (int r = 0; r < m; r++) { \
-            sum[r & 1] += lam[r] * (w[r] + (b[r] - soft[r] * lam[r])); \
-            heaviest = larger_##N(d[r], heaviest); \
-        } \
-        out[LANE_WORK] = sum[0] + sum[1]; \
-        out[LANE_HEAVIEST] = heaviest; \
-        out[LANE_IS_PLAIN] = pick_##N(good, one, zero); \
     } \
     \
     /* Project y (3) on a contact's bounds in the Euclidean metric: Pi in `to` (3) and P (9) of core/block_projection.pxd. */ \
@@ -313,128 +184,226 @@ cdef extern from *:
         } \
     } \
     \
-    /* `count` block sweeps over A in lanes that are `on`. */ \
+    /* w = A lam - b, four columns of A at a time. */ \
+    ISA static void multiply_##N(const lavender_lanes_t* x) { \
+        const int m = x->m, ld = LAVENDER_PLACES(V, m); \
+        const V *a = (const V*)x->a, *b = (const V*)x->b, *lam = (const V*)x->lam; \
+        V* w = (V*)x->w; \
+        int k = 0; \
+        for (int r = 0; r < m; r++) w[r] = -b[r]; \
+        for (int r = m; r < ld; r++) w[r] = b[0] - b[0]; \
+        for (; k + 4 <= m; k += 4, a += 4 * ld) { \
+            const V l0 = lam[k], l1 = lam[k + 1], l2 = lam[k + 2], l3 = lam[k + 3]; \
+            const V *a1 = a + ld, *a2 = a1 + ld, *a3 = a2 + ld; \
+            LAVENDER_APART \
+            for (int r = 0; r < ld; r++) w[r] = (((w[r] + a[r] * l0) + a1[r] * l1) + a2[r] * l2) + a3[r] * l3; \
+        } \
+        for (; k < m; k++, a += ld) { \
+            const V l0 = lam[k]; \
+            LAVENDER_APART \
+            for (int r = 0; r < ld; r++) w[r] += a[r] * l0; \
+        } \
+    } \
+    \
+    /* `count` sweeps over blocks in lanes that are `on`. Columns of A whose rows do not change in any lane are not read. */ \
     ISA static void sweep_##N(const lavender_lanes_t* x, int count, I on) { \
-        const int m = x->m; \
-        const V *a = (const V*)x->a, *b = (const V*)x->b, *mu = (const V*)x->mu, *step = (const V*)x->step; \
-        V* lam = (V*)x->lam; \
+        const int m = x->m, ld = LAVENDER_PLACES(V, m); \
+        const V *a = (const V*)x->a, *mu = (const V*)x->mu, *step = (const V*)x->step, zero = {0.0}; \
+        const V *lower = (const V*)x->lower, *upper = (const V*)x->upper; \
+        V *lam = (V*)x->lam, *w = (V*)x->w; \
+        multiply_##N(x); \
         while (count--) \
-            for (int r = 0; r < m; r += 3) { \
-                const V *row = a + r * m, before = lam[r]; \
-                V y[3], to[3], w0 = b[r], w1 = b[r + 1], w2 = b[r + 2]; \
-                for (int k = 0; k < m; k++) { \
-                    w0 -= row[k] * lam[k]; \
-                    w1 -= row[m + k] * lam[k]; \
-                    w2 -= row[2 * m + k] * lam[k]; \
+            for (int i = 0; i < x->k; i++) { \
+                int r = x->ptr[i]; \
+                for (; !x->kind[i] && r < x->ptr[i + 1]; r++) { \
+                    const V *row = a + r * ld, to = clip_##N(lam[r] - step[r] * w[r], lower[r], upper[r]); \
+                    const V change = pick_##N(on, to - lam[r], zero); \
+                    lam[r] = pick_##N(on, to, lam[r]); \
+                    if (any_##N((I)(change != 0.0))) { \
+                        LAVENDER_APART \
+                        for (int k = 0; k < ld; k++) w[k] += row[k] * change; \
+                    } \
                 } \
-                y[0] = before + step[r] * w0; \
+                if (!x->kind[i]) continue; \
+                const V* row = a + r * ld; \
+                V y[3], to[3], w1 = w[r + 1], w2 = w[r + 2]; \
+                y[0] = lam[r] - step[r] * w[r]; \
                 if (!x->law) { \
-                    const V zero = {0.0}; \
                     y[0] = larger_##N(y[0], zero); \
-                    w1 -= row[m + r] * (y[0] - before); \
-                    w2 -= row[2 * m + r] * (y[0] - before); \
+                    w1 += row[ld + r] * (y[0] - lam[r]); \
+                    w2 += row[2 * ld + r] * (y[0] - lam[r]); \
                 } \
-                y[1] = lam[r + 1] + step[r + 1] * w1; \
-                y[2] = lam[r + 2] + step[r + 2] * w2; \
-                project_##N(x->law, mu[r / 3], y, to, (V*)0); \
-                for (int i = 0; i < 3; i++) lam[r + i] = pick_##N(on, to[i], lam[r + i]); \
+                y[1] = lam[r + 1] - step[r + 1] * w1; \
+                y[2] = lam[r + 2] - step[r + 2] * w2; \
+                project_##N(x->law, mu[i], y, to, (V*)0); \
+                for (int j = 0; j < 3; j++) { \
+                    y[j] = pick_##N(on, to[j] - lam[r + j], zero); \
+                    lam[r + j] = pick_##N(on, to[j], lam[r + j]); \
+                } \
+                if (any_##N((I)(y[0] != 0.0) | (I)(y[1] != 0.0) | (I)(y[2] != 0.0))) { \
+                    const V c0 = y[0], c1 = y[1], c2 = y[2], *row1 = row + ld, *row2 = row1 + ld; \
+                    LAVENDER_APART \
+                    for (int k = 0; k < ld; k++) w[k] = ((w[k] + row[k] * c0) + row1[k] * c1) + row2[k] * c2; \
+                } \
             } \
     } \
     \
     /* w = A lam - b, and the square of the relative residual (judge/score.pxd). */ \
     ISA static V measure_##N(const lavender_lanes_t* x) { \
-        const int m = x->m; \
-        const V *a = (const V*)x->a, *b = (const V*)x->b, *lam = (const V*)x->lam, *out = (const V*)x->out; \
-        V *w = (V*)x->w, energy, fast, worst; \
-        for (int r = 0; r < m; r++) { \
-            V s = -b[r]; \
-            for (int k = 0; k < m; k++) s += a[r * m + k] * lam[k]; \
-            w[r] = s; \
-        } \
-        errors_##N(x, lam, w, (V*)x->e, &energy, &fast, &worst); \
+        const V *lam = (const V*)x->lam, *out = (const V*)x->out; \
+        V energy, fast, worst; \
+        multiply_##N(x); \
+        errors_##N(x, lam, (const V*)x->w, (V*)x->e, &energy, &fast, &worst); \
         energy /= out[LANE_START_ENERGY] * out[LANE_START_ENERGY]; \
         fast /= out[LANE_START_SPEED] * out[LANE_START_SPEED]; \
         return larger_##N(energy, fast); \
     } \
     \
-    /* The Newton step of  lam = Pi(lam - step w)  at lam with slack w, written to `change`. */ \
-    ISA static void newton_##N(const lavender_lanes_t* x) { \
-        const int m = x->m; \
+    /* The Newton step of  lam = Pi(lam - step w)  at lam with slack w, written to `change`. Return the lanes that lose a pivot. \
+     * Rows that no bound leaves free in any lane are rows of the unit matrix, and are not eliminated. */ \
+    ISA static I newton_##N(const lavender_lanes_t* x) { \
+        const int m = x->m, ld = LAVENDER_PLACES(V, m); \
         const V *a = (const V*)x->a, *mu = (const V*)x->mu, *step = (const V*)x->step, *lam = (const V*)x->lam; \
-        const V* w = (const V*)x->w; \
+        const V *w = (const V*)x->w, *lower = (const V*)x->lower, *upper = (const V*)x->upper, zero = {0.0}, one = zero + 1.0; \
         V *g = (V*)x->g, *f = (V*)x->change; \
-        for (int r = 0; r < m; r += 3) { \
-            const V *row = a + r * m; \
-            V y[3], to[3], p[9]; \
-            for (int i = 0; i < 3; i++) y[i] = lam[r + i] - step[r + i] * w[r + i]; \
-            project_##N(x->law, mu[r / 3], y, to, p); \
-            for (int i = 0; i < 3; i++) { \
-                const V p0 = p[3 * i] * step[r], p1 = p[3 * i + 1] * step[r + 1], p2 = p[3 * i + 2] * step[r + 2]; \
-                V* to_row = g + (r + i) * m; \
-                for (int k = 0; k < m; k++) to_row[k] = p0 * row[k] + p1 * row[m + k] + p2 * row[2 * m + k]; \
-                for (int k = 0; k < 3; k++) to_row[r + k] -= p[3 * i + k]; \
-                to_row[r + i] += 1.0; \
-                f[r + i] = to[i] - lam[r + i]; \
+        int free[LANE_ROWS], count = 0, first = 0; \
+        I lost = (I)(zero != zero); \
+        for (int i = 0; i < x->k; i++) { \
+            const int rows = x->kind[i] ? 3 : 1; \
+            for (int r = x->ptr[i]; r < x->ptr[i + 1]; r += rows) { \
+                const V* row = a + r * ld; \
+                V y[3], to[3], p[9]; \
+                for (int j = 0; j < rows; j++) y[j] = lam[r + j] - step[r + j] * w[r + j]; \
+                if (x->kind[i]) project_##N(x->law, mu[i], y, to, p); \
+                else { \
+                    to[0] = clip_##N(y[0], lower[r], upper[r]); \
+                    p[0] = pick_##N((I)(y[0] > lower[r]) & (I)(y[0] < upper[r]), one, zero); \
+                } \
+                for (int j = 0; j < rows; j++) { \
+                    V* to_row = g + (r + j) * ld; \
+                    const V* q = p + 3 * j; \
+                    f[r + j] = to[j] - lam[r + j]; \
+                    if (rows == 1 && any_##N((I)(p[0] != 0.0))) { \
+                        const V q0 = p[0] * step[r]; \
+                        free[count++] = r; \
+                        LAVENDER_APART \
+                        for (int k = 0; k < ld; k++) to_row[k] = q0 * row[k]; \
+                    } else if (rows == 3 && any_##N((I)(q[0] != 0.0) | (I)(q[1] != 0.0) | (I)(q[2] != 0.0))) { \
+                        const V q0 = q[0] * step[r], q1 = q[1] * step[r + 1], q2 = q[2] * step[r + 2]; \
+                    const V *row1 = row + ld, *row2 = row1 + ld; \
+                        free[count++] = r + j; \
+                        LAVENDER_APART \
+                        for (int k = 0; k < ld; k++) to_row[k] = q0 * row[k] + q1 * row1[k] + q2 * row2[k]; \
+                    } else \
+                        for (int k = 0; k < ld; k++) to_row[k] = zero; \
+                    for (int k = 0; k < rows; k++) to_row[r + k] -= p[3 * j + k]; \
+                    to_row[r + j] += 1.0; \
+                } \
             } \
         } \
-        /* LU without exchanges: a lost pivot makes the step worse, which `solve` notices */ \
+        /* LU without exchanges */ \
         for (int j = 0; j < m; j++) { \
-            const V *from = g + j * m, inverse = 1.0 / from[j]; \
-            int i = j + 1; \
-            for (; i + 1 < m; i += 2) { \
-                V *first = g + i * m, *second = first + m; \
-                const V z = first[j] * inverse, t = second[j] * inverse; \
-                for (int k = j + 1; k < m; k++) { \
-                    first[k] -= z * from[k]; \
-                    second[k] -= t * from[k]; \
+            const V* from = g + j * ld; \
+            if (first == count || free[first] != j) { \
+                for (int t = first; t < count; t++) f[free[t]] -= g[free[t] * ld + j] * f[j]; \
+                continue; \
+            } \
+            const V inverse = 1.0 / from[j]; \
+            int t = ++first; \
+            lost |= (I)(abs_##N(inverse) > 1e300) | (I)(inverse != inverse); \
+            for (; t + 1 < count; t += 2) { \
+                V *up = g + free[t] * ld, *low = g + free[t + 1] * ld; \
+                const V z = up[j] * inverse, s = low[j] * inverse; \
+                LAVENDER_APART \
+                for (int k = LAVENDER_FROM(V, j); k < ld; k++) { \
+                    up[k] -= z * from[k]; \
+                    low[k] -= s * from[k]; \
                 } \
-                f[i] -= z * f[j]; \
-                f[i + 1] -= t * f[j]; \
+                f[free[t]] -= z * f[j]; \
+                f[free[t + 1]] -= s * f[j]; \
             } \
-            for (; i < m; i++) { \
-                V* first = g + i * m; \
-                const V z = first[j] * inverse; \
-                for (int k = j + 1; k < m; k++) first[k] -= z * from[k]; \
-                f[i] -= z * f[j]; \
+            if (t < count) { \
+                V* up = g + free[t] * ld; \
+                const V z = up[j] * inverse; \
+                LAVENDER_APART \
+                for (int k = LAVENDER_FROM(V, j); k < ld; k++) up[k] -= z * from[k]; \
+                f[free[t]] -= z * f[j]; \
             } \
-            g[j * m + j] = inverse; \
+            g[j * ld + j] = inverse; \
         } \
         for (int j = m - 1; j >= 0; j--) { \
-            V s = f[j]; \
-            for (int k = j + 1; k < m; k++) s -= g[j * m + k] * f[k]; \
-            f[j] = s * g[j * m + j]; \
+            if (first > 0 && free[first - 1] == j) { \
+                first--; \
+                f[j] *= g[j * ld + j]; \
+            } \
+            lost |= (I)(abs_##N(f[j]) > 1e300) | (I)(f[j] != f[j]); \
+            for (int t = 0; t < first; t++) f[free[t]] -= g[free[t] * ld + j] * f[j]; \
+        } \
+        return lost; \
+    } \
+    \
+    /* Project lam on its bounds: normals and bounded rows if `to_cones` is 0. */ \
+    ISA static void bound_##N(const lavender_lanes_t* x, V* lam, int to_cones) { \
+        const V *mu = (const V*)x->mu, *lower = (const V*)x->lower, *upper = (const V*)x->upper, zero = {0.0}; \
+        for (int i = 0; i < x->k; i++) { \
+            int r = x->ptr[i]; \
+            for (; !x->kind[i] && r < x->ptr[i + 1]; r++) lam[r] = clip_##N(lam[r], lower[r], upper[r]); \
+            if (!x->kind[i]) continue; \
+            lam[r] = larger_##N(lam[r], zero); \
+            if (to_cones) { \
+                const V bound = mu[i] * lam[r], size = root_##N(lam[r + 1] * lam[r + 1] + lam[r + 2] * lam[r + 2]); \
+                const I beyond = (I)(size > (1.0 + 8.0 * 1.1102230246251565e-16) * bound); \
+                const V scale = pick_##N(beyond, bound / larger_##N(size, zero + 1e-300), zero + 1.0); \
+                lam[r + 1] *= scale; \
+                lam[r + 2] *= scale; \
+            } \
         } \
     } \
     \
     /* Solve from the zero impulse to `tol`: block sweeps, then Newton steps. Sweeps replace a step that gains nothing; a lane \
-     * with MISSES such steps ends. */ \
+     * with MISSES such steps ends. A singular A is not solved: more rows than velocities need compliance. */ \
     ISA static void solve_##N(const lavender_lanes_t* x) { \
-        enum { FIRST_SWEEPS = 6, MORE_SWEEPS = 12, ROUNDS = 10, MISSES = 2 }; \
-        const int m = x->m, n = x->n; \
-        const V *y = (const V*)x->y, *soft = (const V*)x->soft, *mu = (const V*)x->mu, zero = {0.0}, one = zero + 1.0; \
+        enum { FIRST_SWEEPS = 6, MORE_SWEEPS = 12, ROUNDS = 10, MISSES = 3 }; \
+        const int m = x->m, n = x->n, ld = LAVENDER_PLACES(V, m); \
+        const V *y = (const V*)x->y, *soft = (const V*)x->soft, *d = (const V*)x->d, zero = {0.0}, one = zero + 1.0; \
         V *a = (V*)x->a, *lam = (V*)x->lam, *step = (V*)x->step, *change = (V*)x->change, *kept = (V*)x->kept; \
-        V* out = (V*)x->out; \
+        V *out = (V*)x->out, *across = (V*)x->g; \
         V now, steps = zero, misses = zero; \
         I on = (I)(out[LANE_IS_PLAIN] > 0.0); \
         for (int r = 0; r < m; r++) { \
-            for (int j = 0; j <= r - r % 3; j += 3) { \
-                const V *first = y + r * n, *second = y + j * n; \
-                V s0 = zero, s1 = zero, s2 = zero; \
-                for (int k = 0; k < n; k++) { \
-                    s0 += first[k] * second[k]; \
-                    s1 += first[k] * second[n + k]; \
-                    s2 += first[k] * second[2 * n + k]; \
-                } \
-                a[r * m + j] = a[j * m + r] = s0; \
-                a[r * m + j + 1] = a[(j + 1) * m + r] = s1; \
-                a[r * m + j + 2] = a[(j + 2) * m + r] = s2; \
-            } \
             lam[r] = zero; \
+            if (m > n) on &= (I)(soft[r] >= 1e-5 * d[r]); \
+            for (int k = 0; k < n; k++) across[k * ld + r] = y[r * n + k]; \
         } \
-        for (int r = 0; r < m; r++) a[r * m + r] += soft[r]; \
-        for (int r = 0; r < m; r += 3) { \
-            const V n1 = abs_##N(a[r * m + r + 1]), n2 = abs_##N(a[r * m + r + 2]), pair = abs_##N(a[(r + 1) * m + r + 2]); \
-            V top = a[r * m + r], low = larger_##N(a[(r + 1) * m + r + 1], a[(r + 2) * m + r + 2]) + pair; \
+        for (int k = 0; k < n; k++) \
+            for (int r = m; r < ld; r++) across[k * ld + r] = zero; \
+        if (!any_##N(on)) return; \
+        for (int r = 0; r < m; r++) { \
+            const V* row = y + r * n; \
+            V* to_row = a + r * ld; \
+            const int end = LAVENDER_PLACES(V, r + 1); \
+            int k = 0; \
+            for (int j = 0; j < ld; j++) to_row[j] = zero; \
+            for (; k + 4 <= n; k += 4) { \
+                const V *c = across + k * ld, *c1 = c + ld, *c2 = c1 + ld, *c3 = c2 + ld; \
+                const V y0 = row[k], y1 = row[k + 1], y2 = row[k + 2], y3 = row[k + 3]; \
+                LAVENDER_APART \
+                for (int j = 0; j < end; j++) to_row[j] = (((to_row[j] + c[j] * y0) + c1[j] * y1) + c2[j] * y2) + c3[j] * y3; \
+            } \
+            for (; k < n; k++) { \
+                const V *c = across + k * ld, y0 = row[k]; \
+                LAVENDER_APART \
+                for (int j = 0; j < end; j++) to_row[j] += c[j] * y0; \
+            } \
+            for (int j = 0; j < r; j++) a[j * ld + r] = to_row[j]; \
+            to_row[r] += soft[r]; \
+        } \
+        for (int i = 0; i < x->k; i++) { \
+            int r = x->ptr[i]; \
+            for (; !x->kind[i] && r < x->ptr[i + 1]; r++) step[r] = 1.0 / a[r * ld + r]; \
+            if (!x->kind[i]) continue; \
+            const V n1 = abs_##N(a[r * ld + r + 1]), n2 = abs_##N(a[r * ld + r + 2]), pair = abs_##N(a[(r + 1) * ld + r + 2]); \
+            V top = a[r * ld + r], low = larger_##N(a[(r + 1) * ld + r + 1], a[(r + 2) * ld + r + 2]) + pair; \
             if (x->law) { \
                 top += n1 + n2; \
                 low += larger_##N(n1, n2); \
@@ -447,18 +416,17 @@ cdef extern from *:
         now = measure_##N(x); \
         on &= (I)(now > 0.25 * x->tol * x->tol); \
         for (int round = 0; round < ROUNDS && any_##N(on); round++) { \
+            I worse = newton_##N(x); \
             V next; \
-            I worse; \
-            newton_##N(x); \
             for (int r = 0; r < m; r++) { \
-                V to = lam[r] + change[r]; \
-                if (r % 3 == 0) to = larger_##N(to, zero); \
                 kept[r] = lam[r]; \
-                lam[r] = pick_##N(on, to, lam[r]); \
+                change[r] += lam[r]; \
             } \
+            bound_##N(x, change, 0); \
+            for (int r = 0; r < m; r++) lam[r] = pick_##N(on, change[r], lam[r]); \
             next = measure_##N(x); \
             steps += pick_##N(on, one, zero); \
-            worse = on & ((I)(next >= 0.81 * now) | (I)(next != next)); \
+            worse = on & (worse | (I)(next >= 0.81 * now) | (I)(next != next)); \
             misses += pick_##N(worse, one, zero); \
             on &= (I)(misses < (double)MISSES); \
             worse = worse & on; \
@@ -470,17 +438,279 @@ cdef extern from *:
             now = next; \
             on &= (I)(now > 0.25 * x->tol * x->tol); \
         } \
-        for (int r = 0; r < m; r += 3) { \
-            const V s = larger_##N(lam[r], zero), bound = mu[r / 3] * s; \
-            const V size = root_##N(lam[r + 1] * lam[r + 1] + lam[r + 2] * lam[r + 2]); \
-            const I beyond = (I)(size > (1.0 + 8.0 * 1.1102230246251565e-16) * bound); \
-            const V scale = pick_##N(beyond, bound / larger_##N(size, zero + 1e-300), one); \
-            lam[r] = s; \
-            lam[r + 1] *= scale; \
-            lam[r + 2] *= scale; \
-        } \
+        bound_##N(x, lam, 1); \
+        for (int r = 0; r < m; r++) lam[r] += 0.0; \
         out[LANE_STEPS] = steps; \
     }
+    #define LAVENDER_LANES(N, V, I, ISA) \
+    /* Interleave n numbers from each of N arrays, of float if `narrow`. */ \
+    ISA static void interleave_##N(const void* const* from, int narrow, long long n, double* to) { \
+        const float* single[N]; \
+        const double* wide[N]; \
+        for (int l = 0; l < N; l++) { \
+            single[l] = from[l]; \
+            wide[l] = from[l]; \
+        } \
+        for (long long i = 0; narrow && i < n; i++) \
+            for (int l = 0; l < N; l++) to[N * i + l] = single[l][i]; \
+        for (long long i = 0; !narrow && i < n; i++) \
+            for (int l = 0; l < N; l++) to[N * i + l] = wide[l][i]; \
+    } \
+    \
+    /* Overwrite v (n) with M^-1 v. */ \
+    ISA static void solve_mass_##N(const lavender_lanes_t* x, V* v) { \
+        const int n = x->n; \
+        const V *l = (const V*)x->mass, *inverse = (const V*)x->inverse; \
+        for (int k = n - 1; k >= 0; k--) \
+            for (int i = 0; i < k; i++) v[i] -= l[k * n + i] * v[k]; \
+        for (int k = 0; k < n; k++) { \
+            V z = v[k] * inverse[k]; \
+            for (int i = 0; i < k; i++) z -= l[k * n + i] * v[i]; \
+            v[k] = z; \
+        } \
+    } \
+    \
+    /* The norm of v (n), with the sums of core/dot.pxd. */ \
+    ISA static V norm_##N(const V* v, int n) { \
+        const V zero = {0.0}; \
+        V sum[4] = {zero, zero, zero, zero}; \
+        for (int i = 0; i < n; i++) sum[i < (n & ~3) ? i & 3 : 0] += v[i] * v[i]; \
+        return root_##N((sum[0] + sum[1]) + (sum[2] + sum[3])); \
+    } \
+    \
+    /* `estimate_condition` of core/condition.pxd, from the factor of M and its diagonal. */ \
+    ISA static V condition_##N(const lavender_lanes_t* x, const V* diagonal) { \
+        const int n = x->n; \
+        const V *l = (const V*)x->mass, zero = {0.0}; \
+        V *s = (V*)x->size, v[LANE_VELOCITIES], first, second; \
+        for (int i = 0; i < n; i++) { \
+            s[i] = root_##N(diagonal[i]); \
+            v[i] = zero; \
+        } \
+        for (int i = n - 1; i >= 0; i--) { \
+            v[i] += pick_##N((I)(v[i] >= 0.0), s[i], -s[i]); \
+            for (int j = 0; j < i; j++) v[j] -= l[i * n + j] * v[i]; \
+        } \
+        for (int i = 0; i < n; i++) { \
+            V z = v[i] * ((const V*)x->inverse)[i]; \
+            for (int j = 0; j < i; j++) z -= v[j] * l[i * n + j]; \
+            v[i] = z; \
+        } \
+        for (int i = 0; i < n; i++) v[i] *= s[i]; \
+        first = norm_##N(v, n); \
+        for (int i = 0; i < n; i++) v[i] = s[i] * (v[i] / first); \
+        solve_mass_##N(x, v); \
+        for (int i = 0; i < n; i++) v[i] *= s[i]; \
+        second = norm_##N(v, n); \
+        second = larger_##N(larger_##N(second, first / sqrt((double)n)), zero + 1.0); \
+        return pick_##N((I)(first > 0.0) & (I)(first < 1e300), second, zero + 1e300); \
+    } \
+    /* Check the data; M = L^T D L, Y = J L^-1 D^-1/2, d, b, and the errors of the zero impulse. LANE_IS_PLAIN receives 1 if \
+     * no number is out of range, the rows form one island, and the zero impulse is within its bounds and not a solution. */ \
+    ISA static void prepare_##N(const lavender_lanes_t* x) { \
+        const int m = x->m, n = x->n; \
+        V *l = (V*)x->mass, *y = (V*)x->y, *d = (V*)x->d, *b = (V*)x->b, *inverse = (V*)x->inverse, *root = (V*)x->root; \
+        V *w = (V*)x->w, *e = (V*)x->e, *lam = (V*)x->zero, *push = (V*)x->push, *out = (V*)x->out; \
+        const V *jac = (const V*)x->jac, *free = (const V*)x->free, *target = (const V*)x->target, *soft = (const V*)x->soft; \
+        const V *mu = (const V*)x->mu, *lower = (const V*)x->lower, *upper = (const V*)x->upper; \
+        const V zero = {0.0}, one = zero + 1.0; \
+        V largest = zero, determinant = one, right = zero, energy, fast, worst; \
+        I good = (I)(zero == zero), moves = (I)(zero != zero); \
+        int is_sparse = 0; \
+        for (int i = 0; i < m * n; i++) good &= (I)(abs_##N(jac[i]) <= 1e60); \
+        for (int i = 0; i < n; i++) good &= (I)(abs_##N(free[i]) <= 1e60); \
+        for (int i = 0; i < m; i++) \
+            good &= (I)(abs_##N(target[i]) <= 1e60) & (I)(soft[i] <= 1e60) & ((I)(soft[i] >= 1e-60) | (I)(soft[i] == 0.0)); \
+        for (int i = 0; i < x->k; i++) good &= (I)(mu[i] <= 1e60) & ((I)(mu[i] >= 1e-60) | (I)(mu[i] == 0.0)); \
+        for (int i = 0; i < x->k; i++) \
+            for (int r = x->ptr[i]; !x->kind[i] && r < x->ptr[i + 1]; r++) \
+                good &= (I)(lower[r] <= 0.0) & (I)(upper[r] >= 0.0); \
+        for (int i = 0; i < n; i++) \
+            for (int j = 0; j <= i; j++) good &= (I)(abs_##N(l[i * n + j]) <= 1e60); \
+        for (int i = 0; x->asymmetry >= 0.0 && i < n; i++)      /* just within `asymmetry`, so that squares may round */ \
+            for (int j = 0; j < i; j++) { \
+                const V gap = l[i * n + j] - l[j * n + i], size = l[i * n + i] * l[j * n + j]; \
+                good &= (I)(gap == 0.0) | (I)(gap * gap <= 0.99 * x->asymmetry * x->asymmetry * size); \
+            } \
+        for (int i = 0; i < (int)(sizeof(V) / sizeof(double)); i++) { \
+            const int found = lavender_list_columns(x, sizeof(V) / sizeof(double), i); \
+            ((double*)(out + LANE_IS_PLAIN))[i] = found > 0; \
+            is_sparse |= found < 2; \
+        } \
+        good &= (I)(out[LANE_IS_PLAIN] > 0.0); \
+        /* factor of M; the diagonal of l keeps D */ \
+        for (int i = 0; i < n; i++) inverse[i] = l[i * n + i]; \
+        for (int k = n - 1; k >= 0; k--) { \
+            V* row = l + k * n; \
+            const V size = inverse[k]; \
+            good &= (I)(row[k] > 8.8817841970012523e-16 * size) & (I)(row[k] >= 1e-60); \
+            inverse[k] = 1.0 / row[k]; \
+            root[k] = root_##N(inverse[k]); \
+            for (int j = k - 1; j >= 0; j--) { \
+                V *to = l + j * n; \
+                if (is_sparse && !any_##N((I)(row[j] != 0.0))) continue; \
+                const V z = row[j] * inverse[k]; \
+                to[j] -= z * row[j]; \
+                for (int i = 0; i < j; i++) to[i] -= z * row[i]; \
+                row[j] = z; \
+            } \
+            push[k] = size;                                     /* M_kk for the determinant below */ \
+        } \
+        for (int k = 0; k < n; k++) determinant *= inverse[k] * push[k]; \
+        out[LANE_CONDITION] = 2.72 * determinant; \
+        if (any_##N((I)(determinant > 1e3))) out[LANE_CONDITION] = condition_##N(x, push); \
+        /* Y and b */ \
+        for (int r = 0; r < m; r++) { \
+            V *row = y + r * n, sum = zero; \
+            for (int k = 0; k < n; k++) { \
+                row[k] = jac[r * n + k]; \
+                sum += row[k] * free[k]; \
+            } \
+            b[r] = target[r] - sum; \
+            largest = larger_##N(abs_##N(b[r]), largest); \
+        } \
+        good &= (I)(largest <= 1e60) & ((I)(largest >= 1e-60) | (I)(largest == 0.0)); \
+        for (int k = n - 1; k >= 0; k--) { \
+            const V *from = l + k * n, scale = root[k]; \
+            for (int r = 0; r < m; r++) { \
+                V* row = y + r * n; \
+                const V z = row[k]; \
+                if (is_sparse && !any_##N((I)(z != 0.0))) continue; \
+                for (int i = 0; i < k; i++) row[i] -= from[i] * z; \
+                row[k] = z * scale; \
+            } \
+        } \
+        /* d: four running sums over the columns of a block, and its last columns in the first sum (core/dot.pxd); the sums \
+         * change places after each column */ \
+        for (int i = 0; i < x->k; i++) { \
+            const I fours = ((const I*)x->fours)[i], last = ((const I*)x->last)[i]; \
+            for (int r = x->ptr[i]; r < x->ptr[i + 1]; r++) { \
+                V s0 = zero, s1 = zero, s2 = zero, s3 = zero; \
+                for (int k = 0; k < n; k++) { \
+                    const I own = 0 - (fours >> k & 1), end = 0 - (last >> k & 1); \
+                    const V square = y[r * n + k] * y[r * n + k], sum = s0 + square; \
+                    s0 = pick_##N(own, s1, s0); \
+                    s1 = pick_##N(own, s2, s1); \
+                    s2 = pick_##N(own, s3, s2); \
+                    s3 = pick_##N(own, sum, s3); \
+                    s0 += pick_##N(end, square, zero); \
+                } \
+                d[r] = ((s0 + s1) + (s2 + s3)) + soft[r]; \
+                good &= (I)(d[r] >= 1e-60) & (I)(d[r] <= 1e60); \
+            } \
+            if (x->kind[i]) d[x->ptr[i] + 1] = d[x->ptr[i] + 2] = 0.5 * (d[x->ptr[i] + 1] + d[x->ptr[i] + 2]); \
+        } \
+        /* the zero impulse */ \
+        for (int r = 0; r < m; r++) { \
+            lam[r] = zero; \
+            w[r] = -b[r]; \
+            right += (b[r] / d[r]) * b[r]; \
+        } \
+        errors_##N(x, lam, w, e, &energy, &fast, &worst); \
+        for (int r = 0; r < m; r++) moves |= (I)(d[r] * abs_##N(e[r]) > 3.5527136788005009e-15 * abs_##N(b[r])); \
+        good &= moves & (I)(energy > 0.0) & (I)(fast > 0.0) & (I)(energy < 1e300) & (I)(fast < 1e300); \
+        out[LANE_START_ENERGY] = root_##N(energy); \
+        out[LANE_START_SPEED] = root_##N(fast); \
+        out[LANE_RHS] = root_##N(right); \
+        out[LANE_IS_PLAIN] = pick_##N(good, one, zero); \
+    } \
+    \
+    /* Judge lam: slack, errors, norms, floors, and the sums of judge/refine.pxd. */ \
+    ISA static void judge_##N(const lavender_lanes_t* x) { \
+        const int m = x->m, n = x->n; \
+        const V *y = (const V*)x->y, *d = (const V*)x->d, *b = (const V*)x->b, *lam = (const V*)x->lam; \
+        const V *jac = (const V*)x->jac, *soft = (const V*)x->soft, *mu = (const V*)x->mu; \
+        const V *lower = (const V*)x->lower, *upper = (const V*)x->upper; \
+        V *w = (V*)x->w, *e = (V*)x->e, *push = (V*)x->push, *out = (V*)x->out, *size = (V*)x->size; \
+        const V zero = {0.0}, one = zero + 1.0; \
+        V energy, fast, worst, sum[2] = {zero, zero}, heaviest = zero; \
+        const double unit = 1.1102230246251565e-16; \
+        I good = (I)(out[LANE_IS_PLAIN] > 0.0); \
+        /* push = M^-1 J^T lam, w = J push + soft lam - b */ \
+        for (int k = 0; k < n; k++) push[k] = size[k] = zero; \
+        for (int r = 0; r < m; r++) { \
+            const V* row = jac + r * n; \
+            for (int k = 0; k < n; k++) push[k] += row[k] * lam[r]; \
+        } \
+        solve_mass_##N(x, push); \
+        for (int r = 0; r < m; r++) { \
+            V s = zero; \
+            for (int k = 0; k < n; k++) s += jac[r * n + k] * push[k]; \
+            w[r] = s + (soft[r] * lam[r] - b[r]); \
+            good &= (I)(abs_##N(w[r]) <= 1.7976931348623157e308) & (I)(abs_##N(lam[r]) <= 1e60); \
+        } \
+        errors_##N(x, lam, w, e, &energy, &fast, &worst); \
+        good &= (I)(energy < 1e300) & (I)(fast < 1e300); \
+        out[LANE_ENERGY] = root_##N(energy); \
+        out[LANE_SPEED] = pick_##N((I)(fast > 0.0), root_##N(larger_##N(fast, zero)), zero); \
+        out[LANE_WORST] = worst; \
+        /* rounding: |Y| |Y|^T |lam| + soft |lam| and |b| (judge/forms.pxd, add_block_floor of judge/tally.pxd) */ \
+        for (int r = 0; r < m; r++) \
+            for (int k = 0; k < n; k++) size[k] += abs_##N(y[r * n + k] * lam[r]); \
+        energy = fast = zero; \
+        for (int i = 0; i < x->k; i++) { \
+            const int end = x->ptr[i + 1]; \
+            V terms[LANE_ROWS], rounding, t; \
+            int r = x->ptr[i]; \
+            for (int j = r; j < end; j++) { \
+                V s = zero; \
+                for (int k = 0; k < n; k++) s += abs_##N(y[j * n + k]) * size[k]; \
+                terms[j - r] = s + soft[j] * abs_##N(lam[j]); \
+            } \
+            for (int j = r; !x->kind[i] && j < end; j++) { \
+                rounding = unit * (terms[j - r] + abs_##N(b[j])); \
+                const I none = ((I)(lam[j] == lower[j]) & (I)(w[j] > rounding)) \
+                    | ((I)(lam[j] == upper[j]) & (I)(-w[j] > rounding)); \
+                rounding = pick_##N(none, zero, rounding); \
+                t = rounding / d[j]; \
+                energy += t * rounding; \
+                t = d[j] * t * rounding; \
+                fast = larger_##N(t, fast); \
+            } \
+            if (!x->kind[i]) continue; \
+            V gap = w[r]; \
+            I none = (I)(lam[r] == 0.0) & (I)(lam[r + 1] == 0.0) & (I)(lam[r + 2] == 0.0); \
+            rounding = unit * (terms[0] + abs_##N(b[r])); \
+            if (x->law) { \
+                gap -= mu[i] * root_##N(w[r + 1] * w[r + 1] + w[r + 2] * w[r + 2]); \
+                for (int j = 1; j < 3; j++) rounding += mu[i] * (unit * (terms[j] + abs_##N(b[r + j]))); \
+            } \
+            none &= (I)(gap > rounding); \
+            for (int j = 0; j < 3; j++) { \
+                V s = terms[j]; \
+                if (j) { \
+                    const V own = d[r + j] * abs_##N(lam[r + j]); \
+                    s = pick_##N((I)(e[r + j] != w[r + j] / d[r + j]) & (I)(own > s), own, s); \
+                } \
+                rounding = unit * (s + abs_##N(b[r + j])); \
+                t = rounding / d[r + j]; \
+                energy += pick_##N(none, zero, t * rounding); \
+                t = d[r + j] * t * rounding; \
+                fast = pick_##N(none, fast, larger_##N(t, fast)); \
+            } \
+        } \
+        out[LANE_FLOOR_ENERGY] = root_##N(energy); \
+        out[LANE_FLOOR_SPEED] = root_##N(fast); \
+        /* `estimate_factor_loss` in two sums, an odd last row in the first */ \
+        for (int r = 0; r < m; r++) { \
+            sum[r & 1] += lam[r] * (w[r] + (b[r] - soft[r] * lam[r])); \
+            heaviest = larger_##N(d[r], heaviest); \
+        } \
+        out[LANE_WORK] = sum[0] + sum[1]; \
+        out[LANE_HEAVIEST] = heaviest; \
+        out[LANE_IS_PLAIN] = pick_##N(good, one, zero); \
+    }
+    #if defined(__clang__)
+    #define LAVENDER_APART _Pragma("clang loop vectorize(assume_safety)")
+    #elif defined(__GNUC__)
+    #define LAVENDER_APART _Pragma("GCC ivdep")
+    #else
+    #define LAVENDER_APART
+    #endif
+    #define LAVENDER_CHOOSE(V, I, mask, a, b) ((mask) ? (a) : (b))
+    #define LAVENDER_FABS(V, I, a) fabs(a)
+    #define LAVENDER_ONE(N, ISA) LAVENDER_SOLVER(N, double, long long, ISA, sqrt(a), LAVENDER_CHOOSE, LAVENDER_FABS, mask != 0)
+    LAVENDER_ONE(1, )
     #if defined(__GNUC__) && !defined(LAVENDER_ONE_LANE)
     #define LAVENDER_PICK(V, I, mask, a, b) (V)(((mask) & (I)(a)) | (~(mask) & (I)(b)))
     #define LAVENDER_ABS(V, I, a) (V)((I)(a) & 0x7FFFFFFFFFFFFFFFLL)
@@ -490,24 +720,34 @@ cdef extern from *:
     LAVENDER_VECTOR(2, lanes_2, mask_2)
     #ifdef __x86_64__
     #include <immintrin.h>
+    #define LAVENDER_AVX2 __attribute__((target("avx2")))
+    #define LAVENDER_AVX512 __attribute__((target("avx512f,avx512dq,avx512vl,prefer-vector-width=512")))
     LAVENDER_VECTOR(4, lanes_4, mask_4)
     LAVENDER_VECTOR(8, lanes_8, mask_8)
-    LAVENDER_LANES(2, lanes_2, mask_2, , (lanes_2)_mm_sqrt_pd((__m128d)a), LAVENDER_PICK, LAVENDER_ABS)
-    LAVENDER_LANES(4, lanes_4, mask_4, __attribute__((target("avx2"))), (lanes_4)_mm256_sqrt_pd((__m256d)a), LAVENDER_PICK,
-                   LAVENDER_ABS)
-    LAVENDER_LANES(8, lanes_8, mask_8, __attribute__((target("avx512f,avx512dq,avx512vl"))), (lanes_8)_mm512_sqrt_pd((__m512d)a),
-                   LAVENDER_PICK, LAVENDER_ABS)
+    LAVENDER_SOLVER(2, lanes_2, mask_2, , (lanes_2)_mm_sqrt_pd((__m128d)a), LAVENDER_PICK, LAVENDER_ABS,
+                    _mm_movemask_pd((__m128d)mask) != 0)
+    LAVENDER_SOLVER(4, lanes_4, mask_4, LAVENDER_AVX2, (lanes_4)_mm256_sqrt_pd((__m256d)a), LAVENDER_PICK, LAVENDER_ABS,
+                    _mm256_movemask_pd((__m256d)mask) != 0)
+    LAVENDER_SOLVER(8, lanes_8, mask_8, LAVENDER_AVX512, (lanes_8)_mm512_sqrt_pd((__m512d)a), LAVENDER_PICK, LAVENDER_ABS,
+                    _mm512_movepi64_mask((__m512i)mask) != 0)
+    LAVENDER_LANES(2, lanes_2, mask_2, )
+    LAVENDER_LANES(4, lanes_4, mask_4, LAVENDER_AVX2)
+    LAVENDER_LANES(8, lanes_8, mask_8, LAVENDER_AVX512)
+    LAVENDER_ONE(1_avx2, LAVENDER_AVX2)
+    #define lavender_solve_one(x, wide) ((wide) ? solve_1_avx2(x) : solve_1(x))
     #define LAVENDER_IN_LANES(width, name, arguments) \
         ((width) == 8 ? name##_8 arguments : (width) == 4 ? name##_4 arguments : name##_2 arguments)
     #else
-    LAVENDER_LANES(2, lanes_2, mask_2, , ((lanes_2){sqrt(a[0]), sqrt(a[1])}), LAVENDER_PICK, LAVENDER_ABS)
+    LAVENDER_SOLVER(2, lanes_2, mask_2, , ((lanes_2){sqrt(a[0]), sqrt(a[1])}), LAVENDER_PICK, LAVENDER_ABS,
+                    (mask[0] | mask[1]) != 0)
+    LAVENDER_LANES(2, lanes_2, mask_2, )
+    #define lavender_solve_one(x, wide) solve_1(x)
     #define LAVENDER_IN_LANES(width, name, arguments) name##_2 arguments
     #endif
     #define LAVENDER_FEWEST_LANES 2
     #else
-    #define LAVENDER_PICK(V, I, mask, a, b) ((mask) ? (a) : (b))
-    #define LAVENDER_ABS(V, I, a) fabs(a)
-    LAVENDER_LANES(1, double, long long, , sqrt(a), LAVENDER_PICK, LAVENDER_ABS)
+    LAVENDER_LANES(1, double, long long, )
+    #define lavender_solve_one(x, wide) solve_1(x)
     #define LAVENDER_IN_LANES(width, name, arguments) name##_1 arguments
     #define LAVENDER_FEWEST_LANES 1
     #endif
@@ -517,46 +757,28 @@ cdef extern from *:
     #define lavender_interleave(from, narrow, n, to, width) LAVENDER_IN_LANES(width, interleave, (from, narrow, n, to))
     """
     ctypedef struct lanes_t "lavender_lanes_t":
-        int32_t m, n, law
+        int32_t m, n, law, k
+        const int32_t *ptr, *kind
         double asymmetry
-        double* jac
-        double* mass
-        double* free
-        double* target
-        double* soft
-        double* mu
-        double* full
-        double* inverse
-        double* root
-        double* y
-        double* d
-        double* b
-        double* zero
-        double* w
-        double* e
-        double* lam
-        double* push
-        double* size
-        double* out
-        double* a
-        double* g
-        double* step
-        double* change
-        double* kept
+        double *jac, *mass, *free, *target, *soft, *mu, *lower, *upper
+        double *inverse, *root, *y, *d, *b, *zero, *w, *e, *lam, *push, *size, *out
+        double *a, *g, *step, *change, *kept
         double tol
+        uint64_t *fours, *last
     enum:
-        LANE_IS_PLAIN, LANE_START_ENERGY, LANE_START_SPEED, LANE_RHS, LANE_DETERMINANT, LANE_ENERGY, LANE_SPEED, LANE_WORST
+        LANE_IS_PLAIN, LANE_START_ENERGY, LANE_START_SPEED, LANE_RHS, LANE_CONDITION, LANE_ENERGY, LANE_SPEED, LANE_WORST
         LANE_FLOOR_ENERGY, LANE_FLOOR_SPEED, LANE_WORK, LANE_HEAVIEST, LANE_STEPS, LANE_NUMBERS
+        MAX_LANE_ROWS "LANE_ROWS"
+        MAX_LANE_VELOCITIES "LANE_VELOCITIES"
         FEWEST_LANES "LAVENDER_FEWEST_LANES"
     void prepare_lanes "lavender_prepare_lanes"(const lanes_t* x, int32_t width) noexcept nogil
     void solve_lanes "lavender_solve_lanes"(const lanes_t* x, int32_t width) noexcept nogil
+    void solve_one "lavender_solve_one"(const lanes_t* x, int32_t wide) noexcept nogil
     void judge_lanes "lavender_judge_lanes"(const lanes_t* x, int32_t width) noexcept nogil
     void interleave "lavender_interleave"(const void** x, int32_t narrow, int64_t n, double* out, int32_t width) noexcept nogil
 
 
 cdef enum:
-    MAX_LANE_ROWS = 48              # to judge; to solve at most as many as velocities
-    MAX_LANE_VELOCITIES = 40
     MAX_LANES = 8
 
 
@@ -565,75 +787,110 @@ cdef inline int32_t count_lanes() noexcept nogil:
     return 8 if has_wide() == 2 else 4 if has_wide() == 1 else FEWEST_LANES
 
 
-cdef inline bint fit_lanes(const blocks_t* p) noexcept nogil:
-    """Return whether every block is a contact of three rows without further coefficients."""
-    cdef int32_t i
-    for i in range(p.n_blocks):
-        if not is_disk_friction_contact(p, i) or p.patch_radius[i] != 0.0 or p.rolling[i] != 0.0:
-            return False
-    return True
+cdef inline bint fits_lanes(const blocks_t* p, int32_t i) noexcept nogil:
+    """Return whether block i is a set of bounded rows, or a contact of three rows without further coefficients."""
+    return ((has_independent_rows(p, i) or is_disk_friction_contact(p, i))
+            and p.patch_radius[i] == 0.0 and p.rolling[i] == 0.0)
 
 
-cdef inline bint are_worlds_equal_in_size(const worlds_t* w, int64_t first, int64_t end) noexcept nogil:
-    """Return whether worlds [first, end) have equal sizes, and lanes can hold that many rows and velocities."""
-    cdef const int64_t* at = w.at + first * PLACES
-    cdef int64_t i
-    if not (0 < at[ROWS] <= MAX_LANE_ROWS and 0 < at[VELOCITIES] <= MAX_LANE_VELOCITIES and at[ROWS] == 3 * at[BLOCKS]):
+cdef inline int64_t compute_structure_key(const worlds_t* w, int64_t i) noexcept nogil:
+    """Return a number that is equal for worlds with equal sizes and kinds of blocks; 0 if lanes do not cover world i."""
+    cdef const int64_t* at = w.at + i * PLACES
+    cdef uint64_t key = 64 * <uint64_t>at[ROWS] + <uint64_t>at[VELOCITIES]
+    cdef int32_t k, j = <int32_t>at[BLOCK]
+    if not (0 < at[ROWS] <= MAX_LANE_ROWS and 0 < at[VELOCITIES] <= MAX_LANE_VELOCITIES):
+        return 0
+    for k in range(j, j + <int32_t>at[BLOCKS]):
+        if not fits_lanes(&w.blocks, k):
+            return 0
+        key ^= <uint64_t>(2 * (w.blocks.ptr[k + 1] - w.blocks.ptr[k]) + (w.blocks.kind[k] == ROW))
+        key *= <uint64_t>0x100000001B3U                 # FNV-1a
+    return <int64_t>(key | 1)
+
+
+cdef inline bint have_worlds_equal_structure(const worlds_t* w, int64_t i, int64_t j) noexcept nogil:
+    """Return whether worlds i and j have equal sizes and kinds of blocks."""
+    cdef const int64_t* at = w.at + i * PLACES
+    cdef const int64_t* other = w.at + j * PLACES
+    cdef const blocks_t* p = &w.blocks
+    cdef int64_t k, a = at[BLOCK], b = other[BLOCK]
+    if at[ROWS] != other[ROWS] or at[VELOCITIES] != other[VELOCITIES] or at[BLOCKS] != other[BLOCKS]:
         return False
-    for i in range(first + 1, end):
-        at = w.at + i * PLACES
-        if at[ROWS] != w.at[first * PLACES + ROWS] or at[VELOCITIES] != w.at[first * PLACES + VELOCITIES]:
+    for k in range(at[BLOCKS] if a != b else 0):
+        if p.ptr[a + k + 1] - p.ptr[a + k] != p.ptr[b + k + 1] - p.ptr[b + k] or p.kind[a + k] != p.kind[b + k]:
             return False
     return True
+
+
+cdef inline void list_lane_blocks(const blocks_t* p, int32_t block, lanes_t* x, int32_t* ptr, int32_t* kind) noexcept nogil:
+    """Write the x.k blocks from `block` on to ptr (k + 1) and kind (k) of lanes."""
+    cdef int32_t i
+    x.ptr, x.kind, ptr[0] = ptr, kind, 0
+    for i in range(x.k):
+        ptr[i + 1] = p.ptr[block + i + 1] - p.ptr[block]
+        kind[i] = 0 if has_independent_rows(p, block + i) else 1
 
 
 cdef inline int64_t bind_lanes(lanes_t* x, int32_t width, double* memory) noexcept nogil:
     """Take the arrays of lanes of m rows and n velocities from memory; return the number of doubles."""
-    cdef int64_t m = x.m, n = x.n, at = 0
-    cdef double*** array = [&x.jac, &x.mass, &x.y, &x.free, &x.inverse, &x.root, &x.push, &x.size, &x.target, &x.soft, &x.d, &x.b,
-                            &x.zero, &x.w, &x.e, &x.lam, &x.step, &x.change, &x.kept, &x.mu, &x.full, &x.out, &x.a, &x.g]
-    cdef int64_t* count = [m * n, n * n, m * n, n, n, n, n, n, m, m, m, m, m, m, m, m, m, m, m, m // 3, m // 3,
-                            LANE_NUMBERS, m * m, m * m]
+    cdef int64_t m = x.m, n = x.n, at = 0, places = m + 3 & ~3
+    cdef double*** array = [&x.jac, &x.mass, &x.y, &x.free, &x.inverse, &x.root, &x.push, &x.size, &x.target, &x.soft,
+                            &x.lower, &x.upper, &x.d, &x.b, &x.zero, &x.w, &x.e, &x.lam, &x.step, &x.change, &x.kept, &x.mu,
+                            &x.out, &x.a, &x.g, <double**>&x.fours, <double**>&x.last]
+    cdef int64_t* count = [m * n, n * n, m * n, n, n, n, n, n, m, m, m, m, m, m, m, places, m, m, m, m, m, m,
+                           LANE_NUMBERS, places * m, places * max(m, n), m, m]
     cdef int32_t i
-    for i in range(24):
+    for i in range(27):
         array[i][0] = memory + at if memory != NULL else NULL
         at += width * count[i]
     return at
 
 
-cdef inline void load_lanes(const lanes_t* x, const worlds_t* w, const double* lam, int64_t first, int64_t end,
+cdef inline void load_lanes(const lanes_t* x, const worlds_t* w, const double* lam, const int64_t* worlds, int32_t n_worlds,
                             int32_t width) noexcept nogil:
-    """Load worlds [first, end) and their impulses to the lanes; further lanes receive the first world again."""
+    """Load worlds (n_worlds) and their impulses to the lanes; further lanes receive the first world again."""
     cdef const int64_t* at[MAX_LANES]
     cdef const void* line[MAX_LANES]
-    cdef double** to = [x.jac, x.mass, x.free, x.target, x.soft, x.mu, x.lam]
-    cdef int32_t* place = [JAC, MASS, FREE, TARGET, SOFT, MU, AT_ROW]
-    cdef int32_t* count = [x.n, x.n, x.n, x.m, x.m, x.m // 3, x.m]
-    cdef int32_t* lines = [x.m, x.n, 1, 1, 1, 1, 1]
+    cdef double** to = [x.jac, x.mass, x.free, x.target, x.soft, x.mu, x.lam, x.lower, x.upper]
+    cdef int32_t* place = [JAC, MASS, FREE, TARGET, SOFT, MU, AT_ROW, CONE_ROW, CONE_ROW]
+    cdef int32_t* count = [x.n, x.n, x.n, x.m, x.m, x.k, x.m, x.m, x.m]
+    cdef int32_t* lines = [x.m, x.n, 1, 1, 1, 1, 1, 1, 1]
+    cdef const void* source[9]
     cdef int64_t stride
-    cdef int32_t i, k, lane, columns, narrow
-    cdef const char* array
+    cdef int32_t i, k, lane, narrow
     for lane in range(width):
-        at[lane] = w.at + PLACES * (first + lane if first + lane < end else first)
-    for i in range(7):
-        array, narrow = <const char*>lam if i == 6 else <const char*>w.array[i], i < 6 and w.narrow[i]
+        at[lane] = w.at + PLACES * worlds[lane if lane < n_worlds else 0]
+    for i in range(6):
+        source[i] = w.array[i]
+    source[6], source[7], source[8] = lam, w.blocks.lower, w.blocks.upper
+    if w.array[5] == NULL:
+        source[5], place[5] = w.blocks.mu, BLOCK
+    for i in range(9):
+        narrow = i < 6 and w.array[i] != NULL and w.narrow[i]
         stride = w.jac_row_stride if i == 0 else w.mass_row if i == 1 else 0
-        if stride == 0 or stride == count[i]:           # one line
+        if i == 1 and w.mass_ptr != NULL:
+            lines[i], count[i] = 1, w.mass_ptr[x.n]
+        elif stride == 0 or stride == count[i]:         # one line
             stride, count[i], lines[i] = 0, count[i] * lines[i], 1
         for k in range(lines[i]):
             for lane in range(width):
-                line[lane] = array + (4 if narrow else 8) * (at[lane][place[i]] + k * stride)
-                if array == NULL:
-                    line[lane] = w.blocks.mu + at[lane][BLOCK]
+                line[lane] = <const char*>source[i] + (4 if narrow else 8) * (at[lane][place[i]] + k * stride)
             interleave(line, narrow, count[i], to[i] + <int64_t>k * count[i] * width, width)
-    for i in range(x.m // 3):
-        for lane in range(width):
-            columns = x.n
-            while columns > 0 and (x.jac[(3 * i * x.n + columns - 1) * width + lane] == 0.0
-                                   and x.jac[((3 * i + 1) * x.n + columns - 1) * width + lane] == 0.0
-                                   and x.jac[((3 * i + 2) * x.n + columns - 1) * width + lane] == 0.0):
-                columns -= 1
-            x.full[i * width + lane] = columns & ~3
+    if w.mass_ptr != NULL:
+        spread_lower_triangle(x, w.mass_ptr, w.mass_col, width)
+
+
+cdef inline void spread_lower_triangle(const lanes_t* x, const int32_t* ptr, const int32_t* col, int32_t width) noexcept nogil:
+    """Move the entries of a lower triangle in compressed rows, at the beginning of x.mass, to their places, from the last on."""
+    cdef int32_t i, j, k, q = ptr[x.n] - 1
+    for i in range(x.n - 1, -1, -1):
+        for j in range(x.n - 1, -1, -1):
+            k = q >= ptr[i] and col[q] == j
+            if k:
+                memmove(x.mass + (i * x.n + j) * width, x.mass + q * width, width * sizeof(double))
+                q -= 1
+            else:
+                memset(x.mass + (i * x.n + j) * width, 0, width * sizeof(double))
 
 
 cdef inline double lane_number(const lanes_t* x, int32_t which, int32_t width, int32_t lane) noexcept nogil:
@@ -658,22 +915,20 @@ cdef inline bint is_lane_refined(const lanes_t* x, int32_t width, int32_t lane, 
     size = 0.1 * relative_residual(energy, sqrt(lane_number(x, LANE_HEAVIEST, width, lane)) * energy,
                                    lane_number(x, LANE_START_ENERGY, width, lane), lane_number(x, LANE_START_SPEED, width, lane))
     size = x.n * unit_roundoff() * max(size, 1.0)
-    return not size * (2.72 * lane_number(x, LANE_DETERMINANT, width, lane)) <= 0.1 * max(min(tol, strictest),
-                                                                                         min(relative, strictest))
+    return not size * lane_number(x, LANE_CONDITION, width, lane) <= 0.1 * max(min(tol, strictest), min(relative, strictest))
 
 
 cdef inline bint is_solved_in_one_lane(const blocks_t* p, const generalized_t* g, const double* zero_residual) noexcept nogil:
-    """Return whether a problem is of the kind that lanes solve: contacts of three rows, one island, M without zeros.
-
-    More rows than velocities are left out: A is then singular, and other methods take less time.
-    """
-    cdef int32_t i, n = g.n
-    if (not (0 < p.n_rows <= min(n, MAX_LANE_ROWS) and n <= MAX_LANE_VELOCITIES and p.islands == NULL and zero_residual[2] == 1.0)
-            or g.mptr[n] != n * (n + 1) // 2 or not fit_lanes(p)):
+    """Return whether a problem is of the kind that lanes solve: `fits_lanes`, one island, 0 within bounds and not a solution."""
+    cdef int32_t i, k
+    if not (0 < p.n_rows <= MAX_LANE_ROWS and g.n <= MAX_LANE_VELOCITIES and p.islands == NULL and zero_residual[2] == 1.0):
         return False
-    for i in range(g.mptr[n]):
-        if g.mval[i] == 0.0:
+    for i in range(p.n_blocks):
+        if not fits_lanes(p, i):
             return False
+        for k in range(p.ptr[i], p.ptr[i + 1] if has_independent_rows(p, i) else p.ptr[i]):
+            if not p.lower[k] <= 0.0 <= p.upper[k]:
+                return False
     return True
 
 
@@ -681,28 +936,25 @@ cdef inline int32_t solve_in_one_lane(const blocks_t* p, const generalized_t* g,
                                       workspace_t* workspace, double* lam) noexcept nogil:
     """Solve from the zero impulse, with the bits of a lane, into lam (m); return the Newton steps, -1 without memory."""
     cdef lanes_t x
-    cdef int32_t i, r, a, lane, nc, width = FEWEST_LANES
+    cdef int32_t i, r, a, nc
+    cdef int32_t ptr[MAX_LANE_ROWS + 1]
+    cdef int32_t kind[MAX_LANE_ROWS]
     cdef const double* y
-    x.m, x.n, x.law, x.tol = p.n_rows, g.n, p.law, tol
-    if not grow_workspace_to(workspace, 0, bind_lanes(&x, width, NULL)):
+    x.m, x.n, x.law, x.tol, x.k = p.n_rows, g.n, p.law, tol, p.n_blocks
+    if not grow_workspace_to(workspace, 0, bind_lanes(&x, 1, NULL)):
         return -1
-    bind_lanes(&x, width, workspace.real)
-    memset(x.y, 0, <int64_t>x.m * x.n * width * sizeof(double))
-    for lane in range(width):
-        for i in range(g.n_panels):
-            nc = g.pcol[i + 1] - g.pcol[i]
-            for r in range(g.prow[i], g.prow[i + 1]):
-                y = g.y + g.pval[i] + <int64_t>(r - g.prow[i]) * nc
-                for a in range(nc):
-                    x.y[(r * x.n + g.cols[g.pcol[i] + a]) * width + lane] = y[a]
-        for r in range(x.m):
-            x.b[r * width + lane], x.d[r * width + lane], x.soft[r * width + lane] = p.b[r], p.d[r], g.compliance[r]
-        for i in range(p.n_blocks):
-            x.mu[i * width + lane] = p.mu[i]
-        x.out[LANE_IS_PLAIN * width + lane] = 1.0
-        x.out[LANE_START_ENERGY * width + lane] = zero_residual[0]
-        x.out[LANE_START_SPEED * width + lane] = zero_residual[1]
-    solve_lanes(&x, width)
-    for r in range(x.m):
-        lam[r] = x.lam[r * width]
-    return <int32_t>x.out[LANE_STEPS * width]
+    bind_lanes(&x, 1, workspace.real)
+    list_lane_blocks(p, 0, &x, ptr, kind)
+    memset(x.y, 0, <int64_t>x.m * x.n * sizeof(double))
+    for i in range(g.n_panels):
+        nc = g.pcol[i + 1] - g.pcol[i]
+        for r in range(g.prow[i], g.prow[i + 1]):
+            y = g.y + g.pval[i] + <int64_t>(r - g.prow[i]) * nc
+            for a in range(nc):
+                x.y[r * x.n + g.cols[g.pcol[i] + a]] = y[a]
+    x.b, x.d, x.soft, x.mu = <double*>p.b, <double*>p.d, <double*>g.compliance, <double*>p.mu
+    x.lower, x.upper = <double*>p.lower, <double*>p.upper
+    x.out[LANE_IS_PLAIN], x.out[LANE_START_ENERGY], x.out[LANE_START_SPEED] = 1.0, zero_residual[0], zero_residual[1]
+    x.out[LANE_STEPS], x.lam = 0.0, lam
+    solve_one(&x, has_wide())
+    return <int32_t>x.out[LANE_STEPS]

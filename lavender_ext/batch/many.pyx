@@ -27,8 +27,10 @@ from lavender_ext.batch.task cimport (copy_small_judgement, compute_missing_deri
 from lavender_ext.small.limits cimport estimate_newton_cost_terms, limits_t, max_newton_cost, newton_cost_t
 from lavender_ext.host cimport grow_workspace_to, free_workspace
 from lavender_ext.batch.lanes cimport (LANE_IS_PLAIN, LANE_RHS, LANE_START_ENERGY, LANE_START_SPEED, LANE_STEPS,
-                                       are_worlds_equal_in_size, bind_lanes, count_lanes, fit_lanes, is_lane_refined, judge_lanes,
-                                       lane_number, lanes_t, load_lanes, prepare_lanes, score_of_lane, solve_lanes)
+                                       MAX_LANES, MAX_LANE_ROWS,
+                                       bind_lanes, compute_structure_key, count_lanes, have_worlds_equal_structure,
+                                       is_lane_refined, judge_lanes, lane_number, lanes_t, list_lane_blocks, load_lanes,
+                                       prepare_lanes, score_of_lane, solve_lanes)
 from lavender_ext.batch.world cimport (BAD, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, LATE, LEFT, MASS, MU, N_ARRAYS, PLACES, READY,
                                        AT_ROW, ROWS, SOFT, STARTED, TARGET, TRIED, VELOCITIES, VELOCITY, worker_scratch_t,
                                        convert_generalized_world, worlds_t)
@@ -70,6 +72,7 @@ cdef ndarray new(Py_ssize_t n):
 cdef enum:
     MAX_KEPT_NUMBERS = 1 << 16      # A workspace with more numbers is freed at the end of a call.
     INTERRUPT_CHECK_WORLDS = 256    # worlds between two checks for Ctrl-C
+    MAX_LANE_PAUSE = 31             # groups of worlds without lanes, where lanes cover none
 
 
 cdef int set_task_from_problem(task_t* j, problem) except -1:
@@ -264,8 +267,10 @@ cdef struct worker_t:             # memory of one thread
     task_workspaces_t small
     workspace_t by_island
     workspace_t lanes
-    int64_t next, end               # taken worlds that are not processed
-    int32_t failed                  # bit k: lanes have not solved world end - k
+    int64_t begin, next, end        # taken places of the order; those from `next` on are not processed
+    int64_t group[MAX_LANES]        # worlds at these places; -1: none
+    int32_t failed                  # bit k: lanes have not solved world k of the group
+    int32_t pause, idle             # groups without lanes after the last group that lanes did not cover; those to come
 
 
 cdef class Worlds:
@@ -295,6 +300,8 @@ cdef class Worlds:
     cdef int64_t taken
     cdef bint cold
     cdef public int width           # number of worlds that a worker takes at a time, to process them in lanes: 1, 2, 4 or 8
+    cdef object order               # worlds (places,) in the order in which they are processed in lanes; -1: none
+    cdef const int64_t* order_at
     cdef readonly object numbers, worst, counts, code, impulse, velocity
     cdef list references
     cdef double* lam
@@ -332,7 +339,7 @@ cdef class Worlds:
         self.w.blocks, self.w.asymmetry = blocks.at, asymmetry
         self.w.blocks.law = law
         self.w.jac_row_stride, self.w.mass_row = strides
-        self.width = count_lanes() if pattern is None and fit_lanes(&self.w.blocks) else 1
+        self.width = count_lanes()
         self.references += [blocks, pattern, *arrays]
         for i in range(N_ARRAYS):
             self.w.array[i] = NULL
@@ -345,6 +352,25 @@ cdef class Worlds:
             else:
                 wide = arrays[i]
                 self.w.array[i] = &wide[0]
+        self.order_worlds()
+
+    cdef void order_worlds(self):
+        """Order the worlds by their structure, in groups of MAX_LANES; -1 fills the last group of each structure."""
+        cdef int64_t i
+        cdef int64_t[::1] key
+        cdef const int64_t[::1] order
+        keys = np.empty(self.w.n, np.int64)
+        key = keys
+        for i in range(self.w.n):
+            key[i] = compute_structure_key(&self.w, i)
+        by = np.argsort(keys, kind="stable")
+        sizes = np.diff(np.flatnonzero(np.diff(keys[by])) + 1, prepend=0, append=self.w.n)
+        places = -(-sizes // MAX_LANES) * MAX_LANES
+        self.order = np.full(places.sum(), -1)
+        self.order[np.arange(self.w.n) + np.repeat(np.cumsum(places - sizes) - (places - sizes), sizes)] = by
+        order = self.order
+        if self.w.n:
+            self.order_at = &order[0]
 
     def set_from_problems(self, list problems, list data, list starts):
         """Set the worlds from problems and their `list_problem_data`; None defers a problem to the caller."""
@@ -419,34 +445,41 @@ cdef class Worlds:
         self.worst_at[i] = j.score.worst
         self.number[PUSH * n + i] = fabs(push)
 
-    cdef void process_in_lanes(self, int64_t first, int64_t end, worker_t* h, double tol, bint judges) noexcept nogil:
-        """Judge or solve worlds [first, end) in lanes as `judge_world` and `solve_world` do.
+    cdef int32_t process_in_lanes(self, const int64_t* worlds, int32_t n_worlds, worker_t* h, double tol,
+                                  bint judges) noexcept nogil:
+        """Judge or solve worlds (n_worlds) in lanes as `judge_world` and `solve_world` do; return their number.
 
         The code of worlds that no lane covers or solves stays LEFT.
         """
         cdef lanes_t x
         cdef task_t j
         cdef const int64_t* at
-        cdef int32_t lane, k, width = self.width
+        cdef int32_t ptr[MAX_LANE_ROWS + 1]
+        cdef int32_t kind[MAX_LANE_ROWS]
+        cdef int32_t lane, k, done = 0, width = self.width
         cdef double* lam
-        cdef bint solves = not judges and self.w.at[first * PLACES + ROWS] <= self.w.at[first * PLACES + VELOCITIES]
         cdef int64_t i, n = self.w.n + 1
         cdef double* v
-        if end - first < 2 or not (judges or solves) or not are_worlds_equal_in_size(&self.w, first, end):
-            return
-        at = self.w.at + first * PLACES
-        x.m, x.n, x.law, x.asymmetry = <int32_t>at[ROWS], <int32_t>at[VELOCITIES], self.w.blocks.law, self.w.asymmetry
+        if n_worlds < 2 or compute_structure_key(&self.w, worlds[0]) == 0:
+            return 0
+        for lane in range(1, n_worlds):
+            if not have_worlds_equal_structure(&self.w, worlds[0], worlds[lane]):
+                return 0
+        at = self.w.at + worlds[0] * PLACES
+        x.m, x.n, x.law, x.k = <int32_t>at[ROWS], <int32_t>at[VELOCITIES], self.w.blocks.law, <int32_t>at[BLOCKS]
+        x.asymmetry = self.w.asymmetry if self.w.mass_ptr == NULL else -1.0
         if not grow_workspace_to(&h.lanes, 0, bind_lanes(&x, width, NULL)):
-            return
+            return 0
         bind_lanes(&x, width, h.lanes.real)
-        load_lanes(&x, &self.w, self.lam, first, end, width)
+        list_lane_blocks(&self.w.blocks, <int32_t>at[BLOCK], &x, ptr, kind)
+        load_lanes(&x, &self.w, self.lam, worlds, n_worlds, width)
         prepare_lanes(&x, width)
         x.tol = tol
-        if solves:
+        if not judges:
             solve_lanes(&x, width)
         judge_lanes(&x, width)
-        for lane in range(<int32_t>(end - first)):
-            i, at = first + lane, self.w.at + (first + lane) * PLACES
+        for lane in range(n_worlds):
+            i, at = worlds[lane], self.w.at + worlds[lane] * PLACES
             if not lane_number(&x, LANE_IS_PLAIN, width, lane) > 0.0:
                 continue
             j.score = score_of_lane(&x, width, lane)
@@ -459,7 +492,7 @@ cdef class Worlds:
             j.above_floor = residual_above_floor(&j.score, j.relative, j.floor)
             if not judges:
                 if not (j.relative <= tol and j.floor <= tol):
-                    h.failed |= 1 << (end - i)
+                    h.failed |= 1 << lane
                     continue
                 lam = self.lam + at[AT_ROW]
                 for k in range(x.m):
@@ -473,6 +506,8 @@ cdef class Worlds:
             for k in range(x.n):
                 v[k] = x.free[k * width + lane] + x.push[k * width + lane]
             self.code_at[i] = READY
+            done += 1
+        return done
 
     cdef int32_t store_empty_world(self, int64_t i, const worker_scratch_t* scratch) noexcept nogil:
         """Store the velocity v+ after the step of a world without rows, which is v*."""
@@ -494,7 +529,7 @@ cdef class Worlds:
         if j.p.n_rows == 0:
             return self.store_empty_world(i, &h.scratch)
         had_derived, j.deadline = j.has_derived, deadline
-        j.failed_in_lanes = h.failed >> (h.end - i) & 1
+        j.failed_in_lanes = h.failed >> (h.next - 1 - h.begin) & 1
         if j.general:
             solve_task(&j, &h.workspace, &h.small.islands, limits, tol)
             if not had_derived:
@@ -615,8 +650,9 @@ cdef class Worker:
         cdef Worlds w = self.worlds
         cdef const limits_t* at = &limits.at if limits is not None else NULL
         cdef const small_rules_t* small_rules = &rules.at if rules is not None else NULL
+        cdef const int64_t* order = NULL
         cdef int64_t i, n = w.w.n
-        cdef int32_t code, n_done = 0
+        cdef int32_t code, n_group, n_done = 0
         cdef bint uses_lanes = not narrow
         cdef deadline_t own                             # Other threads read the clock for themselves.
         cdef deadline_t* until = get_pointer(deadline)
@@ -625,17 +661,30 @@ cdef class Worker:
             until = &own
         if not judges:
             uses_lanes = at != NULL and at.lanes != 0.0 and w.cold
+        if uses_lanes and w.width > 1 and until == NULL:        # With a limit of time, worlds are solved in their own order.
+            order, n = w.order_at, len(w.order)
         with nogil:
             while not self.stop[0]:
                 if self.h.next == self.h.end:
                     i = lav_add(&w.taken, w.width)
                     if i >= n:
                         return DONE_ALL
-                    self.h.next, self.h.end, self.h.failed = i, min(i + w.width, n), 0
+                    self.h.begin, self.h.next, self.h.end, self.h.failed, n_group = i, i, min(i + w.width, n), 0, 0
+                    for i in range(self.h.begin, self.h.end):
+                        self.h.group[i - self.h.begin] = i if order == NULL else order[i]
+                        n_group += self.h.group[i - self.h.begin] >= 0
                     if w.width > 1 and uses_lanes and not has_passed(until, 0.0):
-                        w.process_in_lanes(i, self.h.end, &self.h, tol, judges)
-                i = self.h.next
+                        if self.h.idle > 0:
+                            self.h.idle -= 1
+                        elif w.process_in_lanes(self.h.group, n_group, &self.h, tol, judges) > 0:
+                            self.h.pause = 0
+                        else:
+                            self.h.pause = min(2 * self.h.pause + 1, MAX_LANE_PAUSE)
+                            self.h.idle = self.h.pause
+                i = self.h.group[self.h.next - self.h.begin]
                 self.h.next += 1
+                if i < 0:
+                    continue
                 if w.code_at[i] == READY:               # A lane has processed this world.
                     code = READY
                 elif has_passed(until, reading_interval()):
