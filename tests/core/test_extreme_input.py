@@ -127,21 +127,6 @@ def test_a_problem_in_other_units_is_rejected_or_has_the_same_residual(kind, for
             assert getattr(residual, name) == getattr(expected, name)
 
 
-@pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("kind", KINDS)
-@given(seed=seeds, exponent=near)
-def test_every_solver_gives_the_same_answer_in_other_units(kind, form, seed, exponent):
-    if kind not in ("disks", "boxes", "ellipses", "bounded rows", "free rows"):
-        exponent = (*exponent[:2], 0)  # a solver may sum over rows of different units
-    problem, build, scale, is_valid, is_empty = in_two_units(kind, form, seed, exponent)
-    if not is_valid or is_empty:
-        return
-    for name in lv.available(problem, external=False):
-        expected, solution = (lv.solve(p, name, tol=1e-8, max_iter=200) for p in (problem, build()))
-        assert (solution.status, solution.iterations) == (expected.status, expected.iterations), name
-        np.testing.assert_array_equal(solution.impulse, expected.impulse * scale, err_msg=name)
-
-
 # -- rows without an entry ------------------------------------------------------------------------------------------
 
 
@@ -326,6 +311,31 @@ def test_claims_about_extreme_problems_hold_in_long_double(case):
         check_case(case)
     except (lv.CapabilityError, lv.SolverUnavailable):
         reject()  # an order or an option that this solver does not have for this problem
+
+
+MEASURES = ("kinetic", "energy", "speed", "spin", "rows")
+
+
+@pytest.mark.fuzz
+@pytest.mark.filterwarnings("error")
+@given(data=problem_data(), exponent=st.integers(-1070, 1020))
+def test_motion_errors_and_ranks_of_extreme_problems_are_numbers(data, exponent):
+    """A motion error is finite, or its `note` has the reason."""
+    try:
+        problem = build_problem(data)
+    except lv.InputError:
+        reject()
+    for impulse in (np.full(problem.m, 2.0**exponent), lv.solve(problem).impulse):
+        if not np.isfinite(impulse).all():
+            continue
+        error = lv.motion_error(problem, impulse)
+        values = {name: getattr(error, name) for name in MEASURES}
+        assert [name for name, value in values.items() if value is not None and not np.isfinite(value)] == []
+        assert error.relative is None or np.isfinite(error.relative) or error.note
+        assert str(error)
+    if problem.m and problem.is_symmetric:
+        result = lv.redundancy(problem)
+        assert 0 <= result.rank == problem.m - len(result.rows)
 
 
 FOUND = [json.loads(line) for line in Path(__file__).with_name("found_problems.jsonl").read_text().splitlines()]
