@@ -4,7 +4,7 @@ The results are the numbers of `Generalized` from the same arrays: J and the low
 zeros, M = L^T D L in the given order, b = target - J v*. A world that `Generalized` would reorder is deferred to the caller.
 """
 from libc.stdint cimport int32_t, int64_t
-from libc.string cimport memcmp, memcpy, memset
+from libc.string cimport memcmp, memcpy
 
 from lavender_ext.core.faults cimport NO_FAULT, find_friction_fault, is_valid_rhs
 from lavender_ext.core.validate cimport find_invalid_magnitude, has_invalid_number
@@ -67,7 +67,6 @@ cdef struct worker_scratch_t:   # of one thread
     workspace_t workspace       # data of the current world
     workspace_t tree            # pattern of the last world's factor of M
     int32_t n_tree              # number of velocities of that pattern; -1: none
-    int32_t splits              # 1: zeros of a shared M change the pattern of L, so that the pattern is not reused
     mass_t mass                 # M of the current world
     double* free                # v* of the current world
 
@@ -143,74 +142,11 @@ cdef inline bint find_factor_pattern(worker_scratch_t* d, int32_t n, const int32
     return True
 
 
-cdef inline int32_t count_zeros_and_detect_new(const double* x, int32_t n, const int64_t* known, int64_t* new) noexcept nogil:
-    """Return the number of zeros of x (n); `new` receives whether any of these is not in `known`. Compilers vectorise the loop."""
-    cdef int64_t zeros = 0, unknown = 0, zero
-    cdef int32_t k
-    for k in range(n):
-        zero = x[k] == 0.0
-        zeros += zero
-        unknown |= zero & ~known[k]
-    new[0] = unknown
-    return <int32_t>zeros
-
-
-cdef inline int32_t reuse_shared_pattern(const worlds_t* w, worker_scratch_t* d, int32_t n, const double* x,
-                                         generalized_t* g) noexcept nogil:
-    """Return the number of nonzeros of an M with the shared pattern; -1 if its zeros change the pattern of L.
-
-    It is also -1 if memory is exhausted.
-
-    If a set of zeros does not change the pattern of L, no subset does: M is then used in place, and the set is remembered.
-    """
-    cdef int64_t capacity = <int64_t>n * (n + 1) // 2, new
-    cdef int32_t k, zeros, count = w.mass_ptr[n]
-    cdef int32_t* t
-    cdef int32_t* other
-    cdef int32_t* ptr
-    cdef int64_t* known                                 # positions of zeros that do not change the pattern of L
-    if d.splits or not grow_workspace_to(&d.tree, 2 * (6 * <int64_t>n + 2 + 2 * capacity), 2 * <int64_t>count):
-        return -1
-    t, known = d.tree.index, <int64_t*>d.tree.real
-    bind_factor_pattern(t, n, g)
-    if d.n_tree != n:
-        d.n_tree = n
-        compute_factor_pattern(n, capacity, w.mass_ptr, w.mass_col, t)
-        memset(known, 0, count * sizeof(int64_t))
-    zeros = count_zeros_and_detect_new(x, count, known, &new)
-    if new:
-        for k in range(count):
-            known[count + k] = known[k] | (x[k] == 0.0)
-        other, ptr = t + 5 * n + 1 + capacity, t + 10 * n + 2 + 2 * capacity
-        remove_from_shared_pattern(w, n, known + count, ptr, ptr + n + 1)
-        compute_factor_pattern(n, capacity, ptr, ptr + n + 1, other)
-        d.splits = memcmp(t, other, (n + 1) * sizeof(int32_t)) != 0 \
-            or memcmp(g.lidx, other + 2 * n + 1, t[n] * sizeof(int32_t)) != 0
-        if d.splits:
-            d.n_tree = -1
-            return -1
-        memcpy(known, known + count, count * sizeof(int64_t))
-    return count - zeros
-
-
-cdef inline void remove_from_shared_pattern(const worlds_t* w, int32_t n, const int64_t* out, int32_t* ptr,
-                                            int32_t* idx) noexcept nogil:
-    """Compute the pattern of the shared M without the positions marked in `out`, keeping the diagonal."""
-    cdef int32_t i, k, q = 0
-    ptr[0] = 0
-    for i in range(n):
-        for k in range(w.mass_ptr[i], w.mass_ptr[i + 1]):
-            idx[q] = w.mass_col[k]
-            q += not out[k] or w.mass_col[k] == i
-        ptr[i + 1] = q
-
-
 cdef inline int32_t convert_generalized_world(const worlds_t* w, int64_t i, worker_scratch_t* d, blocks_t* p,
                                               generalized_t* g) noexcept nogil:
     """Convert world i of J and M to p and g, in the worker's scratch d; return READY, BAD or LEFT."""
     cdef const int64_t* at = w.at + i * PLACES
     cdef int32_t m = <int32_t>at[ROWS], n = <int32_t>at[VELOCITIES], k = <int32_t>at[BLOCKS], j, entries
-    cdef bint shared = True
     cdef int64_t all = <int64_t>m * n, half = <int64_t>n * (n + 1) // 2, row = w.jac_row_stride
     cdef int64_t numbers = all + 2 * half + 4 * n + 2 * m + k + 1 + THIN_PADDING, wide = all if m > n else <int64_t>n * n
     cdef const double* a
@@ -237,21 +173,15 @@ cdef inline int32_t convert_generalized_world(const worlds_t* w, int64_t i, work
         a = convert_matrix_to_float64(w, 1, at[MASS], 1, entries, &row, d.workspace.real + numbers)
         if has_invalid_number(a, entries):
             return BAD
-        d.mass.ptr, d.mass.idx, d.mass.val = w.mass_ptr, w.mass_col, a
-        entries = reuse_shared_pattern(w, d, n, a, g)
-        if entries < 0:
-            d.mass.ptr, d.mass.idx, d.mass.val = ptr, idx, x
-            entries = drop_zeros_of_triangle(w.mass_ptr, w.mass_col, a, n, ptr, idx, x)
-            shared = False
+        entries = drop_zeros_of_triangle(w.mass_ptr, w.mass_col, a, n, ptr, idx, x)
     else:
         row = w.mass_row
         a = convert_matrix_to_float64(w, 1, at[MASS], n, n, &row, d.workspace.real + numbers)
         entries = compress_lower_triangle(a, row, w.asymmetry, n, ptr, idx, x)
         if entries < 0 or has_invalid_number(x, entries):
             return BAD
-        d.mass.ptr, d.mass.idx, d.mass.val = ptr, idx, x
-        shared = False
-    if not shared and not find_factor_pattern(d, n, ptr, idx, g):
+    d.mass.ptr, d.mass.idx, d.mass.val = ptr, idx, x
+    if not find_factor_pattern(d, n, ptr, idx, g):
         return LEFT
     if ordering_pays_off(g, entries):
         return LEFT

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from random_problems import ancestors, tree_mass
 
 import lavender as lv
 from lavender.batch.data import Batch
-from tests.random_problems import ancestors, tree_mass
 
 NUMBERS = "relative", "energy", "velocity_error", "impulse_error", "roundoff_floor", "velocity_at_zero", "worst_row"
 SIZES = [(3, 6, 5), (12, 18, 21), (18, 9, 10), (30, 36, 9), (15, 1, 9)]
