@@ -278,14 +278,14 @@ class Batch(Sequence[Problem]):
         return self.get_world(i)
 
     def get_world(self, i: int, named: bool = True) -> Problem:
-        """Return world i as a `Problem` made of copies, with or without the names of its blocks."""
+        """Return world i as a `Problem` made of copies, with or without names of blocks and units of rows."""
         world = dict(zip(WORLD.names, self.at[i].item(), strict=True))  # type: ignore[arg-type]
         jac, mass, free, target, compliance, mu = (self._get_array_of_world(world, k) for k in range(6))
         cones = self._get_cones_of_world(i, None if mu is None else as_array("mu", mu, (None,)))
         problem = Problem.from_jacobian(
             jac, mass, free, target=target, cones=cones, compliance=compliance, friction=self.friction,
-            precision=self.precision, names=self.names_of(i) if named and self.names_of is not None else None,
-            angular=None if self.angular_of is None else self.angular_of(i),
+            precision=self.precision, names=None if self.names_of is None or not named else self.names_of(i),
+            angular=None if self.angular_of is None or not named else self.angular_of(i),
         )  # fmt: skip
         if i in self.engine_motions:
             problem.__dict__["engine_motion"] = self.engine_motions[i]

@@ -8,6 +8,7 @@ with this loop, too.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from math import prod
 from types import SimpleNamespace
 from typing import Any
 
@@ -85,8 +86,8 @@ class WorldResults:
         if type(problems) is Batch:
             at = problems.at
             self._sizes, self._first = at["rows"], at["row"]
-            self._impulse = np.zeros(int(np.prod(problems.shape))) if cold else starts
-            self._velocity: FloatArray | None = np.zeros(int(np.prod(problems.velocity_shape)))
+            self._impulse = np.zeros(prod(problems.shape)) if cold else starts
+            self._velocity: FloatArray | None = np.zeros(prod(problems.velocity_shape))
             self._worlds: Worlds = problems.make_kernel_worlds(self._impulse, self._velocity, cold)
             return
         self._data, at, m = list_problem_data(problems, Problem)
