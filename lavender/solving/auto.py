@@ -22,9 +22,9 @@
                      constraints, for other problems under Coulomb's law by a linear program
     alternation      the factorising solvers, `admm` and sweeps in turn, with doubled work in each round, until none
                      improves the residual in two rounds or the total cost exceeds `total_ratio` times the cheapest's.
-                     On large problems with friction, sweeps do not run, `newton` begins with `turn_factorisations`,
-                     which its last `turn_extension` extend while they halve the residual, and continues its own plan;
-                     `admm` starts from the best impulse. After the last round `newton` uses the rest
+                     On large problems with friction, sweeps do not run, `newton` begins with `turn_factorisations`, or
+                     `cheap_turn`, which its last `turn_extension` extend while they halve the residual, and continues
+                     its own plan; `admm` starts from the best impulse. After the last round `newton` uses the rest
     end              a search for a certificate by a linear program, if none was tried before (`certify.py`)
 
 Linear problems given by a matrix, and others with a narrow band as A, start with `direct`. A program with a singular P

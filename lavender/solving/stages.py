@@ -252,7 +252,8 @@ class DecisionTree:
         self.remaining_cost = DECISIONS.total_ratio * self.unit
         times = DECISIONS.budget_ratio
         if self.is_large:
-            times = DECISIONS.turn_factorisations / DECISIONS.factorisations
+            turn = DECISIONS.cheap_turn if self.has_cheap_newton else DECISIONS.turn_factorisations
+            times = turn / DECISIONS.factorisations
         for k in count():
             before = self.best
             for stage in self.iterate_one_round(times * 2.0**k):
