@@ -1,8 +1,8 @@
 """Conjugate gradients on (I + K^T E K) t = b over bodies, with the 6 x 6 blocks of the bodies as preconditioner.
 
 K (m, 6 n_bodies) is stored by rows, E is diagonal. A solve starts from the solution of the solve before and ends when its
-residual is at most RESIDUAL_REDUCTION of the residual of that start, so that the accuracy follows the changes of b. No factor
-is stored: an iteration takes two multiply-adds per entry of K.
+residual is at most 0.05 of the residual of that start (0.03 to 0.1 cost about the same), so that the accuracy follows the
+changes of b. No factor is stored: an iteration takes two multiply-adds per entry of K.
 """
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t
@@ -28,11 +28,6 @@ cdef struct body_solve_t:
     double* direction           # (n)
     double* product             # (n)
     double iterations           # number of iterations of all solves
-
-
-cdef inline double residual_reduction() noexcept nogil:
-    """Return the residual of a solve relative to the residual of its start. Values from 0.03 to 0.1 cost about the same."""
-    return 0.05
 
 
 cdef inline int64_t body_solve_workspace_size(int64_t n) noexcept nogil:
@@ -128,7 +123,7 @@ cdef inline void solve_body_system(body_solve_t* f, const double* b) noexcept no
     for i in range(f.n):
         f.residual[i] = b[i] - f.product[i]
     size = sqrt(dot(f.residual, f.residual, f.n))
-    limit = residual_reduction() * size
+    limit = 0.05 * size
     beta = 1e-13 * sqrt(dot(b, b, f.n))                 # Rounding errors prevent a smaller residual.
     limit = beta if beta > limit else limit
     for k in range(MAX_BODY_ITERATIONS):

@@ -15,7 +15,7 @@ With w = A lam - b [m/s] and d = diag(A) [1/kg]:
 Every function in this file is inline, allocates nothing and calls no library function except sqrt. The sweeps, the judge,
 the engine and the WebAssembly build all use these functions.
 """
-from libc.math cimport fabs, sqrt
+from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block_types cimport (CONE, MAX_FRICTION_COMPONENTS, blocks_t, get_disk_component, is_disk_friction_contact,
@@ -95,25 +95,9 @@ cdef inline void compute_tangent_error(const double* lam, const double* w, doubl
             e[1] = lam[1] - r * y
 
 
-cdef inline void compute_coulomb_error(const double* lam, const double* w, const double* d, const friction_components_t* q,
-                                       double* e) noexcept nogil:
-    """Compute the error (6) of a contact under Coulomb's law."""
-    cdef double normal_impulse = lam[0] if lam[0] > 0.0 else 0.0, inf = 1.0 / 0.0
-    cdef int32_t g, j
-    e[0] = compute_row_error(lam[0], w[0], d[0], 0.0, inf)
-    for g in range(q.n):
-        j = q.first[g]
-        compute_tangent_error(lam + j, w + j, d[j], q.friction_coefficient[g] * normal_impulse, q.size[g], e + j)
-
-
 cdef inline double scale_projection_argument(double lam, double w, double d, double r) noexcept nogil:
     """Return r (lam - w / d) with r = sqrt(d), one entry of the vector that (7) projects."""
     return r * (lam - w / d)
-
-
-cdef inline double scale_to_radius(double bound, double size) noexcept nogil:
-    """Return bound / size for a vector longer than its bound; 0 if its size underflowed to 0."""
-    return bound / size if size > 0.0 else 0.0
 
 
 cdef inline double project_cone_normal(const int32_t n, const double* a, const double* t, double yn) noexcept nogil:
@@ -161,7 +145,8 @@ cdef inline void compute_cone_error(const double* lam, const double* w, const do
     e[0] = w[0] / d[0] if s == yn else lam[0] - s / rn
     for g in range(q.n):
         j, end = q.first[g], q.first[g] + q.size[g]
-        f = scale_to_radius(a[g] * s, t[g] * sqrt(d[j]))
+        r = t[g] * sqrt(d[j])
+        f = a[g] * s / r if r > 0.0 else 0.0            # Its size may underflow to 0.
         for i in range(j, end):
             e[i] = lam[i] - f * y[i] if t[g] > a[g] * s else w[i] / d[i]
     if total != total:
@@ -267,11 +252,16 @@ cdef inline void compute_round_cone_error(const double* lam, const double* w, co
 
 cdef inline void compute_contact_error(int32_t law, const double* lam, const double* w, const double* d,
                                        const friction_components_t* q, double* e) noexcept nogil:
-    """Compute the error e of one contact with friction components q under `law`."""
+    """Compute the error e of one contact with friction components q, under `law` by (6) or (7)."""
+    cdef double normal_impulse = lam[0] if lam[0] > 0.0 else 0.0
+    cdef int32_t g, j
     if law == CONE:
         compute_cone_error(lam, w, d, q, e)
-    else:
-        compute_coulomb_error(lam, w, d, q, e)
+        return
+    e[0] = compute_row_error(lam[0], w[0], d[0], 0.0, 1.0 / 0.0)
+    for g in range(q.n):
+        j = q.first[g]
+        compute_tangent_error(lam + j, w + j, d[j], q.friction_coefficient[g] * normal_impulse, q.size[g], e + j)
 
 
 cdef inline void compute_block_error(const blocks_t* p, int32_t i, const double* lam, const double* w,

@@ -63,18 +63,9 @@ cdef struct friction_components_t:      # friction components of one contact
     double friction_coefficient[MAX_FRICTION_COMPONENTS]    # a_g of (1)
 
 
-cdef enum:
-    N_FRICTION_ARRAYS = 3       # mu, patch_radius, rolling
-
-
 cdef inline void bind_friction_arrays(blocks_t* p, const double* x, Py_ssize_t stride) noexcept nogil:
     """Point mu, patch_radius and rolling of `p` at x, x + stride and x + 2 stride."""
     p.mu, p.patch_radius, p.rolling = x, x + stride, x + 2 * stride
-
-
-cdef inline void get_friction_arrays(const blocks_t* p, const double** x) noexcept nogil:
-    """Write the addresses of mu, patch_radius and rolling of `p` into x (N_FRICTION_ARRAYS)."""
-    x[0], x[1], x[2] = p.mu, p.patch_radius, p.rolling
 
 
 cdef inline void offset_block_arrays(blocks_t* p, const blocks_t* all, int32_t i) noexcept nogil:

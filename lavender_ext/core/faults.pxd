@@ -8,8 +8,8 @@ from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.block_types cimport CONTACT_BOX, ROUND, ROW, blocks_t, allows_rows
 from lavender_ext.core.validate cimport (find_invalid_magnitude, find_invalid_number, has_invalid_number,
-                                         is_orthonormal_pair, is_valid_magnitude, is_valid_number,
-                                         is_zero_or_definite_inertia, min_magnitude, norm_inf)
+                                         is_valid_magnitude, is_valid_number, is_zero_or_definite_inertia, min_magnitude,
+                                         norm_inf)
 from lavender_ext.core.view cimport rows_t
 
 
@@ -151,9 +151,10 @@ cdef inline int32_t find_pair_fault(const int32_t* pair, int64_t k, int32_t n, b
 cdef inline double measure_frame_error(const double* n, const double* t) noexcept nogil:
     """Return the largest deviation of |n| and |t| from 1 and of n.t from 0, or 0 if it is within rounding."""
     cdef double nn = n[0] * n[0] + n[1] * n[1] + n[2] * n[2], tt = t[0] * t[0] + t[1] * t[1] + t[2] * t[2]
-    if is_orthonormal_pair(n, t, 5e-10):
+    cdef double nt = fabs(n[0] * t[0] + n[1] * t[1] + n[2] * t[2])
+    if fabs(nn - 1.0) <= 5e-10 and fabs(tt - 1.0) <= 5e-10 and nt <= 5e-10:
         return 0.0
-    return max(max(fabs(sqrt(nn) - 1.0), fabs(sqrt(tt) - 1.0)), fabs(n[0] * t[0] + n[1] * t[1] + n[2] * t[2]))
+    return max(max(fabs(sqrt(nn) - 1.0), fabs(sqrt(tt) - 1.0)), nt)
 
 
 cdef inline void orthonormalise_frame(double* n, double* t) noexcept nogil:

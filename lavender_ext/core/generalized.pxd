@@ -147,7 +147,8 @@ cdef inline void add_panel_transpose_product(const generalized_t* g, int32_t pan
             gathered[a] = x[cols[a]]
         for i in range(first, end):
             if lam[i] != 0.0:
-                axpy_add(gathered, y, lam[i], nc)
+                for a in range(nc):
+                    gathered[a] += y[a] * lam[i]
             y += nc
         for a in range(nc):
             x[cols[a]] = gathered[a]
@@ -157,13 +158,6 @@ cdef inline void add_panel_transpose_product(const generalized_t* g, int32_t pan
             for a in range(nc):
                 x[cols[a]] += y[a] * lam[i]
         y += nc
-
-
-cdef inline void axpy_add(double* x, const double* y, double z, int32_t n) noexcept nogil:
-    """Add z y to x (n)."""
-    cdef int32_t i
-    for i in range(n):
-        x[i] += y[i] * z
 
 
 cdef inline void add_abs_panel_transpose_product(const generalized_t* g, int32_t panel, const double* lam,

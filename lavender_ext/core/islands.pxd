@@ -24,19 +24,6 @@ cdef inline int32_t merge_components(int32_t* parent, int32_t i, int32_t j) noex
     return i != j
 
 
-cdef inline int32_t number_components(int32_t k, int32_t* parent, int32_t* label) noexcept nogil:
-    """Write the component of each of k blocks into label (k); return the number of components."""
-    cdef int32_t i, root, count = 0
-    for i in range(k):
-        root = find_root(parent, i)
-        if root == i:
-            label[i] = count
-            count += 1
-        else:
-            label[i] = label[root]
-    return count
-
-
 cdef inline int32_t merge_with_first_at(int32_t* first, int32_t place, int32_t i, int32_t* parent) noexcept nogil:
     """Connect block i with the first block seen at `place`; return 1 if that merged two components."""
     if first[place] < 0:
@@ -119,7 +106,13 @@ cdef inline int32_t find_islands(const view_t* v, int32_t* index, islands_t* out
         count = connect_blocks_by_matrix(&v.p, v.a, parent, parent + k)
     if count == 1:
         return 1
-    number_components(k, parent, label)
+    count = 0
+    for i in range(k):
+        if find_root(parent, i) == i:
+            label[i] = count
+            count += 1
+        else:
+            label[i] = label[find_root(parent, i)]
     sort_blocks_by_level(k, label, count, ptr, order)
     out.n, out.label, out.ptr, out.order = count, label, ptr, order
     out.terms = NULL

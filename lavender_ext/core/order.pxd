@@ -23,7 +23,6 @@ cdef inline uint64_t next_random(uint64_t* state) noexcept nogil:
     return z ^ (z >> 31)
 
 
-cdef void shuffle_blocks(int32_t* order, int32_t first, int32_t end, uint64_t* rng) noexcept nogil
 cdef void reverse_blocks(int32_t* order, int32_t first, int32_t end) noexcept nogil
 cdef void update_sweep_order(int32_t mode, int32_t first_sweep, int32_t* order, int32_t first, int32_t end,
                              uint64_t* rng) noexcept nogil

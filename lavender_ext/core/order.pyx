@@ -6,17 +6,6 @@ import numpy as np
 from lavender_ext.core.order cimport RANDOM, SYMMETRIC, next_random
 
 
-cdef void shuffle_blocks(int32_t* order, int32_t first, int32_t end, uint64_t* rng) noexcept nogil:
-    """Shuffle order[first:end] (Fisher-Yates). A random index below n is r n / 2^32, rounded down, with 32 random bits r."""
-    cdef int32_t i = end - 1, j, t
-    while i > first:
-        j = first + <int32_t>(((next_random(rng) >> 32) * <uint64_t>(i - first + 1)) >> 32)
-        t = order[i]
-        order[i] = order[j]
-        order[j] = t
-        i -= 1
-
-
 cdef void reverse_blocks(int32_t* order, int32_t first, int32_t end) noexcept nogil:
     """Reverse order[first:end]."""
     cdef int32_t i = first, j = end - 1, t
@@ -31,8 +20,14 @@ cdef void reverse_blocks(int32_t* order, int32_t first, int32_t end) noexcept no
 cdef void update_sweep_order(int32_t mode, int32_t first_sweep, int32_t* order, int32_t first, int32_t end,
                              uint64_t* rng) noexcept nogil:
     """Update order[first:end] in place for the next sweep, as `mode` requires; first_sweep is 1 before the first sweep."""
+    cdef int32_t i, j, t
     if mode == RANDOM:
-        shuffle_blocks(order, first, end, rng)
+        # Fisher-Yates. A random index below n is r n / 2^32, rounded down, with 32 random bits r.
+        for i in range(end - 1, first, -1):
+            j = first + <int32_t>(((next_random(rng) >> 32) * <uint64_t>(i - first + 1)) >> 32)
+            t = order[i]
+            order[i] = order[j]
+            order[j] = t
     elif mode == SYMMETRIC and not first_sweep:
         reverse_blocks(order, first, end)
 

@@ -18,11 +18,6 @@ cdef enum:
     MIN_COLUMNS_FOR_FOUR = 16   # Four rows are subtracted at once if they have at least this many columns, otherwise two.
 
 
-cdef inline double min_mass_pivot_ratio() noexcept nogil:
-    """Return the fraction of M_kk that a pivot of a mass matrix must exceed: four roundings of M_kk."""
-    return 8.8817841970012523e-16
-
-
 cdef inline void sort_row_columns(int32_t k, const int32_t* mark, int32_t count, int32_t* cols) noexcept nogil:
     """Sort cols (count), the columns of row k, in ascending order; mark[j] is k for these columns and no other j < k.
 
@@ -128,7 +123,8 @@ cdef inline int32_t factor_tree(int32_t n, const int32_t* mptr, const int32_t* m
                 while lidx[at] != j:
                     at += 1
                 lval[at] = mval[q]
-    return factor_tree_matrix(n, lptr, lidx, lval, pivot, inv_pivot, min_mass_pivot_ratio(), NULL)
+    # A pivot must exceed four roundings of M_kk.
+    return factor_tree_matrix(n, lptr, lidx, lval, pivot, inv_pivot, 8.8817841970012523e-16, NULL)
 
 
 cdef inline int32_t factor_tree_matrix(int32_t n, const int32_t* lptr, const int32_t* lidx, double* lval, double* pivot,
@@ -153,28 +149,17 @@ cdef inline int32_t factor_tree_matrix(int32_t n, const int32_t* lptr, const int
         # rows of the chain among each other
         for t in range(s):
             eliminate_chain_rows(lptr, lidx, lval, pivot, inv_pivot, k, k - t, count - t, row, t)
-            if not invert_pivot(pivot, inv_pivot, k - t, min_pivot):
+            if not (pivot[k - t] > min_pivot * inv_pivot[k - t] and pivot[k - t] >= min_magnitude()):
                 return k - t
+            inv_pivot[k - t] = 1.0 / pivot[k - t]           # It has held M_kk until now.
         # the other rows
         for a in range(count - s, -1, -1):
             eliminate_chain_rows(lptr, lidx, lval, pivot, inv_pivot, k, lidx[first + a], a, row, s)
-        if deadline != NULL and has_passed(deadline, 0.5 * s * count * (entry_cost() + sparse_velocity_cost() * count)):
+        # 2.92 ns: a multiply-add of a factor over velocities, "sparse velocities" of the rates.
+        if deadline != NULL and has_passed(deadline, 0.5 * s * count * (entry_cost() + 2.92 * count)):
             return k
         k -= s
     return -1
-
-
-cdef inline double sparse_velocity_cost() noexcept nogil:
-    """Return the time [ns] of a multiply-add of a factor over velocities: "sparse velocities" of the rates."""
-    return 2.92
-
-
-cdef inline bint invert_pivot(const double* pivot, double* inv_pivot, int32_t k, double min_pivot) noexcept nogil:
-    """Replace inv_pivot[k], which holds M_kk, by 1 / D_k; return False if the pivot is too small."""
-    if not (pivot[k] > min_pivot * inv_pivot[k] and pivot[k] >= min_magnitude()):
-        return False
-    inv_pivot[k] = 1.0 / pivot[k]
-    return True
 
 
 cdef inline void eliminate_chain_rows(const int32_t* lptr, const int32_t* lidx, double* lval, double* pivot,

@@ -7,7 +7,7 @@ Other units bring any practical problem into this range without changing its sol
 numbers, and their squares, do not overflow float64. A row of A counts as empty if its largest entry is below 1e-60.
 """
 from libc.math cimport fabs
-from libc.stdint cimport int32_t, int64_t, uint64_t
+from libc.stdint cimport int64_t, uint64_t
 from libc.string cimport memcpy
 
 
@@ -101,13 +101,6 @@ cdef inline bint all_finite(const double* x, int64_t n) noexcept nogil:
         s += 0.0 * x[i]
         i += 1
     return (s + t) + (u + v) == 0.0
-
-
-cdef inline bint is_orthonormal_pair(const double* n, const double* t, double tolerance) noexcept nogil:
-    """Return whether n.n and t.t are 1 and n.t is 0, all within `tolerance`."""
-    cdef double nn = n[0] * n[0] + n[1] * n[1] + n[2] * n[2], tt = t[0] * t[0] + t[1] * t[1] + t[2] * t[2]
-    return (fabs(nn - 1.0) <= tolerance and fabs(tt - 1.0) <= tolerance
-            and fabs(n[0] * t[0] + n[1] * t[1] + n[2] * t[2]) <= tolerance)
 
 
 cdef inline bint is_zero_or_definite_inertia(const double* x, double skew, double shift, double pivot) noexcept nogil:

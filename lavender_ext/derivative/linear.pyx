@@ -75,25 +75,19 @@ cdef void multiply_jacobian_inverse_mass(const linearised_t* a, double* f, doubl
                 out[i] = whitened_row_dot(g, b, i, f)
 
 
-cdef void add_matrix_transpose_product(const view_t* v, const double* x, double* out) noexcept nogil:
-    """Add A^T x of a matrix to out (m)."""
-    cdef int32_t i, k
-    for i in range(v.p.n_rows):
-        for k in range(v.a.indptr[i], v.a.indptr[i + 1]):
-            out[v.a.indices[k]] += v.a.data[k] * x[i]
-
-
 cdef public void lav_adjoint(const linearised_t* a, const double* y, const double* c, const double* x, double* q, double* s,
                              double* f) noexcept nogil:
     """Compute q, s and f of (1) or (2), with q = 0 on rows outside G; y (n), c (m) and x (m) may be NULL, for 0."""
     cdef const view_t* v = &a.v
-    cdef int32_t i, m = v.p.n_rows
+    cdef int32_t i, k, m = v.p.n_rows
     cdef const double* soft = NULL
     if v.a == NULL:
         soft = v.g.compliance if v.g != NULL else v.r.compliance
     memset(q, 0, m * sizeof(double))
     if v.a != NULL and x != NULL:
-        add_matrix_transpose_product(v, x, q)
+        for i in range(m):                              # A^T x of a matrix
+            for k in range(v.a.indptr[i], v.a.indptr[i + 1]):
+                q[v.a.indices[k]] += v.a.data[k] * x[i]
     elif y != NULL or x != NULL:
         memset(f, 0, a.n * sizeof(double))
         if x != NULL:

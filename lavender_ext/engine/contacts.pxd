@@ -135,20 +135,6 @@ cdef inline void warm_start_contact(engine_t* e, int32_t c, int32_t entry, int32
         lam[nt + n_angular] = dot3(e.cache_roll + 3 * entry, t2)
 
 
-cdef inline double get_pair_restitution(const engine_t* e, int32_t a, int32_t b) noexcept nogil:
-    """Return the restitution of two bodies, the larger of their values."""
-    return e.restitution[a] if e.restitution[a] > e.restitution[b] else e.restitution[b]
-
-
-cdef inline double initial_normal_velocity(const engine_t* e, int32_t a, int32_t b, int32_t c) noexcept nogil:
-    """Return a contact's relative normal velocity [m/s] before the substep; static bodies are at rest."""
-    cdef double u[3]
-    cdef double s[3]
-    compute_relative_velocity(e.v, a if e.dyn[a] >= 0 else -1, b if e.dyn[b] >= 0 else -1, e.arm_a + 3 * c,
-                      e.arm_b + 3 * c, u, s)
-    return dot3(e.normal + 3 * c, u)
-
-
 cdef inline void rotate_arm_to_body(const engine_t* e, int32_t body, const double* arm, double* out) noexcept nogil:
     """Copy a contact's arm for the cache: in the body's frame for a box, in the world frame for other shapes."""
     if e.kind_of_shape[body] == BOX:
@@ -213,13 +199,18 @@ cdef inline void build_contact(engine_t* e, const rows_t* r, int32_t c, int32_t 
 cdef inline void set_contact_target(engine_t* e, int32_t c, int32_t row, int32_t a, int32_t b, double bounce) noexcept nogil:
     """Set the normal row's target after the warm start; on entry b = -J v*."""
     cdef double h = e.setting[S_H], gap = e.gap[c], target = 0.0, relative_normal_velocity
+    cdef double u[3]
+    cdef double s[3]
     if gap > 0.0:
         if e.impulse[row] > 0.0:                        # (2)
             gap = e.setting[S_BETA] * (gap - e.setting[S_SLOP])
         if gap > 0.0:
             target = -gap / h                           # (1)
     if bounce > 0.0 and e.gap[c] - h * e.b[row] <= 0.0:  # (3)
-        relative_normal_velocity = initial_normal_velocity(e, a, b, c)
+        # The velocity before the substep; static bodies are at rest.
+        compute_relative_velocity(e.v, a if e.dyn[a] >= 0 else -1, b if e.dyn[b] >= 0 else -1, e.arm_a + 3 * c, e.arm_b + 3 * c,
+                                  u, s)
+        relative_normal_velocity = dot3(e.normal + 3 * c, u)
         if relative_normal_velocity < -e.setting[S_BOUNCE] and -bounce * relative_normal_velocity > target:
             target = -bounce * relative_normal_velocity
     e.target[row] = target
@@ -253,7 +244,7 @@ cdef inline int32_t build_contacts(engine_t* e, const rows_t* r) noexcept nogil:
             c += m.n                                    # Only count contacts beyond the capacity.
             continue
         mu = sqrt(e.friction[a] * e.friction[b])
-        bounce = get_pair_restitution(e, a, b)
+        bounce = e.restitution[a] if e.restitution[a] > e.restitution[b] else e.restitution[b]
         patch = e.patch[a] if e.patch[a] < e.patch[b] else e.patch[b]
         nt = 2 if mu > 0.0 else 0
         n_angular = 0 if not mu > 0.0 else (1 if patch > 0.0 else 0) + (2 if e.setting[S_ROLLING] > 0.0 else 0)

@@ -21,7 +21,7 @@ from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport clip, project_normal_update
-from lavender_ext.core.rows cimport (cross, dot3, apply_joint_impulse, joint_row_velocity, apply_impulse_to_bodies,
+from lavender_ext.core.rows cimport (dot3, apply_joint_impulse, joint_row_velocity, apply_impulse_to_bodies,
                                      compute_relative_velocity)
 from lavender_ext.engine.arrays cimport (H_CONTACTS, H_POSITION_ITERATIONS, H_PROJECTED, J_HERTZ, N_DYNAMIC,
                                          N_JOINT, N_JOINT_REAL, N_JOINT_ROW, S_BETA, S_DEPTH, S_H,
@@ -45,12 +45,6 @@ cdef inline double contact_normal_velocity(const engine_t* e, const double* v, i
     compute_relative_velocity(v, e.contact_body[2 * c], e.contact_body[2 * c + 1], e.arm_a + 3 * c, e.arm_b + 3 * c,
                       u, s)
     return dot3(e.normal + 3 * c, u)
-
-
-cdef inline void apply_contact_impulse(const engine_t* e, double* v, int32_t c, const double* impulse) noexcept nogil:
-    """Apply an impulse (3) [N s] at a contact to the velocities v (nd, 6)."""
-    apply_impulse_to_bodies(v, e.contact_body[2 * c], e.contact_body[2 * c + 1], e.inv_mass, e.inv_inertia, e.arm_a + 3 * c,
-                e.arm_b + 3 * c, impulse, NULL)
 
 
 cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
@@ -121,7 +115,8 @@ cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
                 continue
             e.push[mj + c] = new_multiplier
             scale3(change, e.normal + 3 * c, impulse)
-            apply_contact_impulse(e, e.shift, c, impulse)
+            apply_impulse_to_bodies(e.shift, e.contact_body[2 * c], e.contact_body[2 * c + 1], e.inv_mass, e.inv_inertia,
+                                    e.arm_a + 3 * c, e.arm_b + 3 * c, impulse, NULL)
         if slop > 0.0 or sweep < n_sweeps:
             continue
         # (3)

@@ -85,16 +85,6 @@ cdef inline void measure_contact_errors(const engine_t* e, double* residual, dou
     violation[0] = max_violation
 
 
-cdef inline void apply_warm_start(engine_t* e, const blocks_t* p, const rows_t* r) noexcept nogil:
-    """Set dv = M^-1 J^T lam, or 0 without warm starting."""
-    cdef int32_t i
-    if e.head[H_WARM_START]:
-        compute_velocity_change(p, r, e.impulse, e.dv)
-        return
-    for i in range(6 * e.size[N_DYNAMIC]):
-        e.dv[i] = 0.0
-
-
 cdef inline void set_sweep_order_of_blocks(engine_t* e) noexcept nogil:
     """Write the sweep order of all blocks to e.order, as computed by lavender.ordering: joints, then contacts."""
     cdef int32_t kj = e.size[N_JOINT], n = kj + e.head[H_CONTACTS], nd = e.size[N_DYNAMIC]
@@ -150,36 +140,31 @@ cdef void sweep_joints_then_contacts(engine_t* e, const blocks_t* p, const rows_
             record_sweep_error(e, p, r, curve + 2 * (s + 1), scratch)
 
 
-cdef inline int32_t sweep_packed_blocks(engine_t* e, const blocks_t* p, const rows_t* r, int32_t sweeps,
-                                        double* workspace) noexcept nogil:
-    """Sweep over packed blocks with the same bits; return 0 if there are too few blocks or the order changes."""
-    if e.head[H_ORDER] == SYMMETRICALLY or e.head[H_ORDER] == AT_RANDOM:
-        return 0
-    return sweep_packed(p, r, e.order, sweeps, workspace, e.impulse, e.dv)
-
-
-cdef inline void run_velocity_sweeps(engine_t* e, const blocks_t* p, const rows_t* r, int32_t sweeps, double* workspace,
-                                     double* curve, double* scratch) noexcept nogil:
-    """Run the sweeps in the order of H_ORDER, over packed blocks if that pays."""
-    set_sweep_order_of_blocks(e)
-    if workspace == NULL or sweeps < MIN_PACKED_SWEEPS or not sweep_packed_blocks(e, p, r, sweeps, workspace):
-        sweep_joints_then_contacts(e, p, r, sweeps, curve, scratch)
-
-
 cdef inline void solve_substep(engine_t* e, int32_t sweeps, double* workspace, double* curve, double* scratch) noexcept nogil:
     """Solve the substep's velocity problem by sweeps; sweeps = 0: warm start and its error only."""
     cdef blocks_t p
     cdef rows_t r
     cdef double* out = e.setting + S_OUT
+    cdef int32_t i
+    cdef bint packs = e.head[H_ORDER] != SYMMETRICALLY and e.head[H_ORDER] != AT_RANDOM     # The order does not change.
     bind_substep_problem(e, &p, &r)
-    # warm start and error before the first sweep
-    apply_warm_start(e, &p, &r)
+    # warm start, and error before the first sweep
+    if e.head[H_WARM_START]:
+        compute_velocity_change(&p, &r, e.impulse, e.dv)
+    else:
+        for i in range(6 * e.size[N_DYNAMIC]):
+            e.dv[i] = 0.0
     measure_contact_errors(e, out + 4, out + 6)
     if curve != NULL:
         record_sweep_error(e, &p, &r, curve, scratch)
     if not sweeps:
         return
-    run_velocity_sweeps(e, &p, &r, e.head[H_ITERATIONS], workspace, curve, scratch)
+    # sweeps, over packed blocks if that pays, with the same bits
+    set_sweep_order_of_blocks(e)
+    sweeps = e.head[H_ITERATIONS]
+    packs = packs and workspace != NULL and sweeps >= MIN_PACKED_SWEEPS
+    if not packs or not sweep_packed(&p, &r, e.order, sweeps, workspace, e.impulse, e.dv):
+        sweep_joints_then_contacts(e, &p, &r, sweeps, curve, scratch)
     measure_contact_errors(e, out + 5, out + 7)
 
 

@@ -118,11 +118,6 @@ cdef inline void factor_band_ldl_columns(int32_t begin, int32_t end, int32_t wid
             axpy_subtract(last - 1, x[i] * inv, col + 1, x + i + 1)
 
 
-cdef inline double band_work_cost() noexcept nogil:
-    """Return the time [ns] of a column of a band divided by its squared height: "band work" of the rates."""
-    return 0.4
-
-
 cdef inline int32_t full_columns(int32_t n, int32_t width) noexcept nogil:
     """Return the number of columns that have all `width` rows, which come first; 0 if width is 0."""
     return n - width + 1 if n >= width > 0 else 0
@@ -132,7 +127,7 @@ cdef inline void factor_band_ldl_before_deadline(int32_t n, int32_t width, doubl
                                                  double* x, pivots_t* out, deadline_t* deadline) noexcept nogil:
     """Factor the columns of full height by (1) in pieces, until the deadline; the pivots after it count as small."""
     cdef int32_t i = 0, end, full = full_columns(n, width)
-    cdef double cost = band_work_cost() * width * width
+    cdef double cost = 0.4 * width * width              # ns for a column: "band work" of the rates
     cdef int32_t columns = <int32_t>max(1.0, reading_interval() / cost)
     while i < full:
         end = i + columns if i + columns <= full else full

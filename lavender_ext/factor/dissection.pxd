@@ -36,11 +36,6 @@ cdef struct dissection_t:
     int32_t* separator          # (n) list of separating vertices
 
 
-cdef inline double max_half() noexcept nogil:
-    """Return the largest fraction of the vertices in one half."""
-    return 0.58
-
-
 cdef inline int32_t absolute_difference(int32_t i, int32_t j) noexcept nogil:
     """Return |i - j|."""
     return i - j if i > j else j - i
@@ -151,7 +146,7 @@ cdef inline bint refine_separator(const dissection_t* g, int32_t begin, int32_t 
         if g.part[v] == SEPARATOR:
             g.separator[count] = v
             count += 1
-    limit = <int32_t>(max_half() * (end - begin))
+    limit = <int32_t>(0.58 * (end - begin))             # largest number of vertices in one half
     smallest, difference = size[2], absolute_difference(size[0], size[1])
     for k in range(2 * smallest + 20):  # no-cython-lint
         chosen, half, best_gain = -1, 0, 0

@@ -12,15 +12,6 @@ from lavender_ext.factor.dissection cimport order_by_dissection
 from lavender_ext.factor.symbolic cimport apply_postorder, compute_block_elimination_tree
 
 
-cdef inline double min_dissection_work() noexcept nogil:
-    """Return the multiply-adds of a factor, in products of blocks, from which on nested dissection is tried.
-
-    With blocks of 6 rows these are 1.5e8 multiply-adds, which take 17 ms. Nested dissection takes 4 ms for such a pile of 512
-    bodies, and saves 0.1 of the work; for 1,000, 4,096 and 8,000 bodies it saves 0.26, 0.53 and 0.64.
-    """
-    return 7e5
-
-
 cdef inline double count_block_products(int32_t n, const int32_t* nptr, const int32_t* nind, int32_t* scratch) noexcept nogil:
     """Return the number of products of blocks in the factor of a lower pattern; scratch has 4 n entries."""
     cdef int32_t i
@@ -59,7 +50,9 @@ cdef inline void order_graph(int32_t n, const int32_t* ptr, const int32_t* near,
     minimum_degree_order(n, size, ptr[n] + ptr[n] // 4 + n, lists, integers, outside, head, order)
     apply_postorder(n, ptr, near, order, rank, nptr, nind, parent, integers)
     work = count_block_products(n, nptr, nind, scratch)
-    if work < min_dissection_work():
+    # 7e5 products of blocks of 6 rows are 1.5e8 multiply-adds, which take 17 ms. Nested dissection takes 4 ms for such a pile of
+    # 512 bodies, and saves 0.1 of the work; for 1,000, 4,096 and 8,000 bodies it saves 0.26, 0.53 and 0.64.
+    if work < 7e5:
         return
     memcpy(scratch + 12 * n, order, n * sizeof(int32_t))
     order_by_dissection(n, ptr, near, rank, scratch, order)

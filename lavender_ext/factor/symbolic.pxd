@@ -6,11 +6,6 @@ cdef enum:
     NARROW_SUPERNODE_COLUMNS = 6    # Up to this many columns (or blocks), a supernode may have four times as many stored zeros.
 
 
-cdef inline double max_zero_fraction() noexcept nogil:
-    """Return the largest fraction of a panel that may be zeros. With more zeros, products cost more than larger panels save."""
-    return 0.1
-
-
 cdef inline void compute_block_elimination_tree(int32_t n, const int32_t* nptr, const int32_t* nind, int32_t* parent,
                                                 int32_t* mark, int32_t* row_count, int32_t* column_count) noexcept nogil:
     """Compute the elimination tree of a lower pattern, and the number of off-diagonal entries in each row and column of L."""
@@ -130,7 +125,7 @@ cdef inline int32_t find_supernodes(int32_t n, const int32_t* lptr, const int32_
     """Merge adjacent vertices, each the parent of its predecessor, to supernodes; return the number of supernodes.
 
     first (n + 1) receives the first vertex of each supernode. A vertex has size (n) columns, or one if that is NULL. It joins the
-    supernode before it if the fraction of stored zeros stays within `max_zero_fraction`.
+    supernode before it if the fraction of stored zeros stays within 0.1: with more, products cost more than larger panels save.
     """
     cdef int32_t j, k = 0, q
     cdef double width = 0.0, below, before = 0.0, zeros = 0.0, more_zeros, entries, own
@@ -145,7 +140,7 @@ cdef inline int32_t find_supernodes(int32_t n, const int32_t* lptr, const int32_
             # Every column of the supernode gets the rows below j. The supernode's own rows are stored already.
             more_zeros = zeros + width * (below + own - before)
             entries = 0.5 * (width + own) * (width + own + 1.0) + (width + own) * below
-            if more_zeros <= (4.0 if width < NARROW_SUPERNODE_COLUMNS else 1.0) * max_zero_fraction() * entries:
+            if more_zeros <= (4.0 if width < NARROW_SUPERNODE_COLUMNS else 1.0) * 0.1 * entries:
                 zeros = more_zeros
                 width += own
                 before = below

@@ -119,9 +119,13 @@ cdef inline void judge_impulse_over_bodies(const blocks_t* p, const rows_t* r, c
 # -- generalised coordinates ---------------------------------------------------------------------------
 
 
-cdef inline const double* bound_generalized_terms(const blocks_t* p, const generalized_t* g, const double* lam,
-                                                  const double* extra, double* x) noexcept nogil:
-    """Return |Y| |Y|^T |lam| + c |lam| + extra (m), an upper bound of |A| |lam|, inside x (n + m); extra is (m) or NULL."""
+cdef inline void score_generalized_slack(const blocks_t* p, const generalized_t* g, const double* lam, const double* w,
+                                         double* e, double* x, const double* extra, score_t* out) noexcept nogil:
+    """Compute errors e from the slack w, their norms and floors.
+
+    The floors follow from |Y| |Y|^T |lam| + c |lam| + extra, an upper bound of |A| |lam|; extra is (m) or NULL, x (n + m) is
+    scratch.
+    """
     cdef int32_t i
     cdef double* size = x + g.n
     for i in range(g.n):
@@ -135,13 +139,7 @@ cdef inline const double* bound_generalized_terms(const blocks_t* p, const gener
     if extra != NULL:
         for i in range(p.n_rows):
             size[i] += extra[i]
-    return size
-
-
-cdef inline void score_generalized_slack(const blocks_t* p, const generalized_t* g, const double* lam, const double* w,
-                                         double* e, double* x, const double* extra, score_t* out) noexcept nogil:
-    """Compute errors e from the slack w, their norms and floors; extra as in `bound_generalized_terms`, x (n + m) is scratch."""
-    score_all_blocks(p, lam, w, e, bound_generalized_terms(p, g, lam, extra, x), out)
+    score_all_blocks(p, lam, w, e, size, out)
 
 
 cdef inline void judge_impulse_over_generalized(const blocks_t* p, const generalized_t* g, const double* lam, double* w,

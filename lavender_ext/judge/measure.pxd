@@ -7,7 +7,7 @@ from lavender_ext.core.problem cimport Data
 from lavender_ext.core.start cimport clip_zero_to_row_bounds
 from lavender_ext.core.view cimport generalized_t, view_t
 from lavender_ext.judge.best cimport count_islands
-from lavender_ext.judge.score cimport zero_if_at_floor, floor_hides_residual, relative_residual, score_t
+from lavender_ext.judge.score cimport floor_hides_residual, is_at_floor, relative_residual, score_t
 
 
 cdef inline int64_t count_judge_scratch(const view_t* v) noexcept nogil:
@@ -86,7 +86,7 @@ cdef inline double residual_above_floor(const score_t* s, double now, double flo
 
     now and floor are the results of `relative_residual_of_score` and `relative_floor_of_score`.
     """
-    return s.above_floor if s.relative >= 0.0 else zero_if_at_floor(now, floor)
+    return s.above_floor if s.relative >= 0.0 else 0.0 if is_at_floor(now, floor) else now
 
 
 cdef class Judged:

@@ -188,18 +188,6 @@ def judge_impulse(Data p, const double[::1] lam, double[::1] w, double[::1] e, b
     return s.energy, s.velocity, now, above
 
 
-cdef double estimate_factor_loss_of_pass(Data p, impulse, both) except -1.0:
-    """Return the possible error of the slack in `both` due to the factor of M, as a relative residual."""
-    cdef const double[::1] lam = impulse, w = both
-    cdef Workspace workspace
-    if p.blocks.n_rows == 0:
-        return 0.0
-    workspace = allocate_bytes(2 * <Py_ssize_t>p.general.n * sizeof(double))
-    return estimate_factor_loss(&p.blocks, &p.general, &lam[0], &w[0], <double*>workspace.at, p.reference_energy,
-                                p.reference_velocity,
-                          0.0)
-
-
 cdef Judged make_judged(Data p, impulse, both, const score_t* s, double relative_, double floor, double float64_relative=NAN):
     """Create the result of a pass over `impulse`, with w and e in `both` (2 m + 1)."""
     cdef Judged judged = Judged.__new__(Judged)
@@ -247,9 +235,15 @@ cdef class Judged:
     @property
     def loss(self):
         """Possible error due to the factor of M, as a relative residual (judge/refine.pxd (2)); 0 after refinement."""
-        if self.known_loss < 0.0:
-            self.known_loss = estimate_factor_loss_of_pass(self.data, self.impulse, self.both)
-        return self.known_loss
+        cdef Data p = self.data
+        cdef const double[::1] lam, w
+        cdef Workspace workspace
+        if self.known_loss < 0.0 and p.blocks.n_rows > 0:
+            lam, w = self.impulse, self.both
+            workspace = allocate_bytes(2 * <Py_ssize_t>p.general.n * sizeof(double))
+            self.known_loss = estimate_factor_loss(&p.blocks, &p.general, &lam[0], &w[0], <double*>workspace.at,
+                                                   p.reference_energy, p.reference_velocity, 0.0)
+        return max(self.known_loss, 0.0)
 
     def refine(self, double tol):
         """Return the refined pass if `tol` or a report requires it (judge/refine.pxd (2)), otherwise self."""

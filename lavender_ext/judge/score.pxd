@@ -65,11 +65,6 @@ cdef inline bint is_at_floor(double relative, double floor) noexcept nogil:
     return relative <= 2.0 * floor and relative <= 1e-5 and not floor_hides_residual(floor)
 
 
-cdef inline double zero_if_at_floor(double relative, double floor) noexcept nogil:
-    """Return 0 if rounding explains a relative residual (`is_at_floor`), otherwise that residual."""
-    return 0.0 if is_at_floor(relative, floor) else relative
-
-
 cdef inline void take_smallest_island_reference(const blocks_t* p, double* energy, double* velocity) noexcept nogil:
     """Replace E0 and V0 of all rows by the smallest of any island, for estimates over all rows that must hold in each island."""
     cdef const double* own

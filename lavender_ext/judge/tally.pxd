@@ -5,8 +5,8 @@ from libc.stdint cimport int32_t
 from lavender_ext.core.block cimport compute_block_error, compute_row_error, euclidean_norm
 from lavender_ext.core.block_types cimport (CONE, blocks_t, get_disk_component, get_row_groups, is_disk_friction_contact,
                                             has_independent_rows, get_friction_components, friction_components_t)
-from lavender_ext.judge.score cimport (zero_if_at_floor, floor_hides_residual, is_at_floor, ratio_to_reference,
-                                       relative_residual, score_t, unit_roundoff)
+from lavender_ext.judge.score cimport (floor_hides_residual, is_at_floor, ratio_to_reference, relative_residual, score_t,
+                                       unit_roundoff)
 
 
 cdef struct tally_t:
@@ -116,26 +116,19 @@ cdef inline void add_block_error(const blocks_t* p, int32_t i, const double* e, 
             add_row_error(p, j + q.first[g], e[j + q.first[g]], s)
 
 
-cdef inline int32_t find_nonfinite_row(const double* e, int32_t m) noexcept nogil:
-    """Return the first row with a non-finite error, or -1."""
-    cdef int32_t i
-    for i in range(m):
-        if not fabs(e[i]) < 1.0 / 0.0:
-            return i
-    return -1
-
-
 cdef inline void write_score_norms(const blocks_t* p, const double* e, const tally_t* s, score_t* out) noexcept nogil:
     """Write the norms of e (m) to the score; the floor entries are not changed."""
+    cdef int32_t k
     out.energy = sqrt(s.energy)
     out.velocity = sqrt(s.fast) if s.fast > 0.0 else 0.0
     out.worst = s.worst
     out.finite = out.energy + out.velocity < 1.0 / 0.0
     if not out.finite:
         out.velocity = 1.0 / 0.0
-        out.worst = find_nonfinite_row(e, p.n_rows)
-        if out.worst < 0:
-            out.worst = s.worst
+        for k in range(p.n_rows):
+            if not fabs(e[k]) < 1.0 / 0.0:
+                out.worst = k
+                break
 
 
 cdef inline double compute_rhs_energy_norm(const blocks_t* p) noexcept nogil:
@@ -234,15 +227,6 @@ cdef inline void add_block_floor(const blocks_t* p, int32_t i, const double* lam
             add_slack_rounding(p, j + k, j, slack_rounding_of_row(p, j + k, x), s)
 
 
-cdef inline int32_t begin_island_scores(const blocks_t* p, score_t* out) noexcept nogil:
-    """Initialise the score before the first `add_island_to_score`; return the number of islands."""
-    if p.islands == NULL:
-        return 1
-    out.relative = out.floor = out.above_floor = 0.0
-    out.island = 0
-    return p.islands.n
-
-
 cdef inline int32_t get_island_block(const blocks_t* p, int32_t a) noexcept nogil:
     """Return the block at index `a` of the list of islands; without islands block a."""
     return p.islands.order[a] if p.islands != NULL else a
@@ -270,20 +254,13 @@ cdef inline double relative_residual_of_island(const blocks_t* p, int32_t island
                relative_residual_of_unmoved_rows(p, p.islands.order, p.islands.ptr[island], p.islands.ptr[island + 1], e))
 
 
-cdef inline double relative_floor_of_island(const blocks_t* p, int32_t island, const floor_t* f) noexcept nogil:
-    """Return the floor of one island as a relative residual."""
-    cdef const double* reference = p.islands.reference + 2 * island
-    if reference[0] < 0.0:
-        return f.own
-    return relative_residual(sqrt(f.energy), sqrt(f.fast), reference[0], reference[1])
-
-
 cdef inline void add_island_to_score(const blocks_t* p, int32_t island, const double* w, const double* e, const tally_t* s,
                                      const floor_t* f, tally_t* total, score_t* out) noexcept nogil:
     """Add the sums of an island to the total and its relative residual to the score; f is NULL without a floor.
 
     If the problem has no list of islands, only the sums are added; the caller computes the relative residual from them.
     """
+    cdef const double* reference
     cdef double now, floor = 0.0
     cdef double check = 0.0                             # This stays 0, or becomes NaN at an infinite or NaN slack.
     cdef int32_t a, i, k
@@ -298,7 +275,8 @@ cdef inline void add_island_to_score(const blocks_t* p, int32_t island, const do
     if check != 0.0:
         now = 1.0 / 0.0
     if f != NULL:
-        floor = relative_floor_of_island(p, island, f)
+        reference = p.islands.reference + 2 * island
+        floor = f.own if reference[0] < 0.0 else relative_residual(sqrt(f.energy), sqrt(f.fast), reference[0], reference[1])
         if floor_hides_residual(floor) and now < floor < 1.0 / 0.0:
             now = floor
         if not is_at_floor(now, floor) and now > out.above_floor:
@@ -319,11 +297,14 @@ cdef inline void score_all_blocks(const blocks_t* p, const double* lam, const do
 
     sizes (m) is an upper bound of |A| |lam|, from which the floors are computed. If it is NULL, the floor entries are not changed.
     """
-    cdef int32_t island, a, i, k, end, n = begin_island_scores(p, out)
+    cdef int32_t island, a, i, k, end
     cdef const int32_t* order = p.islands.order if p.islands != NULL else NULL
     cdef tally_t own, s = make_empty_tally()
     cdef floor_t floor, f = make_empty_floor()
-    for island in range(n):
+    if p.islands != NULL:
+        out.relative = out.floor = out.above_floor = 0.0
+        out.island = 0
+    for island in range(p.islands.n if p.islands != NULL else 1):
         own, floor = make_empty_tally(), make_empty_floor()
         end = index_of_island_end(p, island)
         for a in range(index_of_island_begin(p, island), end):

@@ -125,10 +125,23 @@ cdef void judge_iterate(direct_t* t) noexcept nogil:
         t.x, t.best = t.best, x
 
 
-cdef inline int32_t refine_free_rows(direct_t* t) noexcept nogil:
-    """Correct the free rows as long as that halves the residual; return ROUNDS_USED if a row was exchanged, else SOLVED."""
+cdef inline int32_t judge_and_refine_exchanges(direct_t* t, int32_t code) noexcept nogil:
+    """Judge and refine the result of rounds that ended with `code`; return `code`, or ROUNDS_USED if a row was exchanged.
+
+    The free rows are corrected as long as that halves the residual. Rows whose signs differ by rounding may be exchanged
+    without end; the judge then finds that only rounding is left.
+    """
     cdef double previous = INFINITY
     cdef int32_t _
+    if code == SMALL_PIVOT or code == INDEFINITE:
+        return code
+    judge_iterate(t)
+    if code != SOLVED or t.s.linear.shift != 0.0:
+        return code
+    t.solved = 1
+    if is_best_impulse_accurate(t):
+        return SOLVED
+    compute_slack_and_rounding(&t.s)
     for _ in range(MAX_CORRECTIONS):
         if is_best_impulse_accurate(t) or not t.now < 0.5 * previous or has_passed_after_product(&t.s):
             break
@@ -140,23 +153,6 @@ cdef inline int32_t refine_free_rows(direct_t* t) noexcept nogil:
             return ROUNDS_USED
         judge_iterate(t)
     return SOLVED
-
-
-cdef inline int32_t judge_and_refine_exchanges(direct_t* t, int32_t code) noexcept nogil:
-    """Judge and refine the result of rounds that ended with `code`; return `code`, or ROUNDS_USED if a row was exchanged.
-
-    Rows whose signs differ by rounding may be exchanged without end; the judge then finds that only rounding is left.
-    """
-    if code == SMALL_PIVOT or code == INDEFINITE:
-        return code
-    judge_iterate(t)
-    if code != SOLVED or t.s.linear.shift != 0.0:
-        return code
-    t.solved = 1
-    if is_best_impulse_accurate(t):
-        return SOLVED
-    compute_slack_and_rounding(&t.s)
-    return refine_free_rows(t)
 
 
 # -- linear systems and exchanges --------------------------------------------------------------------------------
@@ -173,22 +169,6 @@ cdef inline int32_t factor_linear_system(direct_t* t) noexcept nogil:
         return SOLVED
     t.rank = t.s.n - t.s.linear.pivots.small
     return SMALL_PIVOT
-
-
-cdef inline int32_t step_linear_solve(direct_t* t) noexcept nogil:
-    """Factor A and solve with all rows free, in the state of a linear system; return the result of the step."""
-    cdef int32_t code = factor_linear_system(t)
-    if code != SOLVED:
-        return code
-    t.s.n_rounds += 1
-    solve_with_all_rows_free(&t.s)
-    return judge_and_refine_exchanges(t, SOLVED)
-
-
-cdef inline int32_t step_guess_and_exchanges(direct_t* t, int32_t max_rounds) noexcept nogil:
-    """Guess the free rows, then do at most `max_rounds` rounds of exchanges; return the result of the step."""
-    t.swept = not guess_free_rows_by_sweeps(&t.s, t.start, t.sweeps, max_rounds)
-    return judge_and_refine_exchanges(t, run_exchange_rounds(&t.s, max_rounds) if t.swept else SOLVED)
 
 
 cdef inline int32_t step_exchanges(direct_t* t, int32_t max_rounds) noexcept nogil:
@@ -215,14 +195,10 @@ cdef inline void begin_proximal_passes(direct_t* t, int32_t state) noexcept nogi
     t.halved_from = INFINITY
 
 
-cdef inline void recenter_proximal_term(direct_t* t) noexcept nogil:
-    memcpy(t.s.center, t.s.x, t.s.n * sizeof(double))
-
-
 cdef inline void begin_proximal_pass(direct_t* t) noexcept nogil:
     t.is_pass_over = t.descent_steps = 0
     t.passes += 1
-    recenter_proximal_term(t)
+    memcpy(t.s.center, t.s.x, t.s.n * sizeof(double))
     if t.larger_shift > 0.0 or t.next_shift < N_SHIFTS:
         set_diagonal_shift(&t.s, t.larger_shift if t.larger_shift > 0.0 else get_proximal_shift(t.next_shift))
         t.next_shift += t.larger_shift == 0.0
@@ -239,7 +215,7 @@ cdef inline void repeat_proximal_pass(direct_t* t) noexcept nogil:
         if is_best_impulse_accurate(t) or not t.now < 0.5 * previous or has_passed_after_product(&t.s):
             break
         previous = t.now
-        recenter_proximal_term(t)
+        memcpy(t.s.center, t.s.x, t.s.n * sizeof(double))
         compute_slack_and_rounding(&t.s)
         correct_free_row_solution(&t.s)
         compute_slack_and_rounding(&t.s)
@@ -382,9 +358,6 @@ cdef inline int32_t run_descent_steps(direct_t* t, int32_t max_steps) noexcept n
 
 # -- the driver --------------------------------------------------------------------------------------------------
 
-cdef inline bint is_final_result(const direct_t* t, int32_t code) noexcept nogil:
-    return code == SOLVED or code == INDEFINITE or code == PASSES_USED or code == CYCLING
-
 
 cdef inline int32_t choose_state_after_exchanges(direct_t* t, int32_t code) noexcept nogil:
     """Choose what follows exchanges or a linear solve that ended with `code`; return the result of the step."""
@@ -405,16 +378,21 @@ cdef int32_t step_direct_solve(direct_t* t, int32_t max_rounds) noexcept nogil:
     cdef int32_t code
     if t.state == GUESS or t.state == EXCHANGE:
         if t.linear:
-            code = step_linear_solve(t)
+            code = factor_linear_system(t)
+            if code == SOLVED:
+                t.s.n_rounds += 1
+                solve_with_all_rows_free(&t.s)
+                code = judge_and_refine_exchanges(t, SOLVED)
         elif t.state == GUESS:
-            code = step_guess_and_exchanges(t, max_rounds)
+            t.swept = not guess_free_rows_by_sweeps(&t.s, t.start, t.sweeps, max_rounds)
+            code = judge_and_refine_exchanges(t, run_exchange_rounds(&t.s, max_rounds) if t.swept else SOLVED)
         else:
             code = step_exchanges(t, max_rounds)
         t.state = EXCHANGE
         code = choose_state_after_exchanges(t, code)
     else:
         code = step_proximal_pass(t, max_rounds)
-    t.is_over = is_final_result(t, code)
+    t.is_over = code == SOLVED or code == INDEFINITE or code == PASSES_USED or code == CYCLING
     return code
 
 

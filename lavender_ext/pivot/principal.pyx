@@ -28,18 +28,6 @@ cdef enum:
     MAX_PATIENCE = 8            # Rounds are stuck after this many exchanges without a new smallest number of infeasible rows.
 
 
-cdef inline void call_outside_factor(pivoting_t* s) noexcept nogil:
-    """Factor the free rows by the outside factor, and store its number of small pivots."""
-    cdef int32_t small = s.factor_outside(s.outside, s.place, s.n_free, s.linear.shift)
-    s.late = small < 0
-    if s.late:
-        return
-    clear_pivot_statistics(&s.linear.pivots)
-    s.linear.pivots.small = small
-    s.factorisations += 1
-    s.is_factored = 1
-
-
 cdef inline void copy_free_rows_to_dense_matrix(pivoting_t* s) noexcept nogil:
     """Copy A_FF to the full matrix of L U."""
     cdef int32_t i, j, q, at, to
@@ -89,7 +77,7 @@ cdef inline void copy_free_rows_to_band(pivoting_t* s) noexcept nogil:
 
 cdef void factor_free_rows(pivoting_t* s, double* x) noexcept nogil:
     """Factor A_FF + s D_FF of (1). L D L^T begins the solve of x (n_free) on the way, unless x is NULL."""
-    cdef int32_t i, k = 0, r
+    cdef int32_t i, k = 0, r, small
     for r in range(s.n):
         i = r if s.natural else s.order[r]
         s.place[i] = -1
@@ -100,7 +88,14 @@ cdef void factor_free_rows(pivoting_t* s, double* x) noexcept nogil:
     s.n_free = k
     s.linear.ahead = x
     if s.factor_outside != NULL:
-        call_outside_factor(s)
+        small = s.factor_outside(s.outside, s.place, s.n_free, s.linear.shift)
+        s.late = small < 0
+        if s.late:
+            return
+        clear_pivot_statistics(&s.linear.pivots)
+        s.linear.pivots.small = small
+        s.factorisations += 1
+        s.is_factored = 1
         return
     if s.linear.by == LU:
         copy_free_rows_to_dense_matrix(s)
@@ -211,16 +206,6 @@ cdef int32_t exchange_infeasible_rows(pivoting_t* s) noexcept nogil:
     return n_infeasible
 
 
-cdef inline void set_bound_rows_to_bounds(pivoting_t* s) noexcept nogil:
-    """Set x of bound rows to their bounds."""
-    cdef int32_t i
-    for i in range(s.n):
-        if s.at[i] == AT_LOWER:
-            s.x[i] = s.p.lower[i]
-        elif s.at[i] == AT_UPPER:
-            s.x[i] = s.p.upper[i]
-
-
 cdef inline void predict_active_bounds(pivoting_t* s) noexcept nogil:
     """Decide from x - w / d, with the slack w of x, which rows are free and which are at a bound."""
     cdef int32_t i
@@ -299,12 +284,14 @@ cdef inline bint is_solved_with_all_rows_free(pivoting_t* s) noexcept nogil:
 
 cdef int32_t run_exchange_rounds(pivoting_t* s, int32_t max_rounds) noexcept nogil:
     """Factor, solve and exchange, at most `max_rounds` times, until no row is infeasible or the deadline has passed."""
-    cdef int32_t _, n_infeasible
+    cdef int32_t _, i, n_infeasible
     for _ in range(max_rounds):
         if has_passed_after_product(s):
             return ROUNDS_USED
         s.n_rounds += 1
-        set_bound_rows_to_bounds(s)
+        for i in range(s.n):
+            if s.at[i] != FREE:
+                s.x[i] = s.p.lower[i] if s.at[i] == AT_LOWER else s.p.upper[i]
         compute_slack_and_rounding(s)
         if not s.is_factored:
             factor_free_rows(s, NULL)

@@ -328,14 +328,6 @@ cdef void store_packed_impulses(const blocks_t* p, const int32_t* order, const p
             lam[p.ptr[order[i]] + k] = x[LANES * k]
 
 
-cdef inline int32_t find_active_lanes(const int64_t* header, int32_t pass_, int32_t sweeps) noexcept nogil:
-    """Return the lanes that are due in this pass, 0 <= pass_ - stage < sweeps, as a bit set."""
-    cdef int32_t lane, due = 0
-    for lane in range(LANES):
-        due |= (0 <= pass_ - header[OWNER * LANES + lane] < sweeps) << lane
-    return due
-
-
 cdef inline void mask_inactive_lanes(const pair_t* record, int32_t n, int32_t due, int64_t unused, int64_t* write_offset,
                                      double* saved) noexcept nogil:
     """Redirect the velocities of lanes that are not due to an unused place, and save the impulses of the record."""
@@ -347,39 +339,16 @@ cdef inline void mask_inactive_lanes(const pair_t* record, int32_t n, int32_t du
         saved[k] = (<const double*>(record + HEADER_SIZE))[k]
 
 
-cdef inline void restore_inactive_lanes(pair_t* record, int32_t n, int32_t due, const double* saved) noexcept nogil:
-    """Restore the impulses of lanes that are not due."""
-    cdef int32_t k
-    for k in range(LANES * n):
-        if not due >> (k % LANES) & 1:
-            (<double*>(record + HEADER_SIZE))[k] = saved[k]
-
-
-cdef inline void gather_impulses_of_record(const pair_t* record, int32_t n, const double* lam, pair_t* impulses) noexcept nogil:
-    """Load the impulses of a record from lam (m)."""
-    cdef const int64_t* header = <const int64_t*>record
-    cdef int32_t k
-    for k in range(n):
-        impulses[k] = load_pair(lam + header[OWNER * LANES] + k, lam + header[OWNER * LANES + LANES - 1] + k)
-
-
-cdef inline void store_record_impulses(const pair_t* record, int32_t n, const pair_t* impulses, double* lam) noexcept nogil:
-    """Store the impulses of a record to lam (m)."""
-    cdef const int64_t* header = <const int64_t*>record
-    cdef int32_t k
-    for k in range(n):
-        store_pair(lam + header[OWNER * LANES] + k, lam + header[OWNER * LANES + LANES - 1] + k, impulses[k])
-
-
 cdef inline void relax_records(const blocks_t* p, const rows_t* r, const packed_t* packed, const span_t* span, double* lam,
                                double* v) noexcept nogil:
     """Update the blocks of the records of a span that are due."""
-    cdef int32_t kind, n, due, all_lanes = (1 << LANES) - 1
+    cdef int32_t kind, n, due, k, all_lanes = (1 << LANES) - 1
     cdef int64_t code, unused = VELOCITY_BYTES * <int64_t>(r.n_bodies + 1)
     cdef int64_t held_offset[4]
     cdef double saved[2 * MAX_RECORD_ROWS]
     cdef pair_t outside[MAX_RECORD_ROWS]
     cdef const int64_t* write_offset
+    cdef const int64_t* owner
     cdef pair_t* record = span.begin
     cdef pair_t* impulses
     while True:
@@ -389,12 +358,16 @@ cdef inline void relax_records(const blocks_t* p, const rows_t* r, const packed_
         # Load the impulses, and find the lanes that are due.
         impulses = record + HEADER_SIZE
         write_offset = <int64_t*>record + WRITE_OFFSET * LANES
+        owner = <int64_t*>record + OWNER * LANES
         due = all_lanes
         if packed.single:
-            gather_impulses_of_record(record, n, lam, outside)
+            for k in range(n):
+                outside[k] = load_pair(lam + owner[0] + k, lam + owner[LANES - 1] + k)
             impulses = outside
         elif span.sweeps > 0:
-            due = find_active_lanes(<int64_t*>record, span.pass_, span.sweeps)
+            due = 0
+            for k in range(LANES):
+                due |= (0 <= span.pass_ - owner[k] < span.sweeps) << k
             if due != all_lanes:
                 mask_inactive_lanes(record, n, due, unused, held_offset, saved)
                 write_offset = held_offset
@@ -402,9 +375,12 @@ cdef inline void relax_records(const blocks_t* p, const rows_t* r, const packed_
         if due:
             relax_record(p, r, record, kind, impulses, v, write_offset, lam)
         if packed.single:
-            store_record_impulses(record, n, outside, lam)
+            for k in range(n):
+                store_pair(lam + owner[0] + k, lam + owner[LANES - 1] + k, outside[k])
         elif due != all_lanes:
-            restore_inactive_lanes(record, n, due, saved)
+            for k in range(LANES * n):
+                if not due >> (k % LANES) & 1:
+                    (<double*>impulses)[k] = saved[k]
         # Go to the next record.
         if record == span.end:
             return

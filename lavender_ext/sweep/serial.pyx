@@ -59,14 +59,6 @@ cdef void compute_sweep_velocities(const sweep_context_t* c, const double* lam) 
         compute_velocity_change(c.blocks, c.rows, lam, c.v)
 
 
-cdef inline void update_order_for_sweep(sweep_context_t* c, bint first) noexcept nogil:
-    """Reverse or shuffle the order for the next sweep; `first`: the next sweep is the first one."""
-    update_sweep_order(c.mode, first, c.order, 0, c.split, c.rng)
-    update_sweep_order(c.mode, first, c.order, c.split, c.blocks.n_blocks, c.rng)
-    if c.packing != NULL and c.mode == SYMMETRIC and not first:
-        c.packing.backwards = not c.packing.backwards
-
-
 cdef double compute_jacobi_damping(const blocks_t* p, const csr_t* a, double* scratch) noexcept nogil:
     """Return min(1, 1.6 / max_i sum_j |A_ij| sqrt(s_i s_j)) with the steps s, a safe omega of Jacobi; scratch (m)."""
     cdef double largest_sum = 0.0, row_sum
@@ -153,8 +145,11 @@ cdef void sweep_over_form(sweep_context_t* c, const blocks_t* p, bint exact, dou
             c.w[i] = csr_row_dot(c.csr, i, lam) - p.b[i]
         sweep_jacobi(p, c.w, c.omega, lam)
         return
-    # Set the order.
-    update_order_for_sweep(c, first)
+    # Reverse or shuffle the order.
+    update_sweep_order(c.mode, first, c.order, 0, c.split, c.rng)
+    update_sweep_order(c.mode, first, c.order, c.split, c.blocks.n_blocks, c.rng)
+    if c.packing != NULL and c.mode == SYMMETRIC and not first:
+        c.packing.backwards = not c.packing.backwards
     # Sweep over the blocks.
     if c.method == SOR:
         sweep_matrix_sor(p, c.csr, c.omega, c.order, lam)
