@@ -12,7 +12,6 @@ from libc.stdint cimport int32_t
 
 from lavender_ext.core.block_types cimport (blocks_t, friction_components_t, get_friction_components, is_box_friction_contact,
                                             is_disk_friction_contact, count_angular_rows, count_tangent_rows)
-from lavender_ext.core.joint cimport relax_joint_block
 from lavender_ext.core.numbers cimport (apply_contact_impulse_changes_to_body, clip_below_zero, clip_to_bound,
                                         convert_to_type_of, dot_numbers, number_t, project_disk, compute_relative_angular_velocity)
 from lavender_ext.core.rows cimport cross
@@ -216,11 +215,3 @@ cdef inline void relax_contact_block(const blocks_t* p, const rows_t* r, int32_t
         bind_contact_arrays(p, r, i, &contact)
         bind_contact_friction(p, i, &components, tangent2, &contact)
         relax_contact(<const other_contact_t*>&contact, lam + j, va, vb)
-
-
-cdef inline void relax_bodies_block(const blocks_t* p, const rows_t* r, int32_t i, double* lam, double* v) noexcept nogil:
-    """Update block i, a joint or a contact; lam (m) [N s], v (n_bodies, 6) [m/s, rad/s]."""
-    if i < r.n_joints:
-        relax_joint_block(p, r, i, lam, v)
-    else:
-        relax_contact_block(p, r, i, lam, v)

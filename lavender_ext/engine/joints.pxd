@@ -19,7 +19,7 @@ from libc.stdint cimport int32_t
 from lavender_ext.core.validate cimport min_magnitude
 from lavender_ext.core.block_types cimport ROW
 from lavender_ext.core.rows cimport cross, dot3, dot12, joint_row_velocity, multiply_inverse_mass, reciprocal_or_zero
-from lavender_ext.engine.arrays cimport (BALL, DISTANCE, HINGE, H_WARM_START, J_ANCHOR_A, J_ANCHOR_B,
+from lavender_ext.engine.arrays cimport (BALL, DISTANCE, H_WARM_START, J_ANCHOR_A, J_ANCHOR_B,
                                          J_AXIS_A, J_AXIS_B, J_DAMPING, J_HERTZ, J_LENGTH, J_SIDE_A, J_SPEED,
                                          J_TORQUE, N_JOINT, N_JOINT_REAL, ROWS_PER_CONTACT, S_H, engine_t)
 from lavender_ext.engine.bodies cimport rotate_to_world

@@ -232,16 +232,6 @@ cdef inline void factor_dense(linear_t* f) noexcept nogil:
     f.factored = LU if f.pivots.small == 0 else NO_FACTOR
 
 
-cdef inline void factor_band(linear_t* f) noexcept nogil:
-    """Factor a band; if `ahead` is set, begin its solve at the same time."""
-    cdef int32_t i
-    if f.shift != 0.0:
-        for i in range(f.n):
-            f.matrix[<int64_t>i * f.width] += f.shift * f.d[i]
-    factor_band_ldl(f.n, f.width, f.matrix, f.d, f.tiny, f.ahead, &f.pivots, f.deadline)
-    f.factored = CHOLESKY
-
-
 cdef inline void factor_compressed_rows(linear_t* f) noexcept nogil:
     """Factor compressed rows; use the fallback if a pivot is lost."""
     cdef int32_t i, negative = 0
@@ -267,13 +257,17 @@ cdef int32_t factor_linear_system_matrix(linear_t* f) noexcept nogil:
 
     For BAND, `pivots` also contains the number of negative pivots.
     """
-    cdef int32_t lost
+    cdef int32_t i, lost
     f.rows.factor.deadline = f.blocks.factor.deadline = f.deadline
     clear_pivot_statistics(&f.pivots)
     if f.kind == DENSE:
         factor_dense(f)
     elif f.kind == BAND:
-        factor_band(f)
+        for i in range(f.n if f.shift != 0.0 else 0):
+            f.matrix[<int64_t>i * f.width] += f.shift * f.d[i]
+        # If `ahead` is set, this begins its solve at the same time.
+        factor_band_ldl(f.n, f.width, f.matrix, f.d, f.tiny, f.ahead, &f.pivots, f.deadline)
+        f.factored = CHOLESKY
     elif f.kind == ROWS:
         factor_compressed_rows(f)
     elif f.kind == BLOCKS:

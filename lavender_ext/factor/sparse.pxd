@@ -9,7 +9,7 @@ from libc.string cimport memset
 
 from lavender_ext.core.csr cimport transpose_csr
 from lavender_ext.factor.factors cimport sparse_t, supernodal_t
-from lavender_ext.factor.supernodal cimport (clear_descendant_lists, factor_supernode, panel_width, rows_below, set_local_rows,
+from lavender_ext.factor.supernodal cimport (clear_descendant_lists, factor_supernode, rows_below, set_local_rows,
                                              solve_supernodes)
 
 

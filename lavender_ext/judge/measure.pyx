@@ -21,8 +21,7 @@ from lavender_ext.judge.forms cimport (compute_csr_slack, judge_impulse_over_bod
                                        judge_impulse_over_generalized, score_generalized_slack)
 from lavender_ext.judge.measure cimport (residual_above_floor, set_zero_impulse, relative_floor_of_score,
                                          relative_residual_of_score, count_judge_scratch)
-from lavender_ext.judge.reference cimport (compute_reference, compute_terms, has_island_without_scale, has_unmoved_row,
-                                           reference_needs_islands)
+from lavender_ext.judge.reference cimport (compute_reference, compute_terms, has_island_without_scale, has_unmoved_row)
 from lavender_ext.judge.refine cimport estimate_factor_loss, min_reported_loss, refine_generalized_slack
 from lavender_ext.judge.rounding cimport mass_t, relative_size_of_change, compute_squared_float32_rounding
 from lavender_ext.judge.score cimport is_at_floor, make_empty_score, relative_residual, score_t
@@ -111,7 +110,7 @@ cdef bint judge_zero_impulse(view_t* v, int32_t* index, islands_t* islands, doub
     if find_islands(v, index, islands) > 1:
         v.p.islands = islands
     compute_reference(&v.p, x, w, e, out)
-    if reference_needs_islands(&v.p, out) or (unmoved and v.p.islands == NULL):
+    if v.p.islands == NULL and (unmoved or out[0] < 0.0 and v.p.n_rows > 0):    # (3) of judge/reference.pxd needs a list.
         list_one_island(v.p.n_blocks, index, islands)
         v.p.islands = islands
         compute_reference(&v.p, x, w, e, out)

@@ -286,8 +286,3 @@ cdef inline void compute_terms(const view_t* v, const int32_t* empty, const doub
                 terms[k] = -error if error > max_rounding_ratio() * largest else -largest
                 if fabs(p.b[k]) <= 4.0 * unit_roundoff() * all_rows:
                     terms[k] = -INFINITY
-
-
-cdef inline bint reference_needs_islands(const blocks_t* p, const double* out) noexcept nogil:
-    """Return whether (3) applies to a problem that has no list of islands. (3) requires such a list."""
-    return p.islands == NULL and out[0] < 0.0 and p.n_rows > 0

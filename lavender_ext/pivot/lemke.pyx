@@ -192,14 +192,6 @@ cdef inline double impulse_per_variable(const blocks_t* p, int32_t i) noexcept n
     return size if p.lower[i] > -INFINITY or p.upper[i] == INFINITY else -size
 
 
-cdef inline int32_t count_complementary_pairs(const blocks_t* p) noexcept nogil:
-    cdef int32_t i, n = 0
-    for i in range(p.n_rows):
-        if p.lower[i] != p.upper[i]:
-            n += 1 + has_two_bounds(p, i)
-    return n
-
-
 cdef inline int32_t first_free_pair(const lemke_t* l) noexcept nogil:
     """Return the first pair of a free row; pairs of bounded rows, then caps, come before it."""
     return l.n_bounded + l.n_caps
@@ -475,7 +467,11 @@ cdef void get_ray_direction(const lemke_t* l, double* y) noexcept nogil:
 
 cdef void bind_lemke_arrays(lemke_t* l, direct_t* t, arena_t* a) noexcept nogil:
     """Take the arrays of l for the rows of t from an arena; t has its arrays, or both are only counted."""
-    cdef int64_t n = count_complementary_pairs(t.s.p)
+    cdef int64_t n = 0                                  # number of pairs
+    cdef int32_t i
+    for i in range(t.s.p.n_rows):
+        if t.s.p.lower[i] != t.s.p.upper[i]:
+            n += 1 + has_two_bounds(t.s.p, i)
     l.t, l.d.width = t, n + FIRST
     l.d.t = take_doubles(a, n * l.d.width)
     l.row, l.d.initial, l.d.basic = take_integers(a, n), take_integers(a, n), take_integers(a, n)

@@ -11,8 +11,9 @@ from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport clip, project_normal_update, project_row_update, project_tangent_update
 from lavender_ext.core.block_types cimport blocks_t, friction_components_t, get_friction_components, has_independent_rows
-from lavender_ext.core.contact cimport relax_bodies_block
+from lavender_ext.core.contact cimport relax_contact_block
 from lavender_ext.core.csr cimport csr_row_dot
+from lavender_ext.core.joint cimport relax_joint_block
 from lavender_ext.core.row_forms cimport (damped_csr_t, find_panel, row_form_t, compute_row_slack, get_row_step,
                                           set_row_impulse, stored_slack_t)
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t
@@ -73,7 +74,10 @@ cdef inline void sweep_blocks(const blocks_t* p, const form_t* form, const int32
     for k in range(n):
         i = k if form_t is single_rows_t or form_t is stored_slack_t else order[k]
         if form_t is rows_t:
-            relax_bodies_block(p, form, i, lam, v)
+            if i < form.n_joints:
+                relax_joint_block(p, form, i, lam, v)
+            else:
+                relax_contact_block(p, form, i, lam, v)
         elif form_t is single_rows_t:
             lam[i] = project_row_update(lam[i], csr_row_dot(&form.a, i, lam) - p.b[i], p.step[i], p.lower[i], p.upper[i])
         else:
