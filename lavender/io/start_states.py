@@ -268,7 +268,7 @@ def _read_arrays(mj: Any, model: Any, arrays: Mapping[str, Any], source: str) ->
     n = counts["qpos"]
     if n == 0 or set(counts.values()) != {n}:
         sizes = ", ".join(f"{count} of {name}" for name, count in counts.items())
-        raise InputError(f"{source} holds different numbers of states: {sizes}; one number above 0 is needed")
+        raise InputError(f"{source} holds unequal or no states: {sizes}; one number above 0 is needed")
     vectors = []
     for i in range(n):
         data = mj.MjData(model)

@@ -223,14 +223,14 @@ NV, NQ = 13, 15
 REFUSED = [
     *(({"states": arrays}, words) for arrays, words in (
         ({"qpos": np.zeros((2, NQ))}, "has no qvel"),
-        ({"qpos": np.zeros((2, NQ)), "qvel": np.zeros((3, NV))}, "different numbers: 2 of qpos, 3 of qvel"),
+        ({"qpos": np.zeros((2, NQ)), "qvel": np.zeros((3, NV))}, "2 of qpos, 3 of qvel; one number above 0"),
         ({"qpos": np.zeros((2, NQ - 1)), "qvel": np.zeros((2, NV))}, "qpos"),
         ({"qpos": np.full((1, NQ), np.nan), "qvel": np.zeros((1, NV))}, "qpos"),
-        ({"qpos": np.zeros((0, NQ)), "qvel": np.zeros((0, NV))}, "at least one"),
+        ({"qpos": np.zeros((0, NQ)), "qvel": np.zeros((0, NV))}, "0 of qpos, 0 of qvel; one number above 0"),
         ({"qpos": np.zeros((1, NQ)), "qvel": np.zeros((1, NV)), "speed": np.zeros(1)}, "has an array 'speed'"),
         ({"state": np.zeros((2, 3))}, "mjSTATE_INTEGRATION"))),
     ({"states": "torn.npz"}, "torn.npz"), ({"states": "no.npz"}, "no.npz"),
-    ({"states": "keyframes"}, "has no keyframes"),
+    ({"states": "keyframes"}, "the model has none; a keyframe is needed"),
     ({"engine": "bullet"}, "engine"), ({"worlds": 0}, "worlds"), ({"control": "zero", "seed": -1}, "seed"),
     ({"spread": -1.0}, "spread"), ({"precision": "float16"}, "precision"), ({"workers": 0}, "workers"),
     ({"control": "sometimes"}, "controls sometimes"), ({"backend": "carrier pigeon"}, "backend"),
