@@ -173,7 +173,7 @@ cdef public void lav_form_delassus_matrix(const blocks_t* p, const rows_t* r, co
                         nnz += 1
                     next_[row] = nnz
                     col += 1
-                bit = 0 if sides[q] == 1 else 1 if sides[q] == 2 else 2 if sides[q] == 4 else 3
+                bit = (sides[q] > 1) + (sides[q] > 2) + (sides[q] > 4)
                 if sides[q] == 1 << bit:                # The blocks share one body.
                     x = jac + 12 * row + 6 * (bit >> 1)
                     y = minv_jac + 6 * (bit & 1)
