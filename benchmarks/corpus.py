@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import json
 import os
+import select
 import subprocess
 import sys
 import tempfile
@@ -37,6 +38,7 @@ ROOT = Path(__file__).resolve().parents[1]
 TOL, RIGHT = 1e-6, 1e-5
 LIMIT = 5.0  # [s] Time limit of a solve.
 REPEATED_BELOW = 1.0  # [s] Calls that take longer run once.
+ANSWER_LIMIT = 20.0  # [s] A process that answers later is ended: some backends alone have no limit.
 N_MODELS = 12
 #: Settings of backends that stop far above RIGHT by default.
 ALONE = {
@@ -195,6 +197,9 @@ class Checkout:
         if self.process.poll() is None:
             self.process.stdin.write(json.dumps(call) + "\n")
             self.process.stdin.flush()
+        limit = None if call[0] == "step_models" else ANSWER_LIMIT
+        if not select.select([self.process.stdout], [], [], limit)[0]:
+            self.process.kill()
         line = self.process.stdout.readline()
         if line:
             return dict(json.loads(line))
