@@ -320,7 +320,7 @@ def build_checked_csr(
             )
     used = int(indptr[-1]) if len(indptr) else 0
     try:
-        if np.any(indptr[1:] < indptr[:-1]):  # SciPy does not test it if there are no entries.
+        if np.any(indptr[1:] < indptr[:-1]):  # SciPy does not test this if the matrix has no entries.
             raise ValueError("pointers decrease")
         matrix = sp.csr_array((data[:used].astype(float), indices[:used], indptr), shape=(m, n))
         matrix.check_format(full_check=True)

@@ -51,7 +51,7 @@ def resolve_destination(path: str | os.PathLike[str]) -> Path:
     """Return the path at which a file is written: the target of symbolic links, a regular file or a new one."""
     target = os.path.realpath(as_path(path))
     if os.path.exists(target) and not os.path.isfile(target):
-        raise InputError(f"cannot write {path}: it is no regular file; give the name of a file")
+        raise InputError(f"cannot write {path}: it is not a regular file; the name of a file is needed")
     return Path(target)
 
 

@@ -368,7 +368,7 @@ class Solution:
 
     @property
     def is_contradicted(self) -> bool:
-        """Whether the judge's figures contradict `status`."""
+        """Return whether the judge's figures contradict `status`."""
         # Postponed fields belong to claims that have been checked, so they are not computed here.
         return self.__dict__.get("claim_check") == CONTRADICTED
 

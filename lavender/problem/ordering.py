@@ -83,7 +83,9 @@ def compute_block_order(
             raise InputError("ground= is given with an array; it needs order='bottom_up' or 'top_down'")
         blocks = as_array("order", order, (k,), dtype=np.int32).copy()
         if not np.array_equal(np.sort(blocks), np.arange(k)):
-            raise InputError(f"order is no permutation; every block from 0 to {k - 1} is needed exactly once")
+            raise InputError(
+                f"order is not a permutation; it needs every block from 0 to {k - 1} exactly once"
+            )
         return Order(blocks, k, GIVEN, rng)
     if order not in SWEEP_ORDERS:
         raise UnknownName("order", order, SWEEP_ORDERS)

@@ -72,7 +72,7 @@ class DecisionTree:
 
     @cached_property
     def is_large(self) -> bool:
-        """Whether the convex relaxation is solved first: under Coulomb's law, if the problem is large.
+        """Return whether the convex relaxation is solved first, as on large problems under Coulomb's law.
 
         Of J and M, this requires that the velocities belong to free bodies. Over the rows of a sparse A, Newton's
         method on Coulomb's law takes fewer steps than on the relaxation.

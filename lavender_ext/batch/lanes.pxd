@@ -38,8 +38,8 @@ cdef extern from *:
     enum { LANE_IS_PLAIN, LANE_START_ENERGY, LANE_START_SPEED, LANE_RHS, LANE_CONDITION, LANE_ENERGY, LANE_SPEED, LANE_WORST,
            LANE_FLOOR_ENERGY, LANE_FLOOR_SPEED, LANE_WORK, LANE_HEAVIEST, LANE_STEPS, LANE_NUMBERS, LANE_ROWS = 48,
            LANE_VELOCITIES = 40 };
-    /* List the columns of each block of a lane: those of J and their ancestors. Return 0 if blocks may be several islands, 1 if
-     * they are one, 2 if M is also full. */
+    /* List the columns of each block of a lane: those of J and their ancestors. Return 0 if the blocks may belong to several
+     * islands, 1 if they are one island, and 2 if M is also full. */
     static int lavender_list_columns(const lavender_lanes_t* x, int width, int lane) {
         const int n = x->n;
         const unsigned long long one = 1;

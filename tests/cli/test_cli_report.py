@@ -110,7 +110,7 @@ def test_a_recorded_scene_is_reported_as_a_sequence(lavender, tmp_path):
     assert lavender("run", "no such scene")[0] == 2
     assert lavender("report", "--sequence")[0] == 2
     code, _, err = lavender("report", "two_particles", "--solvers", "pgs", "newtn")
-    assert (code, "newton" in err) == (2, True)  # A misspelt solver is no case.
+    assert (code, "newton" in err) == (2, True)  # A misspelt solver is not read as a case.
     assert lavender("report", "--sequence", folder, "--compare", "nowhere")[0] == 2
 
 

@@ -72,7 +72,7 @@ def test_write_over_a_pipe_or_a_folder_is_an_error_and_through_a_link_replaces_i
     target.write_bytes(BEFORE)
     link.symlink_to(target.name)
     for path in (pipe, folder):
-        with pytest.raises(lv.InputError, match=f"{path}: it is no regular file"):
+        with pytest.raises(lv.InputError, match=f"{path}: it is not a regular file"):
             call(results, path)
     call(results, link)
     assert pipe.is_fifo() and link.is_symlink() and target.read_bytes() != BEFORE

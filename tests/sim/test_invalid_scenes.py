@@ -235,7 +235,7 @@ NUMBERS = {
         lambda name: st.tuples(st.just(name), st.integers(0, 10**6), NUMBERS[name])), min_size=1, max_size=5),
 )  # fmt: skip
 def test_snapshot_with_changed_arrays_is_rejected_or_stepped(name, how, steps, edits):
-    """What a changed state computes is not promised; that it reads and writes within its arrays is."""
+    """A changed state may compute anything, but it reads and writes only within its arrays."""
     simulation = after(steps, name, **GALLERY[name], **how | {"on_failure": "use"})
     shot = simulation.snapshot()
     arrays = {array: getattr(shot, array).copy() for array in NUMBERS}

@@ -16,7 +16,7 @@ from lavender.solvers.newton import Newton
 def test_restrict_to_islands_gives_blocks_of_the_matrix(form, seed):
     rolls = bool(seed % 2)
     problem = FORMS[form](random_contact_problem(seed, spin=not rolls, rolling=rolls, bodies=9, joints=2, contacts=6))
-    if form == "J and M" and rolls:  # trees, some velocities of which have no rows
+    if form == "J and M" and rolls:  # Some velocities of these trees have no rows.
         problem = random_generalized_problem(seed, "coulomb", n=30, contacts=3)
     count, label = find_islands(problem)
     # Blocks that share a body may still not touch in A, where rows happen to be orthogonal; not at random.

@@ -22,7 +22,7 @@ class State:
     b: np.ndarray
     cones: lv.Cones
     done: int = 0
-    step: dict[int, float] = field(default_factory=dict)  # of friction components, by their first row [kg]
+    step: dict[int, float] = field(default_factory=dict)  # [kg] Steps of friction components by their first row.
 
     @cached_property
     def units(self):
