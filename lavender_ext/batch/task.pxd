@@ -6,17 +6,17 @@ violates its target, or if the estimated cost is above the limit.
 """
 from libc.stdint cimport int32_t, int64_t
 from libc.math cimport INFINITY, NAN, fabs, sqrt
-from libc.string cimport memcpy, memset
+from libc.string cimport memcpy
 
-from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles, take_integers
+from lavender_ext.core.arena cimport arena_t, has_memory, make_arena, take_doubles, take_integers
 from lavender_ext.core.assemble cimport lav_form_delassus_matrix, lav_list_blocks_of_bodies
 from lavender_ext.core.validate cimport find_invalid_number
 from lavender_ext.core.deadline cimport deadline_t, has_passed
 from lavender_ext.core.method cimport MORE, REACHED, NEEDS_WORKSPACE, info_t, options_t, workspace_t
 from lavender_ext.core.islands cimport island_workspace_integers
 from lavender_ext.core.block_types cimport CONE, blocks_t, has_independent_rows, islands_t
-from lavender_ext.core.problem cimport (DERIVED, bind_derived_row_arrays, compute_derived_numbers_of_jacobian, derived_t,
-                                        lav_compute_body_diagonal, lav_compute_csr_diagonal)
+from lavender_ext.core.problem cimport (DERIVED, compute_derived_numbers_of_jacobian, derive_row_numbers, derived_t,
+                                        lav_compute_csr_diagonal)
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.driver.driver cimport NEWTON, lav_analyse, lav_start, lav_step
 from lavender_ext.factor.factors cimport has_wide
@@ -31,7 +31,7 @@ from lavender_ext.small.call cimport (N_COUNTS, RESULT_IS_START, RESULT_SOLVED, 
                                       small_problem_t, small_rules_t, solve_small, solve_workspaces_t, can_use_small_call)
 from lavender_ext.small.limits cimport (estimate_newton_cost_terms, limits_t, max_factorisation_work,
                                         max_newton_cost, newton_cost_t)
-from lavender_ext.small.workspace cimport fits_workspace, grow_workspace_to_arena
+from lavender_ext.small.workspace cimport grow_workspace_to_arena
 from lavender_ext.batch.lanes cimport is_solved_in_one_lane, solve_in_one_lane
 from lavender_ext.batch.world cimport THIN_PADDING, LEFT, READY, STARTED, TRIED, compress_dense_rows
 from lavender_ext.velocity_newton.soft cimport needs_no_proximal_terms
@@ -237,35 +237,21 @@ cdef inline void solve_task(task_t* j, workspace_t* workspace, workspace_t* isla
     j.solved = j.relative <= tol and j.floor <= tol
 
 
-cdef inline bint derive_row_numbers_from_matrix(task_t* j, workspace_t* workspace) noexcept nogil:
-    """Compute A in compressed rows, d, nu and step in `workspace`; return False without memory."""
-    cdef int64_t m = j.p.n_rows, entries = m * m + THIN_PADDING if j.dense != NULL else 0
-    cdef double* x
-    cdef int32_t* empty
-    if not grow_workspace_to(workspace, 2 * (m + 1) + entries, 3 * (m + 1) + entries):
-        return False
-    x, empty = workspace.real, workspace.index
-    if j.dense != NULL:
-        j.a.indptr, j.a.indices, j.a.data = empty + m + 1, empty + 2 * (m + 1), x + 3 * (m + 1)
-        compress_dense_rows(j.dense, j.row, j.p.n_rows, j.p.n_rows, <int32_t*>j.a.indptr, <int32_t*>j.a.indices, <double*>j.a.data)
-    j.p.d, j.p.nu, j.p.step = x, x + m + 1, x + 2 * (m + 1)
-    j.made.n_empty = lav_compute_csr_diagonal(&j.p, &j.a, empty)
-    return True
-
-
-cdef inline bint derive_row_numbers_from_bodies(task_t* j, workspace_t* workspace) noexcept nogil:
-    """Compute d, nu, step, joints' M^-1 J^T, coupling and inv_inertia_arm of contacts; return whether d is in the valid range."""
-    cdef int64_t m = j.p.n_rows
+cdef inline bint derive_row_numbers_of_task(task_t* j, workspace_t* workspace) noexcept nogil:
+    """Compute d, nu, step and other numbers of A or of bodies in `workspace`; return whether d is in the valid range."""
+    cdef int64_t m = j.p.n_rows, entries = m * m + THIN_PADDING
     cdef arena_t arena = make_arena(NULL, NULL)
-    bind_derived_row_arrays(&j.r, &j.p, &arena)
-    if not grow_workspace_to(workspace, m + 1, arena.n_real + 3 * (m + 1)):
-        return False
-    memset(workspace.real, 0, (arena.n_real + 3 * (m + 1)) * sizeof(double))
-    arena = make_arena(workspace.real, NULL)
-    bind_derived_row_arrays(&j.r, &j.p, &arena)
-    j.p.d, j.p.nu, j.p.step = take_doubles(&arena, m + 1), take_doubles(&arena, m + 1), take_doubles(&arena, m + 1)
-    j.made.n_empty = lav_compute_body_diagonal(&j.p, &j.r, workspace.index)
-    return find_invalid_number(j.p.d, m) < 0
+    cdef int32_t _pass
+    for _pass in range(2):                              # The first pass counts the numbers.
+        if j.dense != NULL:
+            j.a = csr_t(take_integers(&arena, m + 1), take_integers(&arena, entries), take_doubles(&arena, entries))
+            if has_memory(&arena):
+                compress_dense_rows(j.dense, j.row, j.p.n_rows, j.p.n_rows, <int32_t*>j.a.indptr, <int32_t*>j.a.indices,
+                                    <double*>j.a.data)
+        j.made.n_empty = derive_row_numbers(&j.p, NULL if j.factored else &j.a, &j.r if j.factored else NULL, &arena)
+        if not has_memory(&arena) and not grow_workspace_to_arena(workspace, &arena):
+            return False
+    return find_invalid_number(j.p.d, j.p.n_rows) < 0
 
 
 cdef inline bint form_matrix_of_bodies(task_t* j, small_problem_t* s, workspace_t* workspace) noexcept nogil:
@@ -275,19 +261,16 @@ cdef inline bint form_matrix_of_bodies(task_t* j, small_problem_t* s, workspace_
     cdef int32_t* blocks
     cdef int32_t* scratch
     cdef double* jac
-    cdef arena_t arena = make_arena(workspace.real, workspace.index)
+    cdef arena_t arena = make_arena(NULL, NULL)
     cdef int32_t _pass
-    for _pass in range(2):                              # The second pass follows if the workspace was too small.
+    for _pass in range(2):                              # The first pass counts the numbers.
         start, blocks = take_integers(&arena, j.r.n_bodies + 1), take_integers(&arena, 2 * k + 1)
         scratch, jac = take_integers(&arena, 4 * k + 2 + m), take_doubles(&arena, 24 * m)
-        j.a.indptr, j.a.indices = take_integers(&arena, m + 1), take_integers(&arena, m * m + 1)
-        j.a.data = take_doubles(&arena, m * m + 1)
+        j.a = csr_t(take_integers(&arena, m + 1), take_integers(&arena, m * m + 1), take_doubles(&arena, m * m + 1))
         s.over = view_t(j.p, &j.a, NULL, NULL)
         s.over.p.d, s.over.p.nu = take_doubles(&arena, m + 1), take_doubles(&arena, m + 1)
         s.over.p.step = take_doubles(&arena, m + 1)
-        if fits_workspace(workspace, &arena):
-            break
-        if not grow_workspace_to_arena(workspace, &arena):
+        if not has_memory(&arena) and not grow_workspace_to_arena(workspace, &arena):
             return False
     lav_list_blocks_of_bodies(&j.p, &j.r, start, blocks, &n_entries)
     lav_form_delassus_matrix(&j.p, &j.r, start, blocks, jac, scratch, <int32_t*>j.a.indptr, <int32_t*>j.a.indices,
@@ -301,8 +284,7 @@ cdef inline bint prepare_task_for_small_call(task_t* j, small_problem_t* s, task
     """Set up a task of A or of bodies for a solve or for the judge; return False to defer it, for example with empty rows."""
     cdef int64_t m = j.p.n_rows
     if not j.has_derived:
-        j.has_derived = (derive_row_numbers_from_bodies(j, &workspaces.made) if j.factored
-                         else derive_row_numbers_from_matrix(j, &workspaces.made))
+        j.has_derived = derive_row_numbers_of_task(j, &workspaces.made)
     if not j.has_derived or j.made.n_empty:
         return False
     s.v = make_judge_view(j)

@@ -38,7 +38,7 @@ cdef int32_t compute_derived_numbers_of_jacobian(blocks_t* p, generalized_t* g, 
 
 cdef public int32_t lav_compute_csr_diagonal(const blocks_t* p, const csr_t* a, int32_t* empty) noexcept nogil
 cdef public int32_t lav_compute_body_diagonal(const blocks_t* p, const rows_t* r, int32_t* empty) noexcept nogil
-cdef void bind_derived_row_arrays(rows_t* r, const blocks_t* p, arena_t* a) noexcept nogil
+cdef int32_t derive_row_numbers(blocks_t* p, const csr_t* a, rows_t* r, arena_t* arena) noexcept nogil
 cdef int bind_body_arrays(rows_t* r, const blocks_t* p, rows) except -1
 
 

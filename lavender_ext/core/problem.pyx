@@ -9,13 +9,13 @@
 from libc.math cimport fabs
 from libc.stdint cimport int32_t, int64_t
 from libc.stdlib cimport free, malloc
-from libc.string cimport memcpy
+from libc.string cimport memcpy, memset
 
 cimport cython
 
 import numpy as np
 
-from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles
+from lavender_ext.core.arena cimport arena_t, has_memory, make_arena, take_doubles, take_integers
 from lavender_ext.core.arrays cimport as_double_pointer, as_int_pointer, make_read_only
 from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.validate cimport find_invalid_number, min_magnitude
@@ -88,7 +88,7 @@ cdef public int32_t lav_compute_csr_diagonal(const blocks_t* p, const csr_t* a, 
 
 
 cdef public int32_t lav_compute_body_diagonal(const blocks_t* p, const rows_t* r, int32_t* empty) noexcept nogil:
-    """Compute p.d, p.nu, p.step, and the arrays of `bind_derived_row_arrays`; mark empty rows (m) and return their number."""
+    """Compute p.d, p.nu, p.step, and the other arrays of `derive_row_numbers`; mark empty rows (m) and return their number."""
     cdef double* d = <double*>p.d
     cdef double* step = <double*>p.step
     cdef int32_t i, j, q, g, c, nt, n_empty = 0, a, b
@@ -141,11 +141,25 @@ cdef public int32_t lav_compute_body_diagonal(const blocks_t* p, const rows_t* r
     return n_empty
 
 
-cdef void bind_derived_row_arrays(rows_t* r, const blocks_t* p, arena_t* a) noexcept nogil:
-    """Take M^-1 J^T of joints, coupling and inv_inertia_arm of contacts from an arena; they must be 0 at first."""
-    cdef int64_t joint_rows = p.ptr[r.n_joints]
-    r.minv_jac, r.coupling = take_doubles(a, 12 * joint_rows), take_doubles(a, 5 * <int64_t>r.n_contacts)
-    r.inv_inertia_arm = take_doubles(a, 6 * (p.n_rows - joint_rows))
+cdef int32_t derive_row_numbers(blocks_t* p, const csr_t* a, rows_t* r, arena_t* arena) noexcept nogil:
+    """Compute d, nu and step, and for bodies M^-1 J^T of joints, coupling and inv_inertia_arm of contacts, in an arena.
+
+    A (NULL for bodies) or the bodies (NULL for A) are given. Returns the number of empty rows, which the arena's next m + 1
+    integers mark, and 0 if the arena only counts.
+    """
+    cdef int64_t m = p.n_rows, joint_rows
+    cdef int32_t* empty = take_integers(arena, m + 1)
+    p.d, p.nu, p.step = take_doubles(arena, m + 1), take_doubles(arena, m + 1), take_doubles(arena, m + 1)
+    if r != NULL:
+        joint_rows = p.ptr[r.n_joints]
+        r.minv_jac, r.coupling = take_doubles(arena, 12 * joint_rows), take_doubles(arena, 5 * <int64_t>r.n_contacts)
+        r.inv_inertia_arm = take_doubles(arena, 6 * (m - joint_rows))
+    if not has_memory(arena):
+        return 0
+    if r == NULL:
+        return lav_compute_csr_diagonal(p, a, empty)
+    memset(<double*>r.minv_jac, 0, (12 * joint_rows + 5 * <int64_t>r.n_contacts + 6 * (m - joint_rows)) * sizeof(double))
+    return lav_compute_body_diagonal(p, r, empty)
 
 
 cdef int bind_body_arrays(rows_t* r, const blocks_t* p, rows) except -1:
@@ -306,37 +320,34 @@ cdef class Data:
 
     def __init__(self, Blocks blocks, b_, int law, csr=None, rows=None):
         cdef int32_t m = blocks.at.n_rows, n_empty, i
-        numbers_ = new(3 * m + 3)
-        cdef double* numbers = as_double_pointer(numbers_, 3 * m + 3)
         cdef arena_t arena = make_arena(NULL, NULL)
-        cdef Workspace marks = allocate_bytes((<Py_ssize_t>m + 1) * sizeof(int32_t))
-        cdef int32_t* empty = <int32_t*>marks.at
-        self.keep = [blocks, b_, numbers_, csr, rows]
+        cdef csr_t* a = NULL
+        cdef rows_t* r = NULL
+        cdef Workspace marks
         self.blocks = blocks.at
         self.blocks.law = law
-        self.blocks.d, self.blocks.nu, self.blocks.step = numbers, numbers + m + 1, numbers + 2 * (m + 1)
         self.blocks.b = as_double_pointer(b_, m)
         self.reference_energy = self.reference_velocity = self.relative_at_zero = -1.0
         self.ready = True
         self.factored = rows is not None
         self.single_rows = blocks.single_rows
         if self.factored:
-            bind_body_arrays(&self.rows, &self.blocks, rows)
-            bind_derived_row_arrays(&self.rows, &self.blocks, &arena)
-            derived = np.zeros(arena.n_real + 1)
-            self.keep.append(derived)
-            arena = make_arena(as_double_pointer(derived, arena.n_real + 1), NULL)
-            bind_derived_row_arrays(&self.rows, &self.blocks, &arena)
-            n_empty = lav_compute_body_diagonal(&self.blocks, &self.rows, empty)
+            r = &self.rows
+            bind_body_arrays(r, &self.blocks, rows)
         else:
+            a = &self.csr
             indptr, indices, data = csr
-            self.csr.indptr, self.csr.indices = as_int_pointer(indptr, m + 1), as_int_pointer(indices, len(indices))
-            self.csr.data = as_double_pointer(data, len(data))
-            n_empty = lav_compute_csr_diagonal(&self.blocks, &self.csr, empty)
-        self._numbers, self._arrays = numbers_, [None, None, None]
+            a.indptr, a.indices = as_int_pointer(indptr, m + 1), as_int_pointer(indices, len(indices))
+            a.data = as_double_pointer(data, len(data))
+        derive_row_numbers(&self.blocks, a, r, &arena)
+        marks, numbers = allocate_bytes(arena.n_index * sizeof(int32_t)), new(arena.n_real)
+        arena = make_arena(as_double_pointer(numbers, arena.n_real), <int32_t*>marks.at)
+        n_empty = derive_row_numbers(&self.blocks, a, r, &arena)
+        self.keep = [blocks, b_, numbers, csr, rows]
+        self._numbers, self._arrays = numbers, [None, None, None]
         self.empty = _NONE
         if n_empty:
-            self.empty = make_read_only(np.array([i for i in range(m) if empty[i]], np.intp))
+            self.empty = make_read_only(np.array([i for i in range(m) if arena.index[i]], np.intp))
 
     def __dealloc__(self):
         free(self.derived.marks)
