@@ -20,8 +20,8 @@ from random_problems import (
 
 import lavender as lv
 
-# The largest number that a problem may have; the smallest mass or coefficient.
-LARGEST, SMALLEST = (1e60, 1e-60)
+# The largest number that a problem may have.
+LARGEST = 1e60
 SPECIAL = (0.0, 5e-324, 1e-300, 1e-61, 1e-60, 1e-59, 1e-30, 1e-20, 1.0, 1.0 + 2.0**-52, 1e20, 1e30, 1e59, LARGEST)
 SHAPES = {
     "inv_inertia": (-1, 3, 3), "v_free": (-1, 6), "jac": (-1, 12), "joint_body": (-1, 2), "contact_body": (-1, 2),

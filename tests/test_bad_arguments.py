@@ -522,9 +522,3 @@ def test_solve_with_a_wrong_option_of_any_solver_raises(solver, option):
     for value in ("no such word", np.nan, 1j, {1: 2}):
         with pytest.raises(lv.LavenderError, match=option):
             lv.solve(problem, solver, **{option: value})
-
-
-def test_residual_of_nan_is_infinite():
-    nan = [np.nan, 0.0]
-    assert lv.residual(LCP, nan).relative == lv.residual(LCP, nan, precision="float32").relative == np.inf
-    assert np.isnan(GENERAL.generalized.force(nan)).any()

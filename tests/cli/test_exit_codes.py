@@ -11,7 +11,7 @@ from lavender import cli
 
 COMMANDS_PAGE = Path(__file__).resolve().parents[2] / "docs" / "commands.md"
 AIR = '<mujoco><worldbody><body><freejoint/><geom size="1" friction="1"/></body></worldbody></mujoco>'
-#: (code, command). FOLDER contains an unreadable file.
+#: (code, command). FOLDER contains an unreadable file; AIR is a model of MuJoCo whose body touches nothing.
 ENDS = [
     (0, "solve PROBLEM"), (1, "solve PROBLEM --solver pgs --max-iter 1"),
     (0, "solve PROBLEM --solver pgs --max-iter 1 --tol 0"), (3, "solve INFEASIBLE --solver direct"),
@@ -26,7 +26,9 @@ ENDS = [
     (0, "contract sor --list"), (2, "contract nobody"), (0, "run stack --steps 2"),
     (1, "run stack --steps 9 --set gravity=1e60 --set dt=1e60 --set mass=1e60 --set substeps=60"), (2, "run nowhere"),
     (2, "view nothing.npz"), (2, "export c PROBLEM"), (1, "check granularF(n=3) --solvers sor"),
-    (0, "check granularF(n=3) --solvers sor,newton"),
+    (0, "check granularF(n=3) --solvers sor,newton"), (1, "slip AIR"), (2, "slip nothing.xml"),
+    (2, "audit nothing.xml"), (2, "record AIR --steps 1 --out recorded"),
+    (1, "tune AIR --worlds 2 --steps 10 --repeats 1"),
 ]  # fmt: skip
 #: Commands with a wrong word, number or combination of options.
 WRONG = """
@@ -42,23 +44,31 @@ solve random_spd(n=5000000) | check PROBLEM --reference nobody | run stac | run 
 run stack --iterations 3 | run stack --order given --set order=reverse | run stack --warm-start --set warm_start=false
 run stack --iterations 8 --set solver_iterations=4 | run stack --replace | run stack --plot x.plot
 run stack --film x.mp4 | record a.xml --out o --seed 3 --controls zero
-"""
-WRONG_OF_MUJOCO = """
 audit AIR --steps 0 | audit AIR --worlds 0 | audit AIR --keep 0 | audit AIR --engine kamino --workers 3 | audit PROBLEM
 audit AIR --engine kamino --precision float32 | tune AIR --worlds 1 | tune AIR --steps 3 --horizon 2 | tune PROBLEM
 record AIR --out r --steps 0 | slip AIR --steps 0 | slip AIR --contact wheel | slip PROBLEM
 tune AIR --worlds 2 --steps 2 --max-velocity-error -1
 """
-#: Commands that need MuJoCo; AIR is a model whose body touches nothing.
-MUJOCO_ENDS = [
-    (1, "slip AIR"), (2, "slip nothing.xml"), (2, "record AIR --steps 1 --out recorded"),
-    (1, "tune AIR --worlds 2 --steps 10 --repeats 1"), (2, "audit nothing.xml"),
-]  # fmt: skip
 
 
-def split_lines(text):
-    """Return the commands of a table, one by one."""
-    return [words.strip() for line in text.strip().splitlines() for words in line.split("|")]
+@pytest.fixture
+def run_line(lavender, tmp_path):
+    """Run a command in which words in capitals are files: (status, stdout, stderr)."""
+    stack(8).save(tmp_path / "PROBLEM.npz")
+    lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0]], [1.0, 1.0]).save(tmp_path / "INFEASIBLE.npz")
+    (tmp_path / "AIR.xml").write_text(AIR)
+    folder = tmp_path / "FOLDER"
+    folder.mkdir()
+    stack(4).save(folder / "good.npz")
+    (folder / "bad.npz").write_bytes(b"no problem")
+    places = {path.stem: path for path in tmp_path.glob("[A-Z]*")}
+
+    def run(line):
+        if line.split()[0] in ("audit", "record", "slip", "tune"):
+            pytest.importorskip("mujoco")
+        return lavender(*(places.get(word, word) for word in line.split()))
+
+    return run
 
 
 def test_documented_exit_codes_equal_the_package():
@@ -67,33 +77,13 @@ def test_documented_exit_codes_equal_the_package():
 
 
 @pytest.mark.parametrize(("code", "words"), ENDS, ids=[f"{words} is {code}" for code, words in ENDS])
-def test_command_ends_with_its_documented_code(lavender, tmp_path, code, words):
-    stack(8).save(tmp_path / "PROBLEM.npz")
-    lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0]], [1.0, 1.0]).save(tmp_path / "INFEASIBLE.npz")
-    folder = tmp_path / "FOLDER"
-    folder.mkdir()
-    stack(4).save(folder / "good.npz")
-    (folder / "bad.npz").write_bytes(b"no problem")
-    places = {"PROBLEM": tmp_path / "PROBLEM.npz", "INFEASIBLE": tmp_path / "INFEASIBLE.npz", "FOLDER": folder}
-    ended, out, err = lavender(*(places.get(word, word) for word in words.split()))
+def test_command_ends_with_its_documented_code(run_line, code, words):
+    ended, out, err = run_line(words)
     assert ended == code, out + err
 
 
-@pytest.mark.parametrize("words", [*split_lines(WRONG), *split_lines(WRONG_OF_MUJOCO)])
-def test_command_with_a_wrong_argument_prints_an_error_and_ends_with_2(lavender, tmp_path, words):
-    stack(8).save(tmp_path / "PROBLEM.npz")
-    (tmp_path / "air.xml").write_text(AIR)
-    if words in split_lines(WRONG_OF_MUJOCO):
-        pytest.importorskip("mujoco")
-    places = {"PROBLEM": tmp_path / "PROBLEM.npz", "AIR": tmp_path / "air.xml"}
-    ended, out, err = lavender(*(places.get(word, word) for word in words.split()))
+@pytest.mark.parametrize("words", re.split(r" \| |\n", WRONG.strip()))
+def test_command_with_a_wrong_argument_prints_an_error_and_ends_with_2(run_line, words):
+    ended, out, err = run_line(words)
     assert (ended, out) == (2, ""), out + err
     assert len(err.strip().splitlines()) == 1 or err.startswith("Usage: "), err
-
-
-@pytest.mark.parametrize(("code", "words"), MUJOCO_ENDS, ids=[f"{words} is {code}" for code, words in MUJOCO_ENDS])
-def test_mujoco_command_ends_with_its_documented_code(lavender, tmp_path, code, words):
-    pytest.importorskip("mujoco", reason="these commands step MuJoCo models")
-    (tmp_path / "air.xml").write_text(AIR)
-    ended, out, err = lavender(*(tmp_path / "air.xml" if word == "AIR" else word for word in words.split()))
-    assert ended == code, out + err

@@ -3,7 +3,7 @@
 import copy
 import json
 import pickle
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
 from types import SimpleNamespace
 
@@ -175,6 +175,7 @@ ERRORS = {
         lambda: lv.derivative(CONTACT, 0.99 * lv.solve(CONTACT, tol=1e-12).impulse),
         lambda: lv.derivative(CONTACT.updated(b=[9.0, 6.0, 0.0]), lv.solve(CONTACT, tol=1e-12)),
         lambda: lv.derivative(LCP, lv.solve(CONTACT)),
+        *(partial(lv.register, replace(lv.get("pgs"), name=name)) for name in ("my solver", "a\nb")),
         lambda: lv.Scene(friction=1e-61), lambda: lv.Scene(gravity=1e61), lambda: lv.Scene().add_box(mass=1e-61),
         *(partial(build, I3, np.ones(3), cones=contacts(0.5)) for build in (lv.Problem.linear, lv.Problem.lcp,
             partial(lv.Problem.contact, mu=[0.5]))),

@@ -151,6 +151,7 @@ def test_residual_of_an_impulse_that_is_not_finite_is_infinite():
                 lam = np.zeros(problem.m)
                 lam[row] = bad
                 assert lv.residual(problem, lam).relative == np.inf, (friction, bad, row)
+                assert lv.residual(problem, lam, "float32").relative == np.inf, (friction, bad, row)
 
 
 @given(seed=seeds)

@@ -140,9 +140,12 @@ def list_numbers(problem, impulse, solution):
     return [(name, np.asarray(x, float)) for name, x in numbers if x is not None]
 
 
-@pytest.mark.parametrize(("mass", "speed"), [(64.0, 1.0), (1.0, 2.0**-7), (2.0**-4, 8.0)])
+@pytest.mark.parametrize(
+    ("mass", "speed"), [(64.0, 1.0), (1.0, 2.0**-7), (2.0**-4, 8.0), (2.0**180, 2.0**-150), (2.0**-180, 2.0**150)]
+)
 @pytest.mark.parametrize("kind", CONTACTS)
 def test_numbers_of_the_judge_and_of_derivatives_have_their_documented_units(kind, mass, speed):
+    """The last two units are near the ends of the range of numbers, 1e-60 to 1e60."""
     bodies = add_compliance(CONTACTS[kind](5, "coulomb"), 0.02)
     changed, _ = scale_units(bodies, mass, speed)
     for form, make in FORMS.items():

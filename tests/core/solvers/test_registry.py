@@ -65,6 +65,8 @@ def test_available_selects_by_capabilities():
         lv.available(ordered=True)
     with pytest.raises(lv.UnknownName, match="law"):
         lv.available(law="lpc")
+    with pytest.raises(lv.UnknownName, match="did you mean 'sequential_impulses'"):
+        lv.solve(TINY, "si")  # its initials
 
 
 # -- from outside -----------------------------------------------------------------------------------
