@@ -6,9 +6,8 @@
 Cython writes the core of a module (`cdef ... noexcept nogil`) and its Python part into one file, and a declaration
 that several modules cimport into each of their files. Every file is parsed into its declarations (structs, enums,
 typedefs, functions, groups under `#if`). Starting from the roots, each name is resolved to the declaration that
-defines it, and the names which that declaration uses are resolved in turn. Bodies of functions, nine tenths of all
-tokens, are only parsed if the function is needed. A function that another module imports by pointer is replaced by the
-function itself. If a needed declaration uses Python, the error message names its user.
+defines it, and the names which that declaration uses are resolved in turn. A function that another module imports by
+pointer is replaced by the function itself. If a needed declaration uses Python, the error message names its user.
 
 Names lose the prefix of Cython (`__pyx_f_12lavender_ext_4core_5block_clip` becomes `core_block_clip`), core functions
 `lav_x` become `k_x`, and all declarations of the kernels are `static`: if a build omits parts of `front`
@@ -25,12 +24,11 @@ import re
 import runpy
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import ClassVar, NamedTuple
 
 PUBLIC = re.compile(r"^cdef public [^(\n]*?\b(lav_\w+)\(", re.MULTILINE)
 CIMPORT = re.compile(r"^from lavender_ext\.([\w.]+) cimport", re.MULTILINE)
@@ -76,29 +74,27 @@ PROLOGUE = """\
 #define likely(x) (x)
 #define unlikely(x) (x)
 """
-TOKEN = re.compile(
-    r"""(?P<directive>(?<![^\n])[ \t]*\#(?:\\\n|/\*.*?\*/|[^\n])*)
-      |(?P<skip>\n|/\*.*?\*/|//[^\n]*|[^\S\n]+(?=\n|/[/*]|\Z))
-      |(?P<space>[^\S\n]*)(?:
-       (?P<name>[A-Za-z_]\w*)
-      |(?P<literal>"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*'|\.?\d(?:[eEpP][+-]|[\w.])*)
-      |(?P<mark>[^\s\w]))""",
-    re.VERBOSE | re.DOTALL,
-)
-#: Matches braces, and texts that may contain a brace that is not one: preprocessor lines, comments and literals.
-BRACE = re.compile(
-    r"""\n[ \t]*\#(?:\\\n|/\*.*?\*/|[^\n])*|/\*.*?\*/|//[^\n]*|"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*'|[{}]""",
-    re.DOTALL,
+DIRECTIVE = r"#(?:\\\n|/\*.*?\*/|[^\n])*"
+OPAQUE = rf"""^[ \t]*{DIRECTIVE}|"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*'"""  # Texts in which nothing is a mark of C.
+COMMENT = re.compile(rf"{OPAQUE}|/\*.*?\*/|//[^\n]*", re.MULTILINE | re.DOTALL)
+MARK = re.compile(rf"{OPAQUE}|[{{}};]", re.MULTILINE | re.DOTALL)
+DIRECTIVE_LINE = re.compile(
+    rf"\s*^[ \t]*({DIRECTIVE})(?:\s*\n)?(?:[ \t]+(?=[^\s#]))?", re.MULTILINE | re.DOTALL
 )
 WORD = re.compile(r"[A-Za-z_]\w*")
+#: A word that is no member of a struct.
+NAME = re.compile(r"(?<![\w.])(?<!->)[A-Za-z_]\w*")
 DIGITS = re.compile(r"\d+")
-#: Words that need no declaration from the kernels: keywords of C, and words that the prologue defines.
-PREDEFINED = frozenset(
-    WORD.findall(
-        """CYTHON_INLINE CYTHON_UNUSED __PYX_EXTERN_C likely unlikely NULL DL_IMPORT auto break case char const continue
-        default do double else enum extern float for goto if inline int long register return short signed sizeof static
-        struct switch typedef union unsigned void volatile while"""
-    )
+#: Words that need no declaration from the kernels: some are defined by the prologue or by the headers.
+PREDEFINED = (
+    "CYTHON_INLINE",
+    "CYTHON_UNUSED",
+    "__PYX_EXTERN_C",
+    "likely",
+    "unlikely",
+    "NULL",
+    "DL_IMPORT",
+    "inline",
 )
 OPENING = ("if", "ifdef", "ifndef")
 #: Beginning of a name of Cython: function, type, enum, or the variant of a function with fused types, such as `0_1`.
@@ -109,260 +105,120 @@ class ExtractionError(Exception):
     """The C of the kernels could not be produced, or needs Python; the message names the place."""
 
 
-class Token(NamedTuple):
-    """A token of C with the white space before it."""
-
-    kind: str
-    text: str
-    before: str
-
-
 @dataclass
 class Item:
     """One declaration."""
 
     kind: str  # "macro", "type", "prototype", "variable", "function" or "group".
-    part: list[Token]
-    defines: set[str] = field(default_factory=set)  # Names that the declaration defines.
+    text: str
+    defines: set[str]  # Names that the declaration defines.
     origin: str = ""  # Module that contains the declaration.
-    kept_names: frozenset[str] = frozenset()  # Core functions that keep their names.
-
-    @cached_property
-    def all_tokens(self) -> list[Token]:
-        """All tokens, with the bodies of functions split into tokens."""
-        out: list[Token] = []
-        for token in self.part:
-            if token.kind != "body":
-                out.append(token)
-                continue
-            inside = tokenize_c(token.text[1:])
-            out += [Token("mark", "{", token.before), *inside]
-        return out
-
-    @cached_property
-    def output_text(self) -> str:
-        """Text of the declaration in the output."""
-        # Words in strings would be renamed, too; no string of a kernel contains such a word.
-        return WORD.sub(
-            lambda match: _make_output_name(match.group(), self.kept_names), _join_tokens(self.all_tokens)
-        )
 
     @cached_property
     def used_names(self) -> set[str]:
         """Words that may be names of other declarations."""
-        used: set[str] = set()
-        last = ""
-        for token in self.all_tokens:
-            words = [token.text] if token.kind == "name" and last not in (".", "->") else []
-            if token.kind == "directive":
-                words = WORD.findall(token.text)
-            last = "->" if last == "-" and token.text == ">" else token.text
-            used.update(words)
-        return {_make_output_name(name, self.kept_names) for name in used}
-
-    def rename(self, origin: str, kept_names: frozenset[str]) -> None:
-        """Set the module and the kept names, and replace the defined names by their names in the output."""
-        self.origin, self.kept_names = origin, kept_names
-        self.defines = {_make_output_name(name, kept_names) for name in self.defines}
+        return set(NAME.findall(self.text))
 
 
-def tokenize_c(text: str, bodies: bool = False) -> Iterator[Token]:
-    """Yield words, literals, marks and preprocessor lines of C; comments are white space.
-
-    With `bodies`, the text in braces after a closing parenthesis is one token, including its braces.
-    """
-    before, last, at = "", "", 0
-    while at >= 0:
-        start, at = at, -1
-        for match in TOKEN.finditer(text, start):
-            kind = match.lastgroup or ""
-            word = match[kind]
-            if kind == "skip":
-                before += word if word.isspace() else " "
-                continue
-            before += match["space"] or ""
-            if bodies and word == "{" and last == ")":
-                kind, at = "body", _find_end_of_block(text, match.end())
-                word = text[match.start("mark") : at]
-            last = word
-            yield Token(kind, word.lstrip() if kind == "directive" else word, before)
-            before = ""
-            if kind == "body":
-                break
+def parse_declarations(text: str, origin: str = "") -> list[Item]:
+    """Return the declarations of a C file without comments; those between `#if` and `#endif` form one group."""
+    items, at = [], 0
+    while MARK.search(text, at):
+        line = DIRECTIVE_LINE.match(text, at)
+        word = _get_directive(line)
+        if word in OPENING:
+            end = _find_end_of_group(text, at)
+        else:
+            end = line.end() if line else _find_end_of_declaration(text, at)
+        part, at = text[at:end].strip(), end
+        if word in OPENING:
+            inside = DIRECTIVE_LINE.sub(lambda m: m[0] if _get_directive(m) == "define" else "\n", part)
+            defines: set[str] = set().union(*(item.defines for item in parse_declarations(inside)))
+            items.append(Item("group", part, defines, origin))
+        elif word == "define":
+            items.append(Item("macro", part, {WORD.findall(part)[1]}, origin))
+        elif not line:
+            items.append(Item(*_parse_declaration(part), origin))
+    return items
 
 
-def _find_end_of_block(text: str, at: int) -> int:
-    """Return the position after the brace that closes the block with its first character at `at`."""
-    depth = 1
-    for match in BRACE.finditer(text, at):
-        depth += (match[0] == "{") - (match[0] == "}")
+def _get_directive(match: re.Match[str] | None) -> str:
+    """Return the first word of a preprocessor line; an empty text without one."""
+    return WORD.findall(match[1])[0] if match else ""
+
+
+def _find_end_of_group(text: str, at: int) -> int:
+    """Return the position after the #endif of the conditional that opens at `at`."""
+    depth = 0
+    for match in DIRECTIVE_LINE.finditer(text, at):
+        word = _get_directive(match)
+        depth += (word in OPENING) - (word == "endif")
         if depth == 0:
             return match.end()
     return len(text)
 
 
-def parse_declarations(text: str) -> list[Item]:
-    """Return the declarations of a C file; those between `#if` and `#endif` form one group."""
-    # In the C that Cython writes, all declarations are in the #else branch of `#ifndef Py_PYTHON_H`.
-    guarded = text.partition("\n#ifndef Py_PYTHON_H\n")[2].partition("\n#else\n")
-    return list(
-        _iterate_declarations(list(tokenize_c(guarded[2].rpartition("\n#endif")[0] or text, bodies=True)))
-    )
+def _find_end_of_declaration(text: str, at: int) -> int:
+    """Return the position after the declaration that begins at `at`: after the body of a function, or a semicolon."""
+    depth, has_body = 0, False
+    for match in MARK.finditer(text, at):
+        mark = match[0]
+        if mark == "{" and depth == 0:
+            has_body = text[at : match.start()].rstrip().endswith(")")
+        depth += (mark == "{") - (mark == "}")
+        if depth == 0 and (mark == ";" or (mark == "}" and has_body)):
+            return match.end()
+    return len(text)
 
 
-def _iterate_declarations(stream: list[Token]) -> Iterator[Item]:
-    """Yield the declarations of a sequence of tokens."""
-    at = 0
-    while at < len(stream):
-        word, stop = _get_directive(stream[at]), at + 1
-        if word in OPENING:
-            stop = _find_end_of_group(stream, at)
-            yield _make_conditional_group(stream[at:stop])
-        elif word == "define":
-            yield Item("macro", [stream[at]], {WORD.findall(stream[at].text)[1]})
-        elif not word:
-            stop = _find_end_of_declaration(stream, at)
-            yield _parse_declaration(stream[at:stop])
-        at = stop
-
-
-def _get_directive(token: Token) -> str:
-    """Return the first word of a preprocessor line; an empty text for any other token."""
-    if token.kind != "directive":
-        return ""
-    match = WORD.search(token.text)
-    return match.group() if match else ""
-
-
-def _find_end_of_group(stream: list[Token], at: int) -> int:
-    """Return the position after the #endif of the conditional that opens at `at`."""
-    depth = 0
-    for i in range(at, len(stream)):
-        word = _get_directive(stream[i])
-        depth += (word in OPENING) - (word == "endif")
-        if depth == 0:
-            return i + 1
-    return len(stream)
-
-
-def _find_end_of_declaration(stream: list[Token], at: int) -> int:
-    """Return the position after the declaration that begins at `at`."""
-    depth = 0
-    for i in range(at, len(stream)):
-        if stream[i].kind == "body" and depth == 0:
-            return i + 1
-        text = stream[i].text if stream[i].kind == "mark" else ""
-        if text in ("(", "[", "{"):
-            depth += 1
-        elif text in (")", "]", "}"):
-            depth -= 1
-        elif text == ";" and depth == 0:
-            return i + 1
-    return len(stream)
-
-
-def _join_tokens(part: list[Token]) -> str:
-    """Return the text of tokens, without empty lines, and with preprocessor lines on lines of their own."""
-    out = []
-    for i, token in enumerate(part):
-        before = token.before if i else ""
-        if before.count("\n") > 1:
-            before = re.sub(r"\n\s*\n", "\n", before)
-        if token.kind == "directive" or (i and part[i - 1].kind == "directive"):
-            before = "\n" if i else ""
-        out.append(before + token.text)
-    return re.sub(r"[ \t]+\n", "\n", "".join(out))
-
-
-def _make_conditional_group(part: list[Token]) -> Item:
-    """Return the group of all declarations between `#if` and `#endif`."""
-    group = Item("group", part)
-    for item in _iterate_declarations([token for token in part if token.kind != "directive"]):
-        group.defines |= item.defines
-    group.defines |= {WORD.findall(token.text)[1] for token in part if _get_directive(token) == "define"}
-    return group
-
-
-def _parse_declaration(part: list[Token]) -> Item:
-    """Return one declaration with its kind and the names that it defines, from its tokens."""
-    words = ["{" if token.kind == "body" else token.text for token in part]
-    names = [i for i, token in enumerate(part) if token.kind == "name"]
-    brace = words.index("{") if "{" in words else -1
-    call = words.index("(") if "(" in words else len(words)
-    if words[0] == "typedef":
-        pointers = [i for i in range(len(words) - 2) if words[i : i + 2] == ["(", "*"]]
-        if pointers and brace < 0:
-            return Item("type", part, {words[pointers[0] + 2]})
-        last = len(words) - 1 - words[::-1].index("}") if brace >= 0 else 0
-        return Item(
-            "type",
-            part,
-            {words[i] for i in names if i > last and words[i + 1] in (";", "[", "__attribute__")},
-        )
-    if words[0] in ("struct", "union", "enum") and (brace in (1, 2) or words[2:3] == [";"]):
-        item = Item("prototype" if words[2:3] == [";"] else "type", part, {words[1]} if brace != 1 else set())
-        depth = 0
-        for i in range(brace, len(words)) if words[0] == "enum" else ():
-            depth += (words[i] == "(") - (words[i] == ")")
-            if depth == 0 and words[i] in ("{", ",") and part[i + 1].kind == "name":
-                item.defines.add(words[i + 1])
-        return item
-    first = words.index("=") if "=" in words else len(words) - 1
-    if call < first and words[call + 1] == "*":  # A pointer to a function.
-        return Item("variable", part, {words[min(i for i in names if i > call and words[i] != "const")]})
-    if call < first:
-        return Item("function" if brace > call else "prototype", part, {words[call - 1]})
-    before = [i for i in names if i < first]
-    return Item("variable", part, {words[before[-1]]} if before else set())
+def _parse_declaration(text: str) -> tuple[str, str, set[str]]:
+    """Return the kind, the text and the defined names of one declaration."""
+    head, brace, _ = text.partition("{")
+    before, call, after = head.partition("=")[0].partition("(")
+    if text.startswith("typedef"):
+        pointer = None if brace else re.search(r"\(\s*\*\s*(\w+)", head)
+        ends = re.findall(r"(\w+)\s*(?=;|\[|__attribute__)", text.rpartition("}")[2])
+        return "type", text, {pointer[1]} if pointer else set(ends)
+    if tag := re.match(r"(struct|union|enum)\s*(\w*)\s*[{;]", text):
+        members = re.findall(r"[{,]\s*([A-Za-z_]\w*)", text) if tag[1] == "enum" else []
+        return "type" if brace else "prototype", text, {*filter(None, [tag[2]]), *members}
+    if call and after.startswith("*"):  # A pointer to a function.
+        return "variable", text, {next(word for word in WORD.findall(after) if word != "const")}
+    if call:
+        return "function" if brace else "prototype", text, {WORD.findall(before)[-1]}
+    return "variable", text, set(WORD.findall(before)[-1:])
 
 
 # -- resolution of names ------------------------------------------------------------------------------------
 
 
-class _Table:
-    """Declarations of all files, by the names that they define. A definition replaces a prototype or a pointer."""
+#: If several files declare a name, a definition replaces a prototype or a pointer.
+RANK = {"function": 3, "type": 3, "group": 2, "macro": 2, "variable": 1, "prototype": 0}
 
-    RANK: ClassVar = {"function": 3, "type": 3, "group": 2, "macro": 2, "variable": 1, "prototype": 0}
 
-    def __init__(self, items: Iterable[Item]) -> None:
-        self.by_name: dict[str, list[Item]] = {}
-        for item in items:
-            for name in item.defines:
-                self.by_name.setdefault(name, []).append(item)
-
-    def collect_needed_declarations(self, roots: Iterable[str]) -> list[Item]:
-        """Return all declarations that the names need, ordered so that each precedes its use."""
-        done: dict[int, Item] = {}
-        for name in sorted(roots):
-            self._add_with_dependencies(name, done, ())
-        return list(done.values())
-
-    def _add_with_dependencies(self, name: str, done: dict[int, Item], path: tuple[str, ...]) -> None:
-        """Add the declaration of a name and everything that it uses; `path` contains the names that led to it."""
-        if name not in self.by_name or name in PREDEFINED:
-            return
-        candidates = self.by_name[name]
-        item = max(candidates, key=lambda item: self.RANK[item.kind])
-        if id(item) in done:
-            return
-        if name in path:
-            raise ExtractionError(f"{' > '.join(path)} > {name} is a cycle")
-        for other in candidates:
-            if (
-                other.kind == item.kind == "function"
-                and other.part != item.part
-                and other.output_text != item.output_text
-            ):
-                raise ExtractionError(f"{name} is not the same in {item.origin} and {other.origin}")
-        if item.kind in ("variable", "prototype"):
-            if item.kind == "prototype" and item.output_text.startswith(("struct", "union")):
-                return
-            raise ExtractionError(
-                f"{path[-1] if path else 'a root'} needs {name}, which only the Python part defines ({item.origin})"
-            )
-        for used in sorted(item.used_names - item.defines):
-            self._add_with_dependencies(used, done, (*path, name))
-        done[id(item)] = item
+def _add_with_dependencies(
+    name: str, table: dict[str, list[Item]], done: dict[int, Item], path: tuple[str, ...] = ()
+) -> None:
+    """Add the declaration of a name after everything that it uses; `path` contains the names that led to it."""
+    if name not in table or name in PREDEFINED:
+        return
+    item = max(table[name], key=lambda item: RANK[item.kind])
+    if id(item) in done:
+        return
+    if name in path:
+        raise ExtractionError(f"{' > '.join(path)} > {name} is a cycle")
+    for other in table[name]:
+        if other.kind == item.kind == "function" and other.text != item.text:
+            raise ExtractionError(f"{name} is not the same in {item.origin} and {other.origin}")
+    if item.kind == "prototype" and item.text.startswith(("struct", "union")):
+        return
+    if item.kind in ("variable", "prototype"):
+        raise ExtractionError(
+            f"{path[-1] if path else 'a root'} needs {name}, which only the Python part defines ({item.origin})"
+        )
+    for used in sorted(item.used_names - item.defines):
+        _add_with_dependencies(used, table, done, (*path, name))
+    done[id(item)] = item
 
 
 def extract_c(translations: Iterable[tuple[str, str]], front: str = "", roots: Iterable[str] = ()) -> str:
@@ -382,26 +238,39 @@ def extract_c(translations: Iterable[tuple[str, str]], front: str = "", roots: I
     str
     """
     kept_names = frozenset(roots)
-    items = []
-    for name, text in translations:
-        declarations = parse_declarations(text)
-        for item in declarations:
-            item.rename(name, kept_names)
-        items += declarations
-    table, front_items = _Table(items), parse_declarations(front)
-    defined = set().union(*(item.defines for item in front_items))
-    reached = table.collect_needed_declarations(
-        set().union(*(item.used_names for item in front_items), kept_names) - defined
+    table: dict[str, list[Item]] = {}
+    for module, text in translations:
+        # In the C that Cython writes, all declarations are in the #else branch of `#ifndef Py_PYTHON_H`.
+        guarded = (
+            text.partition("\n#ifndef Py_PYTHON_H\n")[2].partition("\n#else\n")[2].rpartition("\n#endif")[0]
+        )
+        # Words in strings would be renamed, too; no string of a kernel contains such a word.
+        renamed = WORD.sub(lambda word: _make_output_name(word[0], kept_names), _remove_comments(guarded))
+        for item in parse_declarations(renamed, module):
+            for name in item.defines:
+                table.setdefault(name, []).append(item)
+    items = parse_declarations(_remove_comments(front))
+    used = kept_names.union(*(item.used_names for item in items)) - set().union(
+        *(item.defines for item in items)
     )
-    missing = sorted(kept_names - set(table.by_name))
+    reached: dict[int, Item] = {}
+    for name in sorted(used):
+        _add_with_dependencies(name, table, reached)
+    missing = sorted(kept_names - set(table))
     if missing:
         raise ExtractionError(f"no such core functions: {', '.join(missing)}")
-    return "\n\n".join([PROLOGUE, *(_make_static(item, kept_names) for item in reached), front])
+    return "\n\n".join([PROLOGUE, *(_make_static(item, kept_names) for item in reached.values()), front])
+
+
+def _remove_comments(text: str) -> str:
+    """Return C with a blank in place of each comment, except for those in preprocessor lines."""
+    return COMMENT.sub(lambda match: " " if match[0].startswith("/") else match[0], text)
 
 
 def _make_static(item: Item, kept_names: frozenset[str]) -> str:
     """Return the text of a declaration; a function is `static` unless it keeps its name."""
-    text = item.output_text
+    text = DIRECTIVE_LINE.sub(r"\n\1\n", item.text).strip()
+    text = re.sub(r"[ \t]+\n", "\n", re.sub(r"\n\s*\n", "\n", text))
     if item.kind == "function":
         text = re.sub(r"^(?:static\s+)?(?:CYTHON_INLINE\s+)?", "", text)
         inline = "inline " if "CYTHON_INLINE" in item.used_names else ""
