@@ -201,16 +201,18 @@ class Solutions(WorldResults, Sequence[Solution]):
         impulse, late = self._impulse[self._get_rows(i)].copy(), self._worlds.code[i] == CODE["late"]
         impulse.setflags(write=False)
         status = Status.TIME_LIMIT if late else Status.CONVERGED
-        rest = self._make_postponed_fields, (i, impulse, status)
-        solution = Solution.with_late_fields(impulse, status, self.tol, self._time_per_world, rest)
         guess = None if type(self.problems) is Batch else self.problems[i].guess
 
         def judge_world(i: int) -> Residual:
             problem = self.problems[i]
             return make_residual(problem, judge_impulse(problem, impulse).refine(self.tol))
 
-        judged = self._make_residual(i, judge_world)
-        return solution.with_fields(start=name_start(guess, self.get_start(i)), residual=judged)
+        return Solution.from_fields({
+            "impulse": impulse, "status": status, "tol": self.tol, "setup_time": 0.0,
+            "solve_time": self._time_per_world, "residual": self._make_residual(i, judge_world),
+            "start": name_start(guess, self.get_start(i)),
+            "_rest": (self._make_postponed_fields, (i, impulse, status)),
+        })  # fmt: skip
 
     def _make_postponed_fields(self, i: int, impulse: FloatArray, status: Status) -> dict[str, Any]:
         """Compute the fields of a solution that are computed only at its first access."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -148,7 +147,14 @@ def diagnose_masses(p: Problem) -> Iterator[Diagnostic]:
     if r is None or not r.n_bodies:
         return
     eigen = np.linalg.eigvalsh(r.inv_inertia)
-    size = _compute_longest_arms(r)
+    # Compute the longest arm of each body over contacts and joint rows with a linear part.
+    size, joint = np.zeros(r.n_bodies), np.repeat(r.joint_body, np.diff(r.joint_ptr), axis=0)
+    for side in (0, 1):
+        body, arm = r.contact_body[:, side], np.linalg.norm(r.arm_b if side else r.arm_a, axis=1)
+        np.maximum.at(size, body[body >= 0], arm[body >= 0])
+        push, turn = (np.linalg.norm(r.jac[:, 6 * side + k : 6 * side + k + 3], axis=1) for k in (0, 3))
+        has = (joint[:, side] >= 0) & (push > 0.0)
+        np.maximum.at(size, joint[has, side], turn[has] / push[has])
     known = np.flatnonzero((r.inv_mass > 0.0) & (eigen[:, 0] > 1e-9 * eigen[:, -1]) & (size > 0.0))
     if not len(known):
         return
@@ -174,20 +180,6 @@ def diagnose_masses(p: Problem) -> Iterator[Diagnostic]:
     if density < 0.05 and 10.0 < np.median(m / s2**1.5) < 3e4:
         reason = f"bodies are lighter than air ({density:.2g} kg/m^3 by the arms), ordinary with {given[0]}"
         yield make_diagnostic(p, "masses", reason, density=float(density))
-
-
-def _compute_longest_arms(r: Any) -> FloatArray:
-    """Return the longest arm of each body (n,) [m] over contacts and joint rows with a linear part."""
-    size = np.zeros(r.n_bodies)
-    joint = np.repeat(r.joint_body, np.diff(r.joint_ptr), axis=0)
-    for side in (0, 1):
-        body = r.contact_body[:, side]
-        arm = np.linalg.norm(r.arm_b if side else r.arm_a, axis=1)
-        np.maximum.at(size, body[body >= 0], arm[body >= 0])
-        push, turn = (np.linalg.norm(r.jac[:, 6 * side + k : 6 * side + k + 3], axis=1) for k in (0, 3))
-        has = (joint[:, side] >= 0) & (push > 0.0)
-        np.maximum.at(size, joint[has, side], turn[has] / push[has])
-    return size
 
 
 def find_free_bodies(mass: FloatArray) -> list[int]:

@@ -135,7 +135,11 @@ class Gradient(GradientArrays):
                 else problem.matrix
             )
             pairs = self._list_outer_product_pairs(name)
-            return _sum_on_pattern(pattern, *pairs) if issparse(pattern) else np.outer(*pairs[0])
+            if not issparse(pattern):
+                return np.outer(*pairs[0])
+            row = np.repeat(np.arange(pattern.shape[0]), np.diff(pattern.indptr))
+            data = sum(u[row] * v[pattern.indices] for u, v in pairs)
+            return sp.csr_array((data, pattern.indices, pattern.indptr), shape=pattern.shape)
         rows, gradient = derivative._coefficient_rows, self._by_row_coefficient
         if name == "rolling":
             return rows.select_rows_or_zero(gradient, rows.rolling)
@@ -195,10 +199,3 @@ class Gradient(GradientArrays):
             raise InputError(f"full needs one of {', '.join(MATRICES)}; {name!r} has no pattern")
         getattr(self, name)  # Raises CapabilityError if the gradient does not exist.
         return np.asarray(sum(np.outer(u, v) for u, v in self._list_outer_product_pairs(name)))
-
-
-def _sum_on_pattern(pattern: Any, *pairs: tuple[FloatArray, FloatArray]) -> sp.csr_array:
-    """Compute the sum of u v^T over `pairs` at the non-zero positions of the matrix `pattern`."""
-    row = np.repeat(np.arange(pattern.shape[0]), np.diff(pattern.indptr))
-    data = sum(u[row] * v[pattern.indices] for u, v in pairs)
-    return sp.csr_array((data, pattern.indices, pattern.indptr), shape=pattern.shape)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from enum import Enum
 from types import MappingProxyType
@@ -293,28 +293,12 @@ class Solution:
 
     @classmethod
     def from_fields(cls, values: dict[str, Any]) -> Solution:
-        """Build a solution from all its fields by name, without copying or checking them."""
-        solution: Solution = make_instance(cls, values)
-        return solution
+        """Build a solution from its fields by name, without copying or checking them.
 
-    @classmethod
-    def with_late_fields(
-        cls,
-        impulse: FloatArray,
-        status: Status,
-        tol: float,
-        solve_time: float,
-        rest: tuple[Callable[..., dict[str, Any]], tuple[Any, ...]],
-        setup_time: float = 0.0,
-    ) -> Solution:
-        """Build a solution from the fields that are known; `rest` computes the other fields at the first access to one.
-
-        `rest` is a function and its arguments; the function returns the fields by name.
+        `_rest`, a function that returns the other fields by name, and its arguments, replaces fields that are computed
+        when one of them is first read.
         """
-        solution: Solution = make_instance(cls, {
-            "impulse": impulse, "status": status, "tol": tol, "setup_time": setup_time, "solve_time": solve_time,
-            "_rest": rest,
-        })  # fmt: skip
+        solution: Solution = make_instance(cls, values)
         return solution
 
     def with_fields(self, **values: Any) -> Solution:

@@ -8,14 +8,22 @@ from typing import TYPE_CHECKING, Any, TypedDict, TypeVar
 
 import numpy as np
 
-from lavender.base.arrays import ArrayLike, FloatArray, IntArray, as_array, get_common_precision, get_shape
-from lavender.base.errors import InputError
+from lavender.base.arrays import (
+    ArrayLike,
+    FloatArray,
+    IntArray,
+    as_array,
+    get_common_precision,
+    get_shape,
+    mark_read_only,
+)
+from lavender.base.errors import InputError, check_name
 from lavender.base.lazy_import import issparse
 from lavender.problem.cones import Cones
 from lavender.problem.contact_rows import make_contacts, make_contacts_of_rows, make_joints
-from lavender.problem.data import check_matrix
+from lavender.problem.data import check_matrix, check_rhs
 from lavender.problem.findex import convert_from_findex, convert_to_findex, order_findex_rows
-from lavender.problem.friction import check_shape
+from lavender.problem.friction import SHAPES
 from lavender.problem.generalized import Generalized
 from lavender.problem.operators import Operators
 from lavender.problem.program import make_quadratic_program
@@ -299,14 +307,16 @@ class Builders(Operators):
         if tangents is None:
             tangents = 2 * (mu > 0.0).astype(np.int32)
         tangents = as_array("tangents", tangents, mu.shape, dtype=np.int32)
-        contacts = make_contacts(mu, tangents, patch_radius, rolling, check_shape("shape", shape))
+        contacts = make_contacts(mu, tangents, patch_radius, rolling, check_name("shape", shape, SHAPES))
         joints = make_joints(rows, lower, upper)
         cones = joints + contacts if rows.n_joints else contacts
         m = cones.n_rows
         target = as_array("target", target, (m,), unit="m/s")
         problem, jv = cls(np.zeros(m), cones, rows=rows, **more), np.zeros(m + 1)
         multiply_body_jacobian(problem.data, rows.v_free, jv)
-        problem._set_rhs(target - jv[:m])
+        problem.b.setflags(write=True)  # No other code has access to the problem yet.
+        problem.b[:] = target - jv[:m]
+        check_rhs(mark_read_only(problem.b))
         return problem
 
     @classmethod

@@ -38,12 +38,11 @@ from lavender.base.arrays import (
     mark_read_only,
     resolve_index,
 )
-from lavender.base.errors import InputError
+from lavender.base.errors import InputError, check_name
 from lavender.problem.derived import cached_property
 from lavender.problem.friction import (
     MIN_COEFFICIENT_RATIO,
     SHAPES,
-    check_shape,
     convert_ellipse_coefficients,
     make_contact_blocks,
     project_impulse,
@@ -354,7 +353,7 @@ class Cones:
             box has no friction along one tangent.
         """
         kind, radius, has_pair = self.kind.copy(), self.patch_radius.copy(), self.n_tangents > 1
-        if check_shape("shape", shape) == "box":
+        if check_name("shape", shape, SHAPES) == "box":
             bad = np.flatnonzero(has_pair & ~np.isin(self.kind, (CONTACT, CONTACT_BOX, CONTACT_ELLIPSE)))
             if len(bad):
                 raise InputError(f"block {bad[0]} has spin, rolling or over two tangents, which no box has")

@@ -175,15 +175,6 @@ class ProblemData:
     def _check_magnitudes(self) -> None:
         """Raise InputError if an entry of A's diagonal may be too large."""
 
-    def _set_rhs(self, b: FloatArray) -> None:
-        """Replace the zeros of a new problem's right-hand side by b (m,) [m/s].
-
-        Allowed only before other code has access to the problem.
-        """
-        self.b.setflags(write=True)
-        self.b[:] = b
-        check_rhs(mark_read_only(self.b))
-
     def _check_rows(self, rows: Rows, k: int) -> None:
         """Raise InputError if the rows do not fit the cones of k blocks."""
         if not isinstance(rows, Rows):

@@ -21,26 +21,6 @@ SHAPES = ("disk", "box")
 MIN_COEFFICIENT_RATIO = 2.0**-60
 
 
-def check_shape(name: str, shape: Any) -> str:
-    """Return a shape of friction; raise UnknownName unless it is one of `SHAPES`."""
-    check_name(name, shape, SHAPES)
-    return shape
-
-
-def check_friction_combination(
-    mu: Any, tangents: int, spin: bool, rolling: bool, is_box: bool, is_pair: bool
-) -> None:
-    """Raise InputError if no kind of contact has this combination of rows."""
-    if is_box and (spin or rolling or tangents > 2):
-        raise InputError("a box has up to two tangents, without spin (patch_radius) and rolling")
-    if is_pair and not is_box:
-        raise InputError(f"mu has shape {np.shape(mu)}, of ellipses; (k,) is needed with spin or rolling")
-    if tangents > 2 and spin:
-        raise InputError(f"{tangents} tangents make a round cone, which has spin: leave patch_radius out")
-    if rolling and tangents != 2:
-        raise InputError(f"tangents is {tangents}; rolling needs tangents=2, the axes of rolling")
-
-
 def _convert_coefficient_pairs(mu: Any) -> FloatArray:
     """Convert coefficients of two tangents to a checked array (k, 2)."""
     array = as_array("mu", mu, (None,) * np.ndim(mu))
@@ -48,16 +28,6 @@ def _convert_coefficient_pairs(mu: Any) -> FloatArray:
     if array.ndim != 2 or array.shape[1] != 2:
         raise InputError(f"mu has shape {array.shape}; (k,) or (k, 2), one for each tangent, is needed")
     return array
-
-
-def convert_box_coefficients(mu: Any) -> tuple[Any, FloatArray]:
-    """Return mu_1 (float or (k,)) and mu_2 / mu_1 (1,) or (k,) of boxes with mu scalar, (k,) or (k, 2)."""
-    if np.ndim(mu) < 2:
-        return mu, np.ones(1)
-    first, second = _convert_coefficient_pairs(mu).T
-    smallest = MIN_COEFFICIENT_RATIO * second
-    first = np.where((first <= smallest) & (second > 0.0), smallest, first)
-    return first, np.divide(second, first, out=np.zeros(len(first)), where=first > 0.0)
 
 
 def convert_ellipse_coefficients(mu: Any) -> tuple[FloatArray, FloatArray | None]:
@@ -80,15 +50,26 @@ def make_contact_blocks(
     """Build the blocks of k contacts with the same rows, which may have a fault; `Cones.contacts` has the arguments."""
     if type(tangents) is not int or not 0 <= tangents <= 5:
         tangents = check_int("tangents", tangents, 0, 5)
-    is_box = check_shape("shape", shape) == "box"
+    is_box = check_name("shape", shape, SHAPES) == "box"
     is_pair = type(mu) is not float and len(get_shape("mu", mu)) > 1
     has_spin, has_rolling = patch_radius is not None, rolling is not None
     if has_spin or has_rolling or tangents != 2:
-        check_friction_combination(mu, tangents, has_spin, has_rolling, is_box, is_pair)
+        if is_box and (has_spin or has_rolling or tangents > 2):
+            raise InputError("a box has up to two tangents, without spin (patch_radius) and rolling")
+        if is_pair and not is_box:
+            raise InputError(f"mu has shape {np.shape(mu)}, of ellipses; (k,) is needed with spin or rolling")
+        if tangents > 2 and has_spin:
+            raise InputError(f"{tangents} tangents make a round cone, which has spin: leave patch_radius out")
+        if has_rolling and tangents != 2:
+            raise InputError(f"tangents is {tangents}; rolling needs tangents=2, the axes of rolling")
     ratio, pair_kind = None, 0
     if is_box and tangents == 2:
-        pair_kind = BOX_KIND
-        mu, ratio = convert_box_coefficients(mu)
+        pair_kind, ratio = BOX_KIND, np.ones(1)
+        if is_pair:
+            mu, second = _convert_coefficient_pairs(mu).T
+            smallest = MIN_COEFFICIENT_RATIO * second
+            mu = np.where((mu <= smallest) & (second > 0.0), smallest, mu)
+            ratio = np.divide(second, mu, out=np.zeros(len(mu)), where=mu > 0.0)
     elif is_pair and not is_box:
         mu, ratio = convert_ellipse_coefficients(mu)
         pair_kind = 0 if ratio is None else ELLIPSE_KIND

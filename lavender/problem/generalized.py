@@ -366,17 +366,12 @@ class Generalized:
 
     def __reduce__(self) -> tuple[Any, ...]:
         if "v_free" not in self.__dict__:
-            return _restore_unfactored, (self.jac, self.mass)
+            lower = extract_lower_triangle("M", self.mass, "")
+            return Generalized.from_validated, (convert_to_compressed_rows("J", self.jac), lower)
         return Generalized, (self.jac, self.mass, self.v_free, self.names)
 
     def __repr__(self) -> str:
         return f"<Generalized {self.m} rows, {self.nv} velocities>"
-
-
-def _restore_unfactored(jac: sp.csr_array, mass: sp.csr_array) -> Generalized:
-    """Build the result of `Generalized.from_validated` from J and both triangles of M."""
-    lower = extract_lower_triangle("M", mass, "")
-    return Generalized.from_validated(convert_to_compressed_rows("J", jac), lower)
 
 
 # -- conversion of arguments --------------------------------------------------------------------------

@@ -28,7 +28,7 @@ whose matrix is not symmetric. Solvers of quadratic programs receive P, q, J and
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -222,7 +222,8 @@ class QuadraticProgram:
         matrix.eliminate_zeros()
         matrix.sort_indices()
         b = np.concatenate([-self.q, self.target])
-        names = Names(len(b), partial(_make_program_names, n, len(b) - n))
+        numbers = range(len(b))
+        names = Names(len(b), lambda: [f"variable {i}" if i < n else f"constraint {i - n}" for i in numbers])
         cones = _make_one_sided_cones(n + self.free, len(b))
         return {"b": b, "cones": cones, "matrix": matrix, "names": names}
 
@@ -365,11 +366,6 @@ class QuadraticProgram:
         )  # fmt: skip
 
 
-def _make_program_names(n: int, m: int) -> list[str]:
-    """Return default names of the unknowns and constraints of a quadratic program."""
-    return [f"variable {i}" for i in range(n)] + [f"constraint {i}" for i in range(m)]
-
-
 def _make_csr(rows: Any, n: int) -> Any:
     """Return compressed rows of n columns as `csr_array`."""
     ptr, idx, value = rows
@@ -433,20 +429,6 @@ def _unpack_arguments(arguments: ProgramArrays) -> ProgramArrays:
     return tuple(getattr(P, name) for name in names)
 
 
-def _convert_matrix(name: str, matrix: Any, n: int, sign: float) -> Compressed:
-    """Convert a dense or sparse matrix of n columns times a sign to checked compressed rows without zeros.
-
-    A one-dimensional array is a single row.
-    """
-    sparse = issparse(matrix)
-    if not sparse:
-        dense = as_array_view(name, matrix, (None,) * max(1, len(get_shape(name, matrix))))
-        matrix = dense[None] if dense.ndim == 1 else dense
-    if len(matrix.shape) != 2 or matrix.shape[1] != n:
-        raise InputError(f"{name} has shape {matrix.shape}; (any, {n}) is needed, as q has {n} entries")
-    return convert_to_compressed_rows(name, matrix, sign) if sparse else dense_to_csr(matrix, sign)
-
-
 def _convert_hessian(P: Any, n: int) -> Compressed:
     """Return the lower triangle of P with its diagonal."""
     if get_shape("P", P) != (n, n):
@@ -474,7 +456,13 @@ def _convert_rows(
         raise InputError(f"{missing} is missing; both or neither of {name} and {rhs_name} are needed")
     if matrix is None:
         return None, None
-    rows = _convert_matrix(name, matrix, n, sign)
+    sparse = issparse(matrix)
+    if not sparse:
+        dense = as_array_view(name, matrix, (None,) * max(1, len(get_shape(name, matrix))))
+        matrix = dense[None] if dense.ndim == 1 else dense  # A one-dimensional array is a single row.
+    if len(matrix.shape) != 2 or matrix.shape[1] != n:
+        raise InputError(f"{name} has shape {matrix.shape}; (any, {n}) is needed, as q has {n} entries")
+    rows = convert_to_compressed_rows(name, matrix, sign) if sparse else dense_to_csr(matrix, sign)
     rhs = as_array(rhs_name, rhs, (len(rows[0]) - 1,), finite=name == "A")
     if name == "G" and not all_finite(rhs):
         check_not_nan(rhs_name, rhs)

@@ -25,7 +25,7 @@ from lavender.base.arrays import (
 from lavender.base.errors import InputError, check_name
 from lavender.problem.cones import Cones
 from lavender.problem.data import Names
-from lavender.problem.friction import check_shape
+from lavender.problem.friction import SHAPES
 from lavender.problem.problem import Problem
 from lavender.problem.rows import Rows, check_and_symmetrise_inertia
 from lavender_ext.core.checks import MIN_MAGNITUDE, find_body_fault
@@ -566,7 +566,7 @@ class RowBuilder:
         Problem
             `lv.solve(problem, impulse=previous)` starts from the solution of the step before.
         """
-        is_box = check_shape("shape", shape) == "box"
+        is_box = check_name("shape", shape, SHAPES) == "box"
         blocks, rows, b, compliance, keys = self._blocks.export(is_box)
         given = dict(self._names)
         return Problem(

@@ -137,7 +137,13 @@ class Rows:
         ptr = as_array("joint_ptr", joint_ptr, (None,), dtype=np.int32, copy=copy)
         if not checks.are_pointers_valid(ptr, 1):
             raise InputError(f"joint_ptr is {ptr.tolist()!s:.60}; it must start with 0 and increase")
-        _check_joint_counts(ptr, jac, joint_body)
+        rows, joints = get_shape("jac", jac), get_shape("joint_body", joint_body)
+        are_tables = all(len(shape) == 2 or shape == (0,) for shape in (rows, joints))
+        if are_tables and (rows[0], joints[0]) != (ptr[-1], len(ptr) - 1):
+            raise InputError(
+                f"jac has {rows[0]} joint rows, joint_body has {joints[0]} joints, and joint_ptr is "
+                f"{ptr.tolist()!s:.60}, default [0]; the first row of each joint, then the number of rows is needed"
+            )
         numbers: dict[str, tuple[Any, tuple[int | None, ...]]] = {
             "inv_mass": (inv_mass, (n,)), "inv_inertia": (inv_inertia, (n, 3, 3)), "v_free": (v_free, (n, 6)),
             "jac": (jac, (int(ptr[-1]), 12)), "normal": (normal, (c, 3)), "tangent": (tangent, (c, 3)),
@@ -187,11 +193,8 @@ class Rows:
             object.__setattr__(
                 self, "inv_inertia", check_and_symmetrise_inertia("inv_inertia", self.inv_inertia)
             )
-        if self.n_contacts:
-            self._orthonormalise_frames()
-
-    def _orthonormalise_frames(self) -> None:
-        """Orthonormalise normals and tangents that float32 has rounded; raise InputError for larger errors."""
+        if not self.n_contacts:
+            return
         normal, tangent = self.normal.copy(), self.tangent.copy()
         i, error = checks.correct_frames(normal, tangent, MAX_UNCORRECTED_ERROR)
         if error > MAX_CORRECTED_ERROR:
@@ -300,17 +303,6 @@ class Rows:
     def __reduce__(self) -> tuple[Any, ...]:
         # Copies and pickles are built by the constructor, which marks their arrays read-only.
         return type(self), tuple(f.name != "copy" and getattr(self, f.name) for f in fields(self))
-
-
-def _check_joint_counts(ptr: IntArray, jac: Any, joint_body: Any) -> None:
-    """Raise InputError if `joint_ptr` describes other joints than `jac` and `joint_body`."""
-    rows, joints = get_shape("jac", jac), get_shape("joint_body", joint_body)
-    are_tables = all(len(shape) == 2 or shape == (0,) for shape in (rows, joints))
-    if are_tables and (rows[0], joints[0]) != (ptr[-1], len(ptr) - 1):
-        raise InputError(
-            f"jac has {rows[0]} joint rows, joint_body has {joints[0]} joints, and joint_ptr is "
-            f"{ptr.tolist()!s:.60}, default [0]; the first row of each joint, then the number of rows is needed"
-        )
 
 
 def check_and_symmetrise_inertia(name: str, tensors: FloatArray) -> FloatArray:

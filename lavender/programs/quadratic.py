@@ -360,11 +360,11 @@ class _Task:
                     f"says CONVERGED, the program's error {judge.error:.1e} is above tol {self.tol:.1e}"
                 )
             status = STALLED
-        solution = Solution.with_late_fields(
-            impulse, status, self.tol, perf_counter() - begun,
-            (self._compute_late_fields, (impulse, last, conflict, is_found)),
-        )  # fmt: skip
-        solution = solution.with_fields(program_error=judge.error)
+        solution = Solution.from_fields({
+            "impulse": impulse, "status": status, "tol": self.tol, "setup_time": 0.0,
+            "solve_time": perf_counter() - begun, "program_error": judge.error,
+            "_rest": (self._compute_late_fields, (impulse, last, conflict, is_found)),
+        })  # fmt: skip
         if conflict:
             solution = solution.with_fields(claim_check=CONTRADICTED)
         return QPSolution(

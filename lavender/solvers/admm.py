@@ -88,11 +88,6 @@ class AdmmState:
             new.factorisations = int(bool(self.first) and new.has_factor)
         return new
 
-    def keep_factor(self) -> None:
-        """Keep the factor for the first rho for `renew`."""
-        names = ("factor", "lu", "full", "matrix", "system")
-        self.first = {name: getattr(self, name) for name in names}
-
     def scale_and_factor(self) -> None:
         """Scale, analyse and factor, unless that was done; raise `_OutOfTime` after the deadline."""
         while self.next_steps:
@@ -281,7 +276,8 @@ class ADMM(Solver):
         """Scale and factor; matrix and factor stay while only b changes."""
         with suppress(_Breakdown):  # `run` repeats the set-up and reports the error.
             state.scale_and_factor()
-            state.keep_factor()
+            names = ("factor", "lu", "full", "matrix", "system")
+            state.first = {name: getattr(state, name) for name in names}
 
     def update(self, state: AdmmState, problem: Problem) -> AdmmState:
         """Build the state for new numbers; matrix and factor stay if only b is new."""

@@ -24,7 +24,6 @@ from lavender.solvers.sweeping import (
     SweepState,
     choose_sweep_data,
     form_name,
-    is_sweep_over_jacobian_cheaper,
 )
 
 
@@ -33,9 +32,6 @@ class BlockGaussSeidel(Sweeping):
     """Block Gauss-Seidel; `order`, `ground` and `seed` as in `lavender.problem.ordering`."""
 
     keeps_last = True
-
-    def _sweeps_over_matrix(self, problem: Problem) -> bool:
-        return problem.rows is None and not is_sweep_over_jacobian_cheaper(problem)
 
     def _build_state(self, problem: Problem, order: Order, before: SweepState | None) -> SweepState:
         return SweepState(problem, choose_sweep_data(problem), order, keeps_last=self.keeps_last, exact=True)

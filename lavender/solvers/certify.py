@@ -58,24 +58,18 @@ def prove_relaxation_infeasible(
     problem: Problem, tol: float, deadline: Deadline | None = None
 ) -> Proof | None:
     """Return the proof that the convex relaxation has no solution, or None."""
-    inner = problem.relaxed("cone")
-    claim = _run_newton(inner, MAX_RELAXATION_STEPS, tol, deadline)
-    if claim is None or claim.certificate is None:
+    inner, spec = problem.relaxed("cone"), get("newton")
+    left = None if deadline is None else deadline.get_remaining_seconds()
+    if spec.refuses(inner) is not None or (left is not None and left <= 0.0):
+        return None
+    solver = spec.load()()
+    claim = solver.run(solver.prepare(inner), inner.start(), MAX_RELAXATION_STEPS, tol, left)
+    if claim.status is Status.INTERRUPTED:
+        raise KeyboardInterrupt
+    if claim.certificate is None:
         return None
     proof = prove_infeasibility(inner, claim.certificate, tol, deadline)
     return None if proof.reason else proof
-
-
-def _run_newton(problem: Problem, steps: int, tol: float, deadline: Deadline | None) -> Claim | None:
-    """Run Newton's method from zero; return its claim, or None if it refuses the problem."""
-    spec, left = get("newton"), None if deadline is None else deadline.get_remaining_seconds()
-    if spec.refuses(problem) is not None or (left is not None and left <= 0.0):
-        return None
-    solver = spec.load()()
-    claim = solver.run(solver.prepare(problem), problem.start(), steps, tol, left)
-    if claim.status is Status.INTERRUPTED:
-        raise KeyboardInterrupt
-    return claim
 
 
 @np.errstate(all="ignore")  # Results that overflow are judged.
@@ -241,7 +235,7 @@ def find_certificate_by_linear_program(problem: Problem, deadline: Deadline) -> 
 
 def check_infeasibility_claim(
     problem: Problem, claim: Claim, tol: float, deadline: Deadline
-) -> tuple[Claim, bool, str]:
+) -> tuple[Claim, str]:
     """Check the claim of another package's solver or of a plug-in that a problem has no solution.
 
     If its certificate is not valid, `auto` searches for one.
@@ -250,26 +244,24 @@ def check_infeasibility_claim(
     -------
     Claim
         The claim, with the certificate of `auto` if that found one.
-    bool
-        Whether the certificate of the returned claim is valid.
     str
         Description of the solution that `auto` found instead, or empty.
     """
     if _is_proof(problem, claim, tol, deadline):
-        return claim, True, ""
+        return claim, ""
     spec, left = get("auto"), deadline.get_remaining_seconds()
     if problem.m > CERTIFICATE_ROWS or (left is not None and left <= 0.0):
-        return claim, False, ""
+        return claim, ""
     solver, impulse = spec.load()(), problem.start()
     own_claim = solver.run(solver.prepare(problem), impulse, spec.max_iter, tol, left)
     if own_claim.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
     if _is_proof(problem, own_claim, tol, deadline):
         message = f"{claim.message}; auto found the certificate".removeprefix("; ")
-        return replace(claim, certificate=own_claim.certificate, message=message), True, ""
+        return replace(claim, certificate=own_claim.certificate, message=message), ""
     relative = residual(problem, impulse, "float64").relative
     solution = f"auto found a solution to a relative residual of {relative:.1e}"
-    return claim, False, solution if relative <= tol else ""
+    return claim, solution if relative <= tol else ""
 
 
 def _is_proof(problem: Problem, claim: Claim, tol: float, deadline: Deadline) -> bool:

@@ -99,23 +99,14 @@ class Lemke(Solver):
                 status = Status.MAX_ITERATIONS
             else:
                 continue
-            if status is Status.STALLED:
-                proof = _find_certificate_by_linear_program(state.problem, tol, deadline)
-                if proof is not None:
+            problem = state.problem
+            if status is Status.STALLED and problem.m <= CERTIFICATE_ROWS and not deadline.has_passed():
+                proof = find_certificate_by_linear_program(problem, deadline)
+                if proof is not None and check_certificate(problem, proof, tol, deadline) is None:
                     status, certificate = Status.INFEASIBLE, proof
                     message = "a linear program found a certificate"
             work = rows.work | {"pivots": paths.pivots, "paths": paths.paths}
             return Claim(status, paths.pivots, work, message, form="dense", certificate=certificate)
-
-
-def _find_certificate_by_linear_program(
-    problem: Problem, tol: float, deadline: Deadline
-) -> FloatArray | None:
-    """Search a certificate (m,) by a linear program, for a problem on which Lemke's method failed; None without one."""
-    if problem.m > CERTIFICATE_ROWS or deadline.has_passed():
-        return None
-    y = find_certificate_by_linear_program(problem, deadline)
-    return y if y is not None and check_certificate(problem, y, tol, deadline) is None else None
 
 
 def _get_refusal_reason(problem: Problem) -> str | None:

@@ -187,9 +187,13 @@ class Newton(Solver):
         bodies = kernel = None
         over_velocities = problem.generalized is not None and self.form != "impulse"
         if over_velocities:
-            max_cost = inf
-            if self.form == "auto":
-                max_cost = VELOCITY_MAX_COST_RATIO * _estimate_full_matrix_cost(problem)
+            max_cost, m = inf, float(problem.m)
+            if self.form == "auto" and m <= MAX_FORMED_ROWS and not problem.cones.has_round:
+                # Compare with the method over a full A.
+                count = Count(
+                    "dense", count_dense_work(problem.m), m * m, m, estimate_formation_cost(problem, False)
+                )
+                max_cost = VELOCITY_MAX_COST_RATIO * estimate_newton_cost(count, problem)
             fixed = estimate_velocity_newton_cost(problem, 0.0)
             slope = estimate_velocity_newton_cost(problem, 1.0) - fixed
             kernel = general.prepare_islands(problem, (max_cost - fixed) / slope)
@@ -365,15 +369,6 @@ class Newton(Solver):
         )
         work = {"factorisations": factorisations} | ({"sweeps": sweeps} if sweeps else {})
         return Claim(run.status, factorisations, work, message, form=system.form, certificate=run.certificate)
-
-
-def _estimate_full_matrix_cost(problem: Problem) -> float:
-    """Return the estimated cost [ns] of Newton's method over a full A of J and M; inf if that is not possible."""
-    m = float(problem.m)
-    if m > MAX_FORMED_ROWS or problem.cones.has_round:
-        return inf
-    form = estimate_formation_cost(problem, False)
-    return estimate_newton_cost(Count("dense", count_dense_work(problem.m), m * m, m, form), problem)
 
 
 def _is_sparse_matrix_faster(problem: Problem, work: float) -> bool:

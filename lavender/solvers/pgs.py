@@ -41,9 +41,6 @@ class PGS(Sweeping):
     def _add_work_to_claim(self, state: SweepState, claim: Claim, count: int) -> Claim:
         return replace(claim, form=form_name(state.data)) if state.data.is_general else claim
 
-    def _sweeps_over_matrix(self, problem: Problem) -> bool:
-        return not is_sweep_over_jacobian_cheaper(problem)
-
     def _build_state(self, problem: Problem, order: Order, before: Any) -> SweepState:
         if is_sweep_over_jacobian_cheaper(problem):
             return SweepState(problem, problem.metric, order, keeps_last=self.keeps_last)

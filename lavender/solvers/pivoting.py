@@ -39,8 +39,14 @@ class PivotState:
             import_numerical_modules()  # Factorisations and certificates use these modules.
         factor: Factor | None = None
         if self.symmetric:
-            same = like is not None and like.symmetric and _have_same_pattern(like.problem, problem)
-            self.chosen = like.chosen if like is not None and same else choose_factorisation(problem)
+            if (
+                like is not None
+                and like.symmetric
+                and all(map(np.array_equal, like.problem._compressed[:2], problem._compressed[:2]))
+            ):  # A has the same sparsity pattern in both problems.
+                self.chosen = like.chosen
+            else:
+                self.chosen = choose_factorisation(problem)
             self.form, band, order = self.chosen
             if self.form != "band":
                 band = -1
@@ -81,9 +87,3 @@ class PivotState:
         In the elimination of a semidefinite matrix, a zero pivot has a zero column, so leaving it out changes nothing.
         """
         return int(self.rows.rank)
-
-
-def _have_same_pattern(p: Problem, q: Problem) -> bool:
-    """Return whether A has the same sparsity pattern in both problems."""
-    a, b = p.csr, q.csr
-    return np.array_equal(a.indptr, b.indptr) and np.array_equal(a.indices, b.indices)

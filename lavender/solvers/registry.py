@@ -324,10 +324,14 @@ class SolverSpec:
         if law in self.laws and not accepts_boxes and problem.cones.has_box:
             return f"takes no boxes, which bound each tangent: {others} cones.shaped('disk')"
         if law not in self.laws and not (law in self.box_friction_laws and problem.cones.is_polyhedral):
-            takes = ", ".join(law for law in LAWS if law in self.laws)
-            way = _suggest_alternative(law, self.laws)
-            if law == "coulomb" and "cone" in self.box_friction_laws and problem.cones.is_polyhedral:
+            takes, way = ", ".join(law for law in LAWS if law in self.laws), ""
+            relaxed_laws = self.laws | (self.box_friction_laws if problem.cones.is_polyhedral else set())
+            if law == "coulomb" and "cone" in relaxed_laws:
                 way = ": pass problem.relaxed('cone'), or use a solver for Coulomb friction"
+            elif law in ("coulomb", "cone") and "lcp" in self.laws:
+                way = ": pass problem.boxed(normal_impulse), or use a solver for friction"
+            elif law == "cone" and "coulomb" in self.laws:
+                way = ": pass problem.relaxed('coulomb')"
             return f"takes laws {takes}, not {law!r}{self.bounded_hint or way}"
         operator = "matrix" if problem.matrix is not None else problem.operator
         if operator == "rows" and blocks.has_ellipse:
@@ -379,17 +383,6 @@ def _list_program_solvers() -> str:
         name for name, s in specs().items() if s.singular_programs and not s.delegates and not s.missing()
     )
     return " or ".join(filter(None, (", ".join(names[:-1]), names[-1]))) if names else "install osqp"
-
-
-def _suggest_alternative(law: str, laws: frozenset[str]) -> str:
-    """Return the part of an error message that explains how to solve a problem of an unsupported law."""
-    if law == "coulomb" and "cone" in laws:
-        return ": pass problem.relaxed('cone'), or use a solver for Coulomb friction"
-    if law in ("coulomb", "cone") and "lcp" in laws:
-        return ": pass problem.boxed(normal_impulse), or use a solver for friction"
-    if law == "cone" and "coulomb" in laws:
-        return ": pass problem.relaxed('coulomb')"
-    return ""
 
 
 @cache

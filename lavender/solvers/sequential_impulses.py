@@ -69,9 +69,6 @@ class SequentialImpulses(Sweeping):
 
     keeps_last = True
 
-    def _sweeps_over_matrix(self, problem: Problem) -> bool:
-        return False
-
     def _build_state(self, problem: Problem, order: Order, earlier: ImpulseState | None) -> ImpulseState:
         return ImpulseState(problem, order, earlier)
 

@@ -70,8 +70,11 @@ def solve_small(
     judged.impulse.setflags(write=False)
     start = start if start is None or impulse is None else start.copy()
     rest = compute_postponed_fields, (problem, spec, judged, counts, start, TIME_LIMIT)
-    solution = Solution.with_late_fields(judged.impulse, TIME_LIMIT, tol, perf_counter() - begin, rest)
-    return solution.with_fields(start=name_start(problem.guess, impulse)), None
+    solution = Solution.from_fields({
+        "impulse": judged.impulse, "status": TIME_LIMIT, "tol": tol, "setup_time": 0.0,
+        "solve_time": perf_counter() - begin, "start": name_start(problem.guess, impulse), "_rest": rest,
+    })  # fmt: skip
+    return solution, None
 
 
 def compute_postponed_fields(
@@ -82,7 +85,7 @@ def compute_postponed_fields(
     start: FloatArray | None,
     status: Status = CONVERGED,
 ) -> dict[str, Any]:
-    """Return the fields of the solution of a compiled call that `Solution.with_late_fields` postpones."""
+    """Return the fields of the solution of a compiled call that are computed when one of them is first read."""
     if spec.small is None:  # Only worlds of `solve_many` have no compiled call of their own.
         claim = Claim(status, 0, {}, NO_STAGE_MESSAGE)
     else:

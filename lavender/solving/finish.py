@@ -45,7 +45,6 @@ from lavender.judge.solution import (
 from lavender.problem import Problem
 from lavender.problem.cones import project_impulse
 from lavender.solvers.registry import SolverSpec, list_not_resumable
-from lavender_ext.core.checks import make_instance
 from lavender_ext.judge.measure import Judged, all_finite, project_far_excess_of
 
 # A lower bound of every solution's impulse is reported only if it is at least this multiple of sum |b_i| / d_i, the
@@ -154,8 +153,7 @@ def finish(run: FinishedRun) -> Solution:
     else:
         verdict = check_claim(run, make_residual(problem, judged))
         values = make_fields(run, judged, verdict) | values | {"status": verdict.status}
-    solution: Solution = make_instance(Solution, values)
-    return solution
+    return Solution.from_fields(values)
 
 
 def make_checked_fields(run: FinishedRun, judged: Judged) -> dict[str, Any]:

@@ -155,8 +155,16 @@ class Prepared:
         # The time of checks counts as set-up: they may form A and convert ellipses to disks.
         start = perf_counter()
         check_accepted(problem, spec)
-        if options:
-            _check_option_names(spec, options)
+        for name in options:
+            if name in spec.accepts:
+                continue
+            if name in SOLVE_ARGUMENTS:
+                raise CapabilityError(f"prepare does not take {name}=: give it to prepare(...).solve")
+            if name in ("order", "ground", "seed"):
+                accepted = ", ".join(sorted(spec.accepts)) or "no options"
+                raise CapabilityError(f"solver {spec.name!r} does not take {name}=; it takes: {accepted}")
+            known = {*spec.accepts, *SOLVE_ARGUMENTS, "solver"}
+            raise UnknownName(f"option of solver {spec.name!r}", name, known)
         self.spec = spec
         self.options = options
         self.problem = problem
@@ -242,7 +250,7 @@ class Prepared:
                 solution, failed_call = solve_small(original, self.spec, impulse, tol, own)
             if solution is not None:
                 if original is not self.problem:
-                    if not has_same_operator(original, self.problem):
+                    if not original.has_operator_of(self.problem):
                         check_accepted(original, self.spec)
                     self.problem, self._setup = original, NotSetUp()
             else:
@@ -327,7 +335,7 @@ class Prepared:
         begin, spec, last, problem = perf_counter(), self.spec, self._setup, original.disk
         is_other = original is not self.problem
         if is_other:
-            if not has_same_operator(original, self.problem):
+            if not original.has_operator_of(self.problem):
                 check_accepted(original, spec)
             self.setup_time = 0.0
         if problem.metric.reference_energy < 0.0:
@@ -414,7 +422,7 @@ class Prepared:
                 claim, refutation = self._select_best_impulse(loop, claim, start, has_checks)
         if claim.status is INFEASIBLE:
             if is_foreign:
-                claim, _, refutation = check_infeasibility_claim(problem, claim, loop.tol, deadline or NEVER)
+                claim, refutation = check_infeasibility_claim(problem, claim, loop.tol, deadline or NEVER)
             if claim.certificate is not None and loop.tol > 0.0 and proof is None:
                 claim = self._solve_feasible_islands(loop, claim, max_iter)
         if claim.judged is not loop.judged:
@@ -496,20 +504,6 @@ def check_accepted(problem: Problem, spec: SolverSpec) -> None:
         raise CapabilityError(f"solver {spec.name!r} {reason}")
 
 
-def _check_option_names(spec: SolverSpec, options: dict[str, Any]) -> None:
-    """Raise an error for the first option that the solver does not accept."""
-    for name in options:
-        if name in spec.accepts:
-            continue
-        if name in SOLVE_ARGUMENTS:
-            raise CapabilityError(f"prepare does not take {name}=: give it to prepare(...).solve")
-        if name in ("order", "ground", "seed"):
-            accepted = ", ".join(sorted(spec.accepts)) or "no options"
-            raise CapabilityError(f"solver {spec.name!r} does not take {name}=; it takes: {accepted}")
-        known = {*spec.accepts, *SOLVE_ARGUMENTS, "solver"}
-        raise UnknownName(f"option of solver {spec.name!r}", name, known)
-
-
 def check_arguments(
     spec: SolverSpec,
     impulse: Any,
@@ -573,16 +567,9 @@ def _make_solver(spec: SolverSpec, options: dict[str, Any]) -> Solver:
     return BoundedRowSolver(solver)
 
 
-def has_same_operator(p: Problem, q: Problem) -> bool:
-    """Return whether two problems share the arrays of A and of the blocks, as `Problem.updated(b=...)` makes them."""
-    if p.cones is not q.cones or p.friction != q.friction or p.matrix is not q.matrix or p.rows is not q.rows:
-        return False
-    return p.generalized is None or p.generalized.operator is getattr(q.generalized, "operator", None)
-
-
 def same_structure(p: Problem, q: Problem) -> bool:
     """Return whether two problems have the same blocks, form of A, and bodies or sparsity pattern."""
-    if has_same_operator(p, q):
+    if p.has_operator_of(q):
         return True
     if not (are_equal(p.cones.ptr, q.cones.ptr) and are_equal(p.cones.kind, q.cones.kind)) or p.law != q.law:
         return False

@@ -80,8 +80,15 @@ def robot(package: str = "gymnasium", model: str = "ant", cone: str = "pyramidal
 
     The numbers depend on the versions of MuJoCo and of the package (`get_package_versions`).
     """
-    path, known = _get_model_path(package, model), tuple(MUJOCO_CONES)
-    check_name("cone", cone, known)
+    check_name("package of models", package, MODEL_FOLDERS)
+    spec, message = find_spec(package), explain_missing_packages(package)
+    if message or spec is None or not spec.submodule_search_locations:
+        raise SolverUnavailable(message)
+    folder = Path(spec.submodule_search_locations[0]) / MODEL_FOLDERS[package]
+    path = folder / f"{model}.xml"
+    if not path.is_file():
+        raise UnknownName(f"model of {package}", model, sorted(p.stem for p in folder.glob("*.xml")))
+    check_name("cone", cone, tuple(MUJOCO_CONES))
     import mujoco
 
     from lavender.io import from_mujoco
@@ -115,16 +122,3 @@ def get_package_versions(package: str) -> str:
     from importlib.metadata import version
 
     return ", ".join(f"{name} {version(name)}" for name in ("mujoco", package)) if package else ""
-
-
-def _get_model_path(package: str, model: str) -> Path:
-    """Return the path of a model file, or raise SolverUnavailable or UnknownName."""
-    check_name("package of models", package, MODEL_FOLDERS)
-    spec, message = find_spec(package), explain_missing_packages(package)
-    if message or spec is None or not spec.submodule_search_locations:
-        raise SolverUnavailable(message)
-    folder = Path(spec.submodule_search_locations[0]) / MODEL_FOLDERS[package]
-    path = folder / f"{model}.xml"
-    if not path.is_file():
-        raise UnknownName(f"model of {package}", model, sorted(p.stem for p in folder.glob("*.xml")))
-    return path

@@ -11,7 +11,7 @@ import numpy as np
 
 from lavender.base.arrays import check_bool, check_float, check_int, check_nonnegative_magnitudes, get_shape
 from lavender.base.errors import InputError, check_name
-from lavender.problem.friction import check_shape
+from lavender.problem.friction import SHAPES
 from lavender.problem.ordering import ENGINE_ORDERS
 from lavender.sim.scene.parts import check_numbers
 from lavender.solvers.registry import SolverSpec, get
@@ -135,7 +135,7 @@ class Parameters:
                 f"order={self.order!r} is used only by sequential_impulses, and the solver is "
                 f"{self.solver!r}: leave order out, or give solver_options of {self.solver!r}"
             )
-        check_shape("friction_shape", self.friction_shape)
+        check_name("friction_shape", self.friction_shape, SHAPES)
         put(self, "position_iterations", check_int("position_iterations", self.position_iterations, 0, 1000))
         put(self, "seed", check_int("seed", self.seed))
         check_name("on_failure", self.on_failure, ON_FAILURE)
