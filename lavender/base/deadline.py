@@ -11,7 +11,6 @@ import math
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from threading import local
-from time import perf_counter
 
 from lavender_ext.core.deadline import Deadline as Deadline
 from lavender_ext.core.deadline import read_clock as read_clock
@@ -20,18 +19,6 @@ from lavender_ext.core.deadline import read_clock as read_clock
 CHUNK_TIME = 0.01
 # [s] The same under a time limit, and for the clock.
 LIMITED_CHUNK_TIME = 1e-3
-
-
-class Stopwatch:
-    """Measures the time since its creation."""
-
-    def __init__(self) -> None:
-        self._start = perf_counter()
-
-    @property
-    def elapsed_seconds(self) -> float:
-        """Seconds since the creation of this object."""
-        return perf_counter() - self._start
 
 
 NEVER = Deadline()

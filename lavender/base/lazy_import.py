@@ -15,13 +15,16 @@ from importlib import import_module
 from threading import RLock
 from typing import TYPE_CHECKING, Any
 
-_lock = RLock()
+_locks: dict[int, RLock] = {}  # By process.
 _imported = set[str]()  # Names that `import_numerical_modules` has imported completely.
 
 
 def import_lock() -> RLock:
-    """Return the lock under which one thread at a time imports modules and fills tables from them."""
-    return _lock
+    """Return the lock under which one thread at a time imports modules and fills tables from them.
+
+    A forked process has a lock of its own, because the thread that may hold the old one does not exist there.
+    """
+    return _locks.get(os.getpid()) or _locks.setdefault(os.getpid(), RLock())
 
 
 def import_module_under_lock(name: str) -> Any:
@@ -32,16 +35,6 @@ def import_module_under_lock(name: str) -> Any:
     """
     with import_lock():
         return import_module(name)
-
-
-def _replace_lock_after_fork() -> None:
-    global _lock
-    # A forked process needs a new lock: the thread that may hold the old one does not exist there.
-    _lock = RLock()
-
-
-if hasattr(os, "register_at_fork"):  # Windows has no fork.
-    os.register_at_fork(after_in_child=_replace_lock_after_fork)
 
 
 class _LazyModule:

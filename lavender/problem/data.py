@@ -371,7 +371,8 @@ class ProblemData:
     def __repr__(self) -> str:
         kind = self.operator if self.matrix is None else "CSR" if issparse(self.matrix) else "dense"
         name = f"{self.name!r}, " if self.name else ""
-        size = f"{_format_count(self.m, 'row')} in {_format_count(self.n_blocks, 'block')}"
+        counts = (self.m, "row"), (self.n_blocks, "block")
+        size = " in ".join(f"{n} {noun}" if n == 1 else f"{n} {noun}s" for n, noun in counts)
         return f"<Problem {name}{self.law}, {size}, {kind}>"
 
     def _repr_html_(self) -> str:
@@ -432,11 +433,6 @@ def check_problem(problem: Any) -> None:
             # The object is a `RowBuilder`, which is not imported here.
             advice = "give the result of its .problem()"
         raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed: {advice}")
-
-
-def _format_count(n: int, noun: str) -> str:
-    """Format a number with its noun: 1 row, 2 rows."""
-    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
 
 def check_matrix(matrix: Any, m: int, copy: bool) -> Any:

@@ -28,7 +28,8 @@ class Derived:
         The zero impulse clipped to the bounds.
     cache : dict
         Values of other modules; each key begins with the name of its module. The key of the lock, which is held while
-        a `computed_once` property is computed, is `_process`.
+        a `computed_once` property is computed, is the number of the process: threads that hold the locks of another
+        process do not exist in a forked one.
     """
 
     __slots__ = ("cache", "start", "view")
@@ -37,20 +38,6 @@ class Derived:
         self.view = view
         self.start: FloatArray | None = None
         self.cache: dict[Any, Any] = {}
-
-
-# Identity of this process. A forked process gets a new object and then new locks, because threads that hold the old
-# locks do not exist in it.
-_process = object()
-
-
-def _replace_process_after_fork() -> None:
-    global _process
-    _process = object()
-
-
-if hasattr(os, "register_at_fork"):  # Windows has no fork.
-    os.register_at_fork(after_in_child=_replace_process_after_fork)
 
 
 class cached_property(Generic[T]):
@@ -80,7 +67,8 @@ class cached_property(Generic[T]):
         if not self.is_locked:
             return attributes.setdefault(self.name, self.function(instance))
         cache = instance.derived.cache
-        with cache.get(_process) or cache.setdefault(_process, RLock()):
+        process = os.getpid()
+        with cache.get(process) or cache.setdefault(process, RLock()):
             if self.name not in attributes:
                 attributes[self.name] = self.function(instance)
             return attributes[self.name]

@@ -71,7 +71,7 @@ def compute_block_order(
     -------
     Order
     """
-    k = problem.n_blocks
+    k = problem.cones._blocks.n_blocks
     split = 0 if problem.rows is None else problem.rows.n_joints
     if type(order) is str and order == "given" and ground is None and type(seed) is int and seed == 0:
         return Order(np.arange(k, dtype=np.int32), split, GIVEN, np.zeros(1, np.uint64), is_given=True)

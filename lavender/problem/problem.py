@@ -213,20 +213,18 @@ class Problem(Builders):
     def _disk(self) -> Problem:
         """Problem in stretched tangents: A' = S A S, b' = S b, lambda = S lambda', w' = S w with S = diag(stretch)."""
         s, cones = self.cones.stretch, self.cones.ellipses_replaced_by_disks
-        guess = None if self.guess is None else self.on_disk(self.guess)
-        more: dict[str, Any] = {"guess": guess, "key": self.key, "names": self.names, "name": self.name}
-        more |= {"friction": self.friction, "precision": self.precision, "angular": self.angular}
+        changes: dict[str, Any] = {"guess": None if self.guess is None else self.on_disk(self.guess)}
         if self.generalized is None:
             indptr, indices, data = self._compressed
             data = np.repeat(s, np.diff(indptr)) * data * s[indices]
             a = sp.csr_array((data, indices, indptr), shape=(self.m, self.m))
-            disk = Problem(s * self.b, cones, a, copy=False, **more)
+            changes |= {"matrix": a, "rows": None, "compliance": None}
         else:
             assert self.compliance is not None
             compliance = s * s * self.compliance
             compliance[compliance < MIN_MAGNITUDE] = 0.0  # A compliance must be 0 or at least MIN_MAGNITUDE.
-            scaled = self.generalized.with_scaled_rows(s)
-            disk = Problem(s * self.b, cones, generalized=scaled, compliance=compliance, copy=False, **more)
+            changes |= {"generalized": self.generalized.with_scaled_rows(s), "compliance": compliance}
+        disk = replace(self, b=s * self.b, cones=cones, copy=False, **changes)
         if self.rows is not None:
             disk.metric.copy_velocity_weight(self.metric, True)
         return disk

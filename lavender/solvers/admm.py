@@ -292,12 +292,7 @@ class ADMM(Solver):
 
     @np.errstate(all="ignore")  # Results that overflow are judged.
     def run(
-        self,
-        state: AdmmState,
-        impulse: FloatArray,
-        max_iter: int,
-        tol: float,
-        time_limit: float | None = None,
+        self, state: AdmmState, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None
     ) -> Claim:
         """Run `max_iter` iterations, or fewer if a check, a breakdown or the deadline ends them."""
         try:

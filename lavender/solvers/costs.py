@@ -32,8 +32,6 @@ from lavender_ext.factor.sparse import bandwidth
 
 # The analysis of A costs 1 + bandwidth / ANALYSIS_BANDWIDTH times its rate per entry.
 ANALYSIS_BANDWIDTH = 1500.0
-# A factor by panels costs 1 + rows / PANELS_GROWTH_ROWS times its rate per entry.
-PANELS_GROWTH_ROWS = 8000.0
 # [ns, ns per entry of a full A] If a time limit exceeds LOOSE_LIMIT + LOOSE_LIMIT_PER_ENTRY m^2, it is about a hundred
 # times the cost of the set-ups, and `auto` does not estimate these.
 LOOSE_LIMIT, LOOSE_LIMIT_PER_ENTRY = 1e7, 1e3
@@ -203,22 +201,12 @@ def estimate_first_factor_cost(m: int, entries: float = inf) -> float:
     return float(min(dense, RATES["sparse factor"] * estimate_sparse_work(entries, m)))
 
 
-def estimate_band_factor_cost(m: int, band: int) -> float:
-    """Return the cost of one compiled factorisation [ns] of m rows with the half bandwidth `band`."""
-    return float(RATES["band work"] * m * float(band + 1) ** 2)
-
-
 def estimate_dense_factor_cost(m: int) -> float:
     """Return the cost of one dense Cholesky factorisation of m rows [ns], without the overhead of the call.
 
     LAPACK on one thread takes 0.7 to 1 times as long.
     """
     return float(RATES["dense work"] * count_dense_work(m) + RATES["dense entry"] * float(m) ** 2)
-
-
-def estimate_panel_factor_cost(nnz: int, m: int) -> float:
-    """Return the cost of one supernodal factorisation with its analysis [ns], for m rows and nnz entries."""
-    return float(RATES["panels call"] + RATES["panels entry"] * nnz * (1.0 + m / PANELS_GROWTH_ROWS))
 
 
 def estimate_elimination_cost(problem: Problem, kind: str) -> float:

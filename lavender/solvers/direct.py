@@ -112,12 +112,7 @@ class Direct(Solver):
         return self.prepare(problem, state.pivot)
 
     def run(
-        self,
-        state: DirectState,
-        impulse: FloatArray,
-        max_iter: int,
-        tol: float,
-        time_limit: float | None = None,
+        self, state: DirectState, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None
     ) -> Claim:
         run = _Run(state, impulse, max_iter, tol, Deadline(time_limit), self)
         if state.problem.m == 0:
@@ -131,7 +126,12 @@ class Direct(Solver):
                 assert state.pivot is not None
                 claim = run.run_pivoting_rounds(state.pivot)
         finally:
-            run.store_best()
+            pivot = run.state.pivot
+            if pivot is not None and pivot.rows.relative < run.best:
+                # If an error or Ctrl-C ended the run between two rounds, the kernel's best iterate was not stored yet.
+                run.store_if_best(pivot.rows.best)
+            if run.best_pass is not None:
+                impulse[:] = run.best_pass.impulse
         return replace(claim, judged=run.best_pass)
 
 
@@ -212,23 +212,10 @@ class _Run:
         """Relative residual of the best iterate."""
         return np.inf if self.best_pass is None else self.best_pass.relative
 
-    @property
-    def floor(self) -> float:
-        """Round-off floor of the best iterate."""
-        return 0.0 if self.best_pass is None else self.best_pass.roundoff_floor
-
-    def store_best(self) -> None:
-        """Copy the best iterate to the impulse."""
-        pivot = self.state.pivot
-        if pivot is not None and pivot.rows.relative < self.best:
-            # If an error or Ctrl-C ended the run between two rounds, the kernel's best iterate was not stored yet.
-            self.store_if_best(pivot.rows.best)
-        if self.best_pass is not None:
-            self.impulse[:] = self.best_pass.impulse
-
     def is_good(self) -> bool:
         """Return whether the best residual is sufficient or at the round-off floor."""
-        return self.best <= max(self.sufficient_residual, min(self.floor, MAX_EXCUSED_RESIDUAL))
+        floor = 0.0 if self.best_pass is None else self.best_pass.roundoff_floor
+        return self.best <= max(self.sufficient_residual, min(floor, MAX_EXCUSED_RESIDUAL))
 
     def is_at_floor(self) -> bool:
         return self.best_pass is not None and self.best_pass.above_floor <= self.tol

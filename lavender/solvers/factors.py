@@ -23,12 +23,7 @@ from lavender.base.lazy_import import import_numerical_modules, lapack
 from lavender.base.lazy_import import sparse as sp
 from lavender.base.lu import factor_sparse_lu
 from lavender.problem import Problem
-from lavender.solvers.costs import (
-    RATES,
-    estimate_band_factor_cost,
-    estimate_dense_factor_cost,
-    estimate_panel_factor_cost,
-)
+from lavender.solvers.costs import RATES, estimate_dense_factor_cost
 from lavender_ext.factor.linear import LinearSystem
 from lavender_ext.factor.sparse import extract_free_part, has_symmetric_pattern
 
@@ -38,6 +33,8 @@ MAX_COMPILED_FACTOR_ROWS = 64
 MAX_COMPILED_BAND = 40  # Up to this half bandwidth, the compiled band factorisation is the fastest.
 MIN_DENSE_FRACTION = 0.1  # Above this fraction of nonzeros, dense Cholesky is faster than sparse Cholesky.
 MAX_PANELS_FRACTION = 0.25  # Supernodal LU is considered for a linear system up to this fraction of nonzeros.
+# A factor by panels costs 1 + rows / PANELS_GROWTH_ROWS times its rate per entry.
+PANELS_GROWTH_ROWS = 8000.0
 # Matrices with more rows are not stored as dense arrays; at this size one takes 288 MB.
 MAX_DENSE_ROWS = 6000
 # Whether to use vectors of four numbers if the processor has them. The results have the same bits.
@@ -66,9 +63,10 @@ def _compute_factorisation_choice(problem: Problem) -> tuple[str, int, IntArray 
     nnz = len(problem._compressed[1])
     if problem.law == "linear" and nnz <= MAX_PANELS_FRACTION * m * m:
         # A linear problem needs one factorisation: choose the cheapest.
-        narrow = estimate_band_factor_cost(m, band)
+        narrow = RATES["band work"] * m * float(band + 1) ** 2
         full = RATES["dense call"] + estimate_dense_factor_cost(m)
-        if estimate_panel_factor_cost(nnz, m) < min(narrow, full if m <= MAX_DENSE_ROWS else np.inf):
+        panels = RATES["panels call"] + RATES["panels entry"] * nnz * (1.0 + m / PANELS_GROWTH_ROWS)
+        if panels < min(narrow, full if m <= MAX_DENSE_ROWS else np.inf):
             return "sparse", m - 1, None
         return ("band", band, None) if narrow <= full else ("dense", m - 1, None)
     if band <= MAX_COMPILED_BAND:

@@ -46,12 +46,7 @@ class Lemke(Solver):
         return PivotState(problem, state)
 
     def run(
-        self,
-        state: PivotState,
-        impulse: FloatArray,
-        max_iter: int,
-        tol: float,
-        time_limit: float | None = None,
+        self, state: PivotState, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None
     ) -> Claim:
         if max_iter == 0 or state.problem.m == 0:
             return Claim(Status.MAX_ITERATIONS if state.problem.m else Status.CONVERGED, 0, {"pivots": 0})

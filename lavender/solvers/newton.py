@@ -235,12 +235,7 @@ class Newton(Solver):
         return self._choose_form_and_build_state(problem, state.system)
 
     def run(
-        self,
-        state: NewtonState,
-        impulse: FloatArray,
-        max_iter: int,
-        tol: float,
-        time_limit: float | None = None,
+        self, state: NewtonState, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None
     ) -> Claim:
         problem, system = state.problem, state.system
         if not len(problem.b):

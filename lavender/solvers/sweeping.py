@@ -9,15 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from lavender.base.arrays import FloatArray
 from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.judge.solution import Claim, Status
 from lavender.problem import LAWS, OPERATORS, Problem
 from lavender.problem.ordering import Order, compute_block_order
 from lavender.solvers.registry import Solver, SolverSpec
-from lavender_ext.core.order import GIVEN
 from lavender_ext.judge.stopping_test import AT_FLOOR, CONVERGED, DIVERGED, RUNNING, STALLED, StoppingTest
 from lavender_ext.sweep import serial
 
@@ -127,14 +124,7 @@ class Sweeping(SweepSolver):
 
     def prepare(self, problem: Problem) -> Any:
         """Build the state before the first sweep, with a new order."""
-        is_default = type(self.order) is str and self.order == "given" and self.ground is None
-        if is_default and type(self.seed) is int and self.seed == 0:
-            # As `compute_block_order`, in half the time.
-            blocks = np.arange(problem.cones._blocks.n_blocks, dtype=np.int32)
-            split = 0 if problem.rows is None else problem.rows.n_joints
-            order = Order(blocks, split, GIVEN, np.zeros(1, np.uint64), is_given=True)
-        else:
-            order = compute_block_order(problem, self.order, seed=self.seed, ground=self.ground)
+        order = compute_block_order(problem, self.order, seed=self.seed, ground=self.ground)
         return self._build_state(problem, order, None)
 
     def update(self, state: Any, problem: Problem) -> Any:

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from math import inf
+from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray
-from lavender.base.deadline import NEVER, Deadline, Stopwatch
+from lavender.base.deadline import NEVER, Deadline
 from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import (
     MAX_EXCUSED_RESIDUAL,
@@ -241,7 +242,7 @@ class Recorder:
     """
 
     solve: Loop
-    watch: Stopwatch = field(default_factory=Stopwatch)
+    begun: float = field(default_factory=perf_counter)  # [s] Time of its creation.
 
     @property
     def records(self) -> list[Record]:
@@ -252,7 +253,7 @@ class Recorder:
     @property
     def time(self) -> float:
         """Time of the solve without recording [s]."""
-        return self.watch.elapsed_seconds - self.solve.recording_time
+        return perf_counter() - self.begun - self.solve.recording_time
 
     def append_later_records(self, solver: str, records: Iterable[Record]) -> None:
         """Append the records with more iterations than the last one."""
@@ -263,10 +264,10 @@ class Recorder:
 
     def record_impulse(self, solver: str, iterations: int, impulse: FloatArray) -> None:
         """Record an impulse (m,) [N s] after this number of iterations of all stages."""
-        time, watch = self.time, Stopwatch()
+        time, begin = self.time, perf_counter()
         r = residual(self.solve.problem, impulse, "float64")
         self.append_later_records(solver, [(iterations, time, r.relative, r.energy, r.velocity)])
-        self.solve.recording_time += watch.elapsed_seconds
+        self.solve.recording_time += perf_counter() - begin
 
     def append_loop_records(self, solver: str, iterations: int, time: float, loop: Loop) -> None:
         """Append the records of a loop that began at this number of iterations and this time [s]."""
