@@ -36,7 +36,6 @@ from lavender.audit.simulated_worlds import (
     Divergence,
     Frame,
     Runs,
-    can_any_geoms_collide,
     count_engine_warnings,
     iterate_frames,
     simulate_world,
@@ -156,7 +155,7 @@ def audit(
         env_model, _ = get_environment_data(model)
         runs = Runs.of_environment(model, env_model, episodes, steps, seed)
         pieces = _audit_environment(model, policy, runs, judging)
-        return _collect(_make_empty_audit(runs, engine, common), pieces, judging, watch)
+        return _collect(Audit.with_size(runs, engine, **common), pieces, judging, watch)
     if policy is not None:
         raise InputError("policy needs a gymnasium environment as model; for a model of MuJoCo give control=")
     if against is not None and engine != "mujoco":
@@ -180,12 +179,12 @@ def audit(
     if engine == "mujoco":
         more = (keep_contact_states, workers, backend, watch, common)
         return _audit_model(runs, judging, worlds, spread, *more)
-    runs, note = runs.choose_spread(spread, watch)
+    runs = runs.choose_spread(spread, watch)
     if watch is not None:
         watch(Event(0, 0, f"compiling {engine}", ""))
     runs = runs.with_ignored_settings(engine)
     pieces = _audit_frames(iterate_frames(engine, runs, njmax), judging)
-    return _collect(_make_empty_audit(runs, engine, common, note), pieces, judging, watch)
+    return _collect(Audit.with_size(runs, engine, **common), pieces, judging, watch)
 
 
 def audit_steps(
@@ -250,11 +249,11 @@ def _audit_model(
         worlds = max(1, min(MAX_DEFAULT_WORLDS, expected))
     if workers == -1 and backend == "loky" and duration * worlds < MIN_DURATION_OF_WORKERS:
         workers = 1
-    runs, note = replace(one, worlds=worlds).choose_spread(spread, watch)
+    runs = replace(one, worlds=worlds).choose_spread(spread, watch)
     if keep_contact_states:
         share = min(1.0, MAX_CONTACT_STATES / (worlds * runs.steps))
         judging = judging._replace(contact_share=share)
-    result = _make_empty_audit(runs, "mujoco", common, note)
+    result = Audit.with_size(runs, "mujoco", **common)
     pieces = _audit_mujoco(runs, judging, range(worlds), workers, backend)
     result = _collect(result, pieces, judging, watch)
     if not result.n_processed:
@@ -286,18 +285,6 @@ def _collect(
         if not result.n_processed:
             raise
     result.is_stopped = result.n_processed < result.verdict.size
-    return result
-
-
-def _make_empty_audit(runs: Runs, engine: str, common: dict[str, Any], *notes: str) -> Audit:
-    """Make the result of an audit of a model of MuJoCo before its first step."""
-    notes = (*runs.notes, *notes)
-    can_touch = can_any_geoms_collide(runs.mj, runs.model)
-    result = Audit.with_size(runs, engine, can_touch=can_touch, notes=list(filter(None, notes)), **common)
-    if runs.against is not None:
-        name, model = runs.against
-        other = replace(runs, name=name, model=model, against=None)
-        result.against = Audit.with_size(other, engine, **common)
     return result
 
 

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
+from lavender.base.lazy_import import markupsafe
+from lavender.base.lazy_import import pandas as pd
 from lavender.io.stored import format_json
 from lavender.judge.residuals import AT_FLOOR, UNCONVERGED, VERDICTS, WRONG
 from lavender.report import drawing
@@ -26,9 +28,14 @@ from lavender.report.text import (
 )
 
 if TYPE_CHECKING:
-    import pandas as pd
     from rich.console import Console
 
+ENGINE_ADVICE = "To find out whether the engine is the cause, audit again with --engine mujoco."
+OUTSIDE_SOLVER = "outside the constraint solver (time step, integrator, actuators or the model itself)"
+DIVERGENCE_ADVICE = (
+    'To find out whether the solver is the cause, audit again with <option solver="Newton" iterations="100" '
+    'tolerance="1e-12"/>: if worlds diverge again after exact solves, the cause is the model.'
+)
 STOPPED_NOTE = "Stopped before the end: the numbers contain only the completed part."
 QUANTILE_LINES = {"median": 0.5, "90 %": 0.9, "99 %": 0.99, "worst": 1.0}
 MAX_BINS = 50  # Largest number of bins of steps of the figure over time.
@@ -89,8 +96,6 @@ def make_audit_page(audit: Any, folder: Path | None) -> Page:
     runs, model = audit.runs, audit.runs.name
     blocks: list[Any] = []
     if folder is not None and counts.n:
-        from markupsafe import Markup
-
         tables = [*counts.make_sizes_table(), *counts.make_rows_table()]
         if audit.worst:
             rows: list[Any] = []
@@ -99,7 +104,7 @@ def make_audit_page(audit: Any, folder: Path | None) -> Page:
                 rows.append([f"worst_{i}.npz", (place, "q", ""), (row, "text", "")])
             command = f"lavender check {folder.parent / 'worst' / 'worst_1.npz'}"
             tables += [make_table(rows, title="Look at the worst steps"), {"code": command}]
-        blocks.append({"pair": [[Markup(counts.draw_errors(folder))], tables]})
+        blocks.append({"pair": [[markupsafe.Markup(counts.draw_errors(folder))], tables]})
     sections = (
         ("The same states", audit.comparison, "Both models solve the same steps from the same states."),
         ("What the engine claims", audit.claims, "A wrong claim hides an error; a missing claim costs iterations."),
@@ -234,7 +239,13 @@ class AuditCounts:
         audit, texts = self.audit, []
         stopped, wrong = (audit.verdict == VERDICTS.index(word) for word in (UNCONVERGED, WRONG))
         if audit.divergences:
-            texts.append(audit.describe_divergences())
+            exact = sum(map(audit.has_exact_solves, audit.divergences))
+            if exact:
+                one = "Every solve until a world diverged"
+                some = one if exact == audit.n_diverged else f"In {exact} worlds every solve until divergence"
+                texts.append(f"{some} was exact: the cause lies {OUTSIDE_SOLVER}.")
+            if exact < audit.n_diverged:
+                texts.append(DIVERGENCE_ADVICE if audit.engine == "mujoco" else ENGINE_ADVICE)
         elif self.above:
             n = int((self.is_above & stopped).sum())
             if n:
@@ -336,8 +347,6 @@ class AuditCounts:
 
     def make_sizes_table(self) -> list[Any]:
         """Make the stacked bar and the table of the numbers of steps by the size of their error."""
-        from markupsafe import Markup
-
         classes = [*self.classes]
         if lost := int((self.audit.verdict == len(VERDICTS)).sum()):
             classes.append(("not judged", lost))
@@ -349,7 +358,7 @@ class AuditCounts:
         ]
         rows: list[Any] = []
         for i, (name, n) in enumerate(classes):
-            swatch = Markup('<span class="swatch" style="background:{}"></span> {}').format(
+            swatch = markupsafe.Markup('<span class="swatch" style="background:{}"></span> {}').format(
                 CLASS_COLORS[i], name
             )
             css = "bad" if i >= 3 and n else "q" if i < 2 else ""
@@ -360,8 +369,6 @@ class AuditCounts:
 
     def make_rows_table(self) -> list[Any]:
         """Make the table of the rows with the largest errors, on a logarithmic scale with the limit."""
-        from markupsafe import Markup
-
         where = sorted(self.audit.where.items(), key=lambda entry: -entry[1][1])
         if not where:
             return []
@@ -374,7 +381,7 @@ class AuditCounts:
         rows: list[Any] = []
         for name, (n, largest) in where[:MAX_NAMED_ROWS]:
             above = ' class="above"' if largest > self.limit else ""
-            dot = Markup(
+            dot = markupsafe.Markup(
                 f'<span class="dot"><b style="left:{place(self.limit):.1f}%"></b>'
                 f'<i{above} style="left:{place(largest):.1f}%"></i></span>'
             )
@@ -424,8 +431,6 @@ class StepSizes:
     @property
     def table(self) -> pd.DataFrame:
         """Median and maximum number of rows and contacts, and the fraction of steps that have any."""
-        import pandas as pd
-
         rows = [
             (name, f"{x['median']:g}", x["maximum"], f"{100.0 * x['share']:.1f} %")
             for name in ("rows", "contacts") if (x := self.as_dict[name])["median"] is not None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import shlex
 import sys
 from datetime import datetime, timezone
@@ -27,10 +28,15 @@ def describe_provenance(model: Any, name: str, engine: str = "mujoco") -> dict[s
     engine, engine_version, lavender, mujoco, integrator, solver, cone, timestep [s], model, model_hash (of the arrays
     and options of the model), date (UTC) and command; an entry that the run does not have is None.
     """
+    version, program = None, Path(sys.argv[0])
+    with contextlib.suppress(metadata.PackageNotFoundError):
+        version = metadata.version(PACKAGES.get(engine, engine))
+    is_lavender = program.stem == "lavender" or program.parts[-2:] == ("lavender", "__main__.py")
     entries: dict[str, Any] = {
-        "engine": engine, "engine_version": _get_version(PACKAGES.get(engine, engine)), "lavender": __version__,
+        "engine": engine, "engine_version": version, "lavender": __version__,
         "mujoco": None, "integrator": None, "solver": None, "cone": None, "timestep": None, "model": name,
-        "model_hash": None, "date": datetime.now(timezone.utc).isoformat(timespec="seconds"), "command": _get_command(),
+        "model_hash": None, "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "command": shlex.join(["lavender", *sys.argv[1:]]) if is_lavender else None,
     }  # fmt: skip
     if model is not None:
         import mujoco as mj
@@ -53,19 +59,3 @@ def format_provenance(entries: dict[str, Any]) -> str:
     parts = [engine, f"lavender {entries['lavender']}", *settings, *timestep, model]
     parts += [entries["date"], entries["command"]]
     return ", ".join(filter(None, parts))
-
-
-def _get_version(package: str) -> str | None:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return None
-
-
-def _get_command() -> str | None:
-    """Return the command line of lavender; None in another program."""
-    program = Path(sys.argv[0])
-    is_lavender = program.stem == "lavender" or (
-        program.name == "__main__.py" and program.parent.name == "lavender"
-    )
-    return shlex.join(["lavender", *sys.argv[1:]]) if is_lavender else None

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -25,16 +25,14 @@ from lavender.audit.pieces import (
     Worst,
 )
 from lavender.audit.provenance import describe_provenance, format_provenance
-from lavender.audit.simulated_worlds import Divergence, Runs
+from lavender.audit.simulated_worlds import Divergence, Runs, can_any_geoms_collide
 from lavender.base.arrays import FloatArray, check_choice
+from lavender.base.lazy_import import pandas as pd
 from lavender.io.npz import write_npz
 from lavender.io.stored import prepare_step_folder, write_arrays
 from lavender.judge.residuals import AT_FLOOR, CLOSE, DEFAULT_THRESHOLD, UNCONVERGED, WRONG
 from lavender.report.page import DEFAULT_ERROR_LIMIT
 from lavender.report.text import format_count, format_percent, format_size, format_speed, split_row_unit
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 QUANTILES = (0.5, 0.9, 0.99, 0.999, 1.0)
 QUANTILE_NAMES = ("50 %", "90 %", "99 %", "99.9 %", "largest error")
@@ -44,81 +42,45 @@ OUTCOMES = (
     "claimed and right", "claimed and wrong", "not claimed but right", "not claimed and wrong",
     "claimed with numbers that are not finite", "not claimed, not finite",
 )  # fmt: skip
-ENGINE_ADVICE = "To find out whether the engine is the cause, audit again with --engine mujoco."
-OUTSIDE_SOLVER = "outside the constraint solver (time step, integrator, actuators or the model itself)"
-DIVERGENCE_ADVICE = (
-    'To find out whether the solver is the cause, audit again with <option solver="Newton" iterations="100" '
-    'tolerance="1e-12"/>: if worlds diverge again after exact solves, the cause is the model.'
-)
 
 
 @dataclass(eq=False)
 class Audit:
-    """Result of `audit`.
-
-    Parameters
-    ----------
-    runs : Runs
-    engine : str
-    numbers : (4, worlds, steps)
-        Errors of the worst row [m/s, N s], relative residual and its floor; NaN if the step was not judged.
-    verdict : (worlds, steps) int
-        Indices in `AUDIT_VERDICTS`; -1 if the audit was stopped before the step.
-    rows, contacts : (worlds, steps) int
-        Rows, and contacts that have rows; 0 if the step was not judged.
-    can_touch : bool
-        Whether the model has geoms that can collide.
-    threshold : float, m/s
-        Velocity error up to which an answer is close enough.
-    error_limit : float, m/s, optional
-        The headline counts the steps with a larger velocity error that rounding does not explain.
-    notes : list of str
-        Sentences about the differences from a simulation of the model as it is, and warnings.
-    converged : (worlds, steps) int, optional
-        The engine's claims: 1 if it calls the solve converged, 0 if not, -1 without a claim. None if it makes none.
-    where : dict
-        Row name (without numbers of contacts) -> number of steps that stopped before convergence with this worst row,
-        and its largest error [m/s].
-    worst : list of Worst
-    divergences : list of Divergence
-    is_stopped : bool
-        The audit was stopped by Ctrl-C, or workers were lost.
-    engine_warnings : Counter
-        MuJoCo's own warnings, and how often each occurred.
-    contact_states : list of StepState
-        States before steps with contact, if the audit keeps them; in the order of worlds and steps.
-    n_dropped : int
-        Number of constraint rows for which the engine had no memory.
-    lost_digits : LostDigits
-    prediction : Prediction
-    against : Audit, optional
-        Result of another model on the same states.
-    provenance : dict
-        Result of `describe_provenance`.
-    """
+    """Result of `audit`."""
 
     runs: Runs
     engine: str
+    # (len(WORST_ROW_ERRORS), worlds, steps): errors of the worst row of each step; NaN if it was not judged.
     numbers: FloatArray
+    # (worlds, steps) int: indices in `AUDIT_VERDICTS`; -1 if the audit was stopped before the step.
     verdict: Any
+    # (worlds, steps) int: rows, and contacts that have rows; 0 if the step was not judged.
     rows: Any
     contacts: Any
-    can_touch: bool = True
-    threshold: float = DEFAULT_THRESHOLD
+    can_touch: bool = True  # Whether the model has geoms that can collide.
+    threshold: float = DEFAULT_THRESHOLD  # [m/s] Velocity error up to which an answer is close enough.
+    # [m/s] The headline counts the steps with a larger velocity error that rounding does not explain.
     error_limit: float | None = None
+    # Sentences about the differences from a simulation of the model as it is, and warnings.
     notes: list[str] = field(default_factory=list)
+    # (worlds, steps) int: the engine's claims, 1 if it calls the solve converged, 0 if not, -1 without a claim; None
+    # if it makes none.
     converged: Any = None
+    # Row name (without numbers of contacts) -> number of steps that stopped before convergence with this worst row, and
+    # its largest error [m/s].
     where: dict[str, tuple[int, float]] = field(default_factory=dict)
     worst: list[Worst] = field(default_factory=list)
     divergences: list[Divergence] = field(default_factory=list)
-    is_stopped: bool = False
+    is_stopped: bool = False  # Whether Ctrl-C stopped the audit, or workers were lost.
+    # MuJoCo's own warnings, and how often each occurred.
     engine_warnings: Counter[str] = field(default_factory=Counter)
+    # States before steps with contact, if the audit keeps them; in the order of worlds and steps.
     contact_states: list[StepState] = field(default_factory=list)
-    n_dropped: int = 0
+    n_dropped: int = 0  # Number of constraint rows for which the engine had no memory.
     lost_digits: LostDigits = field(default_factory=LostDigits)
     prediction: Prediction = field(default_factory=Prediction)
-    against: Audit | None = None
-    provenance: dict[str, Any] = field(default_factory=dict)
+    against: Audit | None = None  # Result of another model on the same states.
+    provenance: dict[str, Any] = field(default_factory=dict)  # Result of `describe_provenance`.
     folder: Path = Path("lavender-audit")  # To which `write` wrote.
 
     @classmethod
@@ -127,15 +89,31 @@ class Audit:
         shape = runs.worlds, runs.steps
         rows, contacts = np.zeros((2, *shape), int)
         numbers = np.full((len(WORST_ROW_ERRORS), *shape), np.nan)
-        claims = np.full(shape, -1, np.int8) if has_claims else None
-        verdict = np.full(shape, -1, np.int8)
-        found = describe_provenance(runs.model, runs.name, engine)
-        return cls(runs, engine, numbers, verdict, rows, contacts, converged=claims, provenance=found, **more)
+        verdict, claims = np.full((2, *shape), -1, np.int8)
+        result = cls(runs, engine, numbers, verdict, rows, contacts, notes=list(runs.notes), **more)
+        result.converged = claims if has_claims else None
+        result.provenance = describe_provenance(runs.model, runs.name, engine)
+        if runs.model is not None:
+            result.can_touch = can_any_geoms_collide(runs.mj, runs.model)
+        if runs.against is not None:
+            name, model = runs.against
+            other = replace(runs, name=name, model=model, against=None, notes=())
+            result.against = cls.with_size(other, engine, **more)
+        return result
 
     def add_piece(self, piece: Piece, keep: int | None) -> None:
         """Add the results of judged steps, and keep the worst (`Judging.keep`)."""
-        self._make_space(piece)
-        at = piece.world, piece.step
+        # Enlarge the arrays for steps of a loop of unknown length and number of worlds.
+        size, at = self.verdict.shape, (piece.world, piece.step)
+        worlds, steps = (max(n, int(np.max(x, initial=-1)) + 1) for n, x in zip(size, at, strict=True))
+        if (worlds, steps) != size:
+            more = ((0, worlds - size[0]), (0, steps - size[1]))
+            self.numbers = np.pad(self.numbers, ((0, 0), *more), constant_values=np.nan)
+            self.verdict = np.pad(self.verdict, more, constant_values=-1)
+            self.rows, self.contacts = np.pad(self.rows, more), np.pad(self.contacts, more)
+            if self.converged is not None:
+                self.converged = np.pad(self.converged, more, constant_values=-1)
+            self.runs = replace(self.runs, worlds=worlds, steps=steps)
         self.numbers[:, piece.world, piece.step] = piece.numbers
         self.verdict[at], self.rows[at], self.contacts[at] = piece.verdict, piece.rows, piece.contacts
         if self.converged is not None and piece.converged is not None:
@@ -143,7 +121,11 @@ class Audit:
         for i, name in piece.where:
             count, largest = self.where.get(name, (0, 0.0))
             self.where[name] = count + 1, max(largest, float(piece.numbers[0, i]))
-        self.worst[:] = _select_worst([*self.worst, *piece.worst], keep)
+        ranked = sorted([*self.worst, *piece.worst], key=lambda w: (-w.velocity, w.world, w.step))
+        if keep is None:  # The worst step of each world.
+            worst = {w.world: w for w in reversed(ranked)}
+            ranked = [w for w in ranked if worst[w.world] is w]
+        self.worst[:] = ranked[: N_WORST_WORLDS if keep is None else keep]
         self.contact_states.extend(piece.contact_states)
         self.engine_warnings.update(piece.engine_warnings)
         self.divergences[:] = sorted([*self.divergences, *piece.divergences])
@@ -152,20 +134,6 @@ class Audit:
         self.prediction = self.prediction.merge(piece.prediction)
         if self.against is not None and piece.against is not None:
             self.against.add_piece(piece.against, keep)
-
-    def _make_space(self, piece: Piece) -> None:
-        """Enlarge the arrays for steps of a loop of unknown length and number of worlds."""
-        size = self.verdict.shape
-        worlds, steps = (max(n, int(np.max(x, initial=-1)) + 1) for n, x in zip(size, piece[:2], strict=True))
-        if (worlds, steps) == size:
-            return
-        more = ((0, worlds - size[0]), (0, steps - size[1]))
-        self.numbers = np.pad(self.numbers, ((0, 0), *more), constant_values=np.nan)
-        self.verdict = np.pad(self.verdict, more, constant_values=-1)
-        self.rows, self.contacts = np.pad(self.rows, more), np.pad(self.contacts, more)
-        if self.converged is not None:
-            self.converged = np.pad(self.converged, more, constant_values=-1)
-        self.runs = replace(self.runs, worlds=worlds, steps=steps)
 
     # -- counts --------------------------------------------------------------------------------------------
 
@@ -297,19 +265,7 @@ class Audit:
             counted = self.engine_warnings.most_common()
             texts = "; ".join(f"{text} ({format_count(n, 'time')})" for text, n in counted)
             lines.append(f"MuJoCo's own warnings: {texts}.")
-        return [*filter(None, lines), *filter(None, self.notes)]
-
-    def describe_divergences(self) -> str:
-        """Return sentences on the cause of divergence; empty if no world diverged."""
-        if not self.divergences:
-            return ""
-        exact = sum(map(self.has_exact_solves, self.divergences))
-        if exact == self.n_diverged:
-            return f"Every solve until a world diverged was exact: the cause lies {OUTSIDE_SOLVER}."
-        text = DIVERGENCE_ADVICE if self.engine == "mujoco" else ENGINE_ADVICE
-        if not exact:
-            return text
-        return f"In {exact} worlds every solve until divergence was exact: the cause lies {OUTSIDE_SOLVER}. {text}"
+        return [*lines, *self.notes]
 
     def compare_in_words(self) -> str:
         """Return a sentence with the counts of the other model on the same states; empty without one."""
@@ -345,7 +301,7 @@ class Audit:
         rows = [
             (row, n, format_speed(x, unit)) for name, (n, x) in ranked for row, unit in [split_row_unit(name)]
         ]
-        return _make_frame(["worst row", "steps", "largest error"], rows)
+        return pd.DataFrame(rows, columns=["worst row", "steps", "largest error"])
 
     @property
     def diverged(self) -> pd.DataFrame:
@@ -355,7 +311,7 @@ class Audit:
              "exact" if self.has_exact_solves(d) else "not exact")
             for d in self.divergences
         ]  # fmt: skip
-        return _make_frame(["too large", "world", "step", "error [m/s]", "solves until then"], rows)
+        return pd.DataFrame(rows, columns=["too large", "world", "step", "error [m/s]", "solves until then"])
 
     @property
     def worst_steps(self) -> pd.DataFrame:
@@ -364,7 +320,7 @@ class Audit:
         for i, w in enumerate(self.worst, 1):
             row, unit = split_row_unit(w.where)
             rows.append((f"worst_{i}.npz", w.world, w.step, format_speed(w.velocity, unit), row))
-        return _make_frame(["file", "world", "step", "error", "worst row"], rows)
+        return pd.DataFrame(rows, columns=["file", "world", "step", "error", "worst row"])
 
     @property
     def claims(self) -> pd.DataFrame:
@@ -379,13 +335,13 @@ class Audit:
                 share = format_percent(n, int((outcome >= 0).sum()), 1)
                 rows.append((name, n, share, int(np.count_nonzero(here.any(axis=1))), *sizes))
         heads = ["claim and verdict", "steps", "share", "worlds", "median [m/s]", "largest error [m/s]"]
-        return _make_frame(heads, rows)
+        return pd.DataFrame(rows, columns=heads)
 
     @property
     def comparison(self) -> pd.DataFrame:
         """Errors and counts of this model and of the other one on the same states."""
         if self.against is None:
-            return _make_frame({})
+            return pd.DataFrame()
         other, both = self.against, self.is_judged & self.against.is_judged
         names = f"{self.runs.name} [m/s]", f"against {other.runs.name} [m/s]"
         return _tabulate_quantiles({names[0]: self.numbers[0][both], names[1]: other.numbers[0][both]})
@@ -463,7 +419,7 @@ class Audit:
         """Page with the result in sentences, figures and tables, as `lavender audit` writes it."""
         counts = AuditCounts(self)
         rows = [(name, n, format_percent(n, max(counts.n, 1))) for name, n in counts.classes]
-        classes = _make_frame(["error of the worst row", "steps", "share"], rows)
+        classes = pd.DataFrame(rows, columns=["error of the worst row", "steps", "share"])
         short = [self.comparison, self.claims, classes, self.worst_rows.head(3), self.worst_steps]
         last = format_provenance(self.provenance)
         return ResultPage(partial(make_audit_page, self), self.totals, short, self.is_stopped, last)
@@ -473,22 +429,4 @@ def _tabulate_quantiles(errors: dict[str, Any]) -> pd.DataFrame:
     """Build the table of `QUANTILES` of some errors; columns without a finite error are left out."""
     known = {name: x[np.isfinite(x)] for name, x in errors.items()}
     columns = {name: np.quantile(x, QUANTILES, method="higher") for name, x in known.items() if len(x)}
-    return _make_frame({"quantile": QUANTILE_NAMES, **columns} if columns else {})
-
-
-def _make_frame(columns: Any, rows: Sequence[Any] | None = None) -> pd.DataFrame:
-    """Build a DataFrame from a dict of columns, or from heads and rows; empty without rows."""
-    import pandas as pd
-
-    return pd.DataFrame(columns) if rows is None else pd.DataFrame(rows, columns=columns)
-
-
-def _select_worst(candidates: list[Worst], keep: int | None) -> list[Worst]:
-    """Select the `keep` worst steps, or the worst step of each of `N_WORST_WORLDS` worlds."""
-    ranked = sorted(candidates, key=lambda w: (-w.velocity, w.world, w.step))
-    if keep is not None:
-        return ranked[:keep]
-    worst: dict[int, Worst] = {}
-    for w in ranked:
-        worst.setdefault(w.world, w)
-    return list(worst.values())[:N_WORST_WORLDS]
+    return pd.DataFrame({"quantile": QUANTILE_NAMES, **columns} if columns else {})

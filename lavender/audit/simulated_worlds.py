@@ -157,14 +157,13 @@ class Runs:
         """Number of worlds that start without noise."""
         return min(self.worlds, 1 if self.starts is None else len(self.starts))
 
-    def choose_spread(self, fixed: float | None, watch: Any = None) -> tuple[Runs, str]:
+    def choose_spread(self, fixed: float | None, watch: Any = None) -> Runs:
         """Return these runs with a fixed spread, or the largest of `SPREADS` that the first worlds with noise survive.
 
-        The second result is a sentence about a choice that is not the largest; else it is empty. If these worlds
-        diverge without noise, too, the largest is chosen.
+        A choice that is not the largest is noted. If these worlds diverge without noise, too, the largest is chosen.
         """
         if fixed is not None:
-            return replace(self, spread=fixed), ""
+            return replace(self, spread=fixed)
         if watch is not None:
             watch(Event(0, 0, "simulating trial worlds to choose the spread", ""))
         trial = range(self.n_exact_worlds, min(self.worlds, self.n_exact_worlds + N_TRIAL_WORLDS))
@@ -174,13 +173,14 @@ class Runs:
                 if all(simulate_world(runs, world)[1] is None for world in trial):
                     break
             else:
-                return replace(self, spread=SPREADS[0]), ""
+                return replace(self, spread=SPREADS[0])
         if spread == SPREADS[0]:
-            return runs, ""
-        return runs, (
+            return runs
+        note = (
             f"The start velocities of the worlds differ by {spread:g} m/s (rad/s) only, because worlds diverged with "
             f"{SPREADS[SPREADS.index(spread) - 1]:g} m/s and not with {spread:g} m/s (--spread)."
         )
+        return replace(runs, notes=(*runs.notes, note))
 
     def create_start_data(self, world: int) -> Any:
         """Create the MjData with which a world starts."""

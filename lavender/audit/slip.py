@@ -27,20 +27,18 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from lavender.base.arrays import FloatArray, as_array, check_float
 from lavender.base.errors import InputError
+from lavender.base.lazy_import import pandas as pd
 from lavender.judge.residuals import residual
 from lavender.problem import Problem
 from lavender.problem.data import check_problem
 from lavender.report.text import NONE, format_size, format_sizes
 from lavender.solving.solve import solve
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 #: {variant: cause of its difference from the next variant}, in the order of replacement.
 CAUSES = {
@@ -162,8 +160,6 @@ class SlipExplanation:
     @property
     def slips(self) -> pd.DataFrame:
         """Slip of each contact and its parts by cause [m/s], and the dominant cause."""
-        import pandas as pd
-
         columns = {"contact": self.contacts, "points": 1, "speed": self.variants[0].speeds, **self.parts}
         return _add_dominant_cause(pd.DataFrame(columns))
 
@@ -180,8 +176,6 @@ class SlipExplanation:
     @property
     def remedies_table(self) -> pd.DataFrame:
         """Slip of the fastest contact with each setting [m/s], in the explained step and later, as texts."""
-        import pandas as pd
-
         slips, means = (format_sizes([getattr(r, name) for r in self.remedies]) for name in ("slip", "later"))
         for i, remedy in enumerate(self.remedies):
             if remedy.diverged_step >= 0:
@@ -470,8 +464,6 @@ def _add_dominant_cause(slips: pd.DataFrame) -> pd.DataFrame:
 
 def average_slip(explanations: Iterable[SlipExplanation]) -> pd.DataFrame:
     """Return the slip of each pair of geoms, averaged over its points in several states."""
-    import pandas as pd
-
     slips = pd.concat([explanation.slips for explanation in explanations])
     groups = slips.drop(columns=["cause", "part"]).groupby(slips["contact"].map(get_geoms), sort=False)
     means = groups.mean(numeric_only=True).assign(points=groups["points"].sum())

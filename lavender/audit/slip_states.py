@@ -6,7 +6,7 @@ import copy
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -29,6 +29,8 @@ from lavender.audit.slip import (
 )
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
+from lavender.base.lazy_import import markupsafe
+from lavender.base.lazy_import import pandas as pd
 from lavender.io import mujoco as adapter
 from lavender.io.mujoco_memory import import_mujoco
 from lavender.io.start_states import name_model, read_states, without_sleep
@@ -36,9 +38,6 @@ from lavender.problem import Problem
 from lavender.report.page import Page, make_table, tabulate_frame
 from lavender.report.runner import Event
 from lavender.report.text import format_count, format_speed
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 MAX_REMEDY_STATES = 8  # Settings are simulated from up to this many states, those with the largest slip.
 FRICTION_FACTOR = 2.0  # The friction coefficient is multiplied by this in one of the settings.
@@ -106,20 +105,18 @@ class SlipOfStates:
             )
         blocks: list[Any] = []
         if folder is not None:
-            from markupsafe import Markup
-
             parts = {cause: float(first[cause]) for cause in CAUSES.values()}
             total = sum(parts.values()) or 1.0
             colors = [f"var(--s{i})" for i in range(len(parts))]
             shares = (f"{100.0 * x / total:.1f}" for x in parts.values())
             bar = list(zip(shares, colors, strict=True))
-            swatch = Markup('<span class="swatch" style="background:{}"></span> {}')
+            swatch = markupsafe.Markup('<span class="swatch" style="background:{}"></span> {}')
             named = zip(parts.items(), colors, strict=True)
             rows: list[Any] = [[swatch.format(color, cause), format_speed(x)] for (cause, x), color in named]
             alt = ", ".join(f"{cause} {format_speed(x)}" for cause, x in parts.items())
             title = "Causes of this slip"
             causes = [make_table(rows, title=title, classes="full"), {"bar": bar, "alt": alt}]
-            drawn = [Markup(worst.draw_slip(folder))] if worst.remedies else []
+            drawn = [markupsafe.Markup(worst.draw_slip(folder))] if worst.remedies else []
             blocks = [{"pair": [drawn or causes, causes if drawn else []]}]
             blocks.append(tabulate_frame(self.table, title="Slip of each pair of geoms"))
             if worst.remedies:

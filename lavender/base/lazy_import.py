@@ -55,10 +55,13 @@ class _LazyModule:
 
 
 if TYPE_CHECKING:
+    import markupsafe as markupsafe
+    import pandas as pandas
     from scipy import sparse as sparse
     from scipy.linalg import lapack as lapack
 else:
     sparse, lapack = map(_LazyModule, ("scipy.sparse", "scipy.linalg.lapack"))
+    pandas, markupsafe = map(_LazyModule, ("pandas", "markupsafe"))  # For pages and tables.
 
 
 def import_module_lazily(name: str) -> Any:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from lavender.base.errors import InputError
+from lavender.base.lazy_import import pandas as pd
 from lavender.cli.options import (
     exit_after_interrupt,
     is_option_set,
@@ -20,8 +21,6 @@ from lavender.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from pandas import DataFrame
-
     from lavender.audit.page import ResultPage
     from lavender.report import Event, Plan
 
@@ -32,7 +31,7 @@ REDRAW_INTERVAL = 0.25  # [s] Time between two updates of the progress on a term
 class Measured(NamedTuple):
     """Lines of a measuring command, measured by this call or reused from its output folder."""
 
-    lines: DataFrame
+    lines: pd.DataFrame
     stopped: bool  # Whether Ctrl-C ended the measurement.
     reuse_note: str = ""  # Sentence on the number of reused runs; empty if this call measured all of them.
 

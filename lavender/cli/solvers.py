@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from lavender.base.lazy_import import pandas as pd
 from lavender.cli.completion import complete_solver
 from lavender.cli.options import escape_markup, make_console
 
@@ -86,8 +87,6 @@ def _describe_solver(name: str) -> None:
 
 def _list_solvers() -> None:
     """Print a table of the solvers, installed ones first."""
-    import pandas as pd
-
     from lavender.problem import LAWS, OPERATORS
     from lavender.report.render import print_table
     from lavender.solvers import registry

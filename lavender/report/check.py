@@ -20,13 +20,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from lavender.base.arrays import check_sequence
 from lavender.base.errors import InputError, LavenderError, format_error
 from lavender.base.lazy_import import import_numerical_modules
+from lavender.base.lazy_import import pandas as pd
 from lavender.external.backends import explain_contradicted_claim
 from lavender.judge.residuals import MAX_EXCUSED_RESIDUAL
 from lavender.judge.solution import CONTRADICTED, NOT_PROVEN, Solution, Status, raise_if_interrupted
@@ -37,9 +38,6 @@ from lavender.report.text import format_residual, format_tolerance
 from lavender.solvers.registry import available, get, known, specs
 from lavender.solving.limits import check_time_limit
 from lavender.solving.prepared import check_arguments
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 REFERENCES = ("osqp", "clarabel", "piqp", "direct")
 # Reference solvers, in order, under the law "cone" (relaxed friction), which does not give a QP.
@@ -164,10 +162,8 @@ class CrossCheck:
         return str(format_cells(self.frame).to_html(index=False, border=0))
 
     @property
-    def frame(self) -> DataFrame:
+    def frame(self) -> pd.DataFrame:
         """Row for each solver; the bounded variant that ran is named after an arrow."""
-        import pandas as pd
-
         heads = make_case(self.problem).heads
         columns = ["solver", "verdict", "status", *heads, "note"]
         rows = [{name: getattr(r, name) for name in columns} for r in self.rows]

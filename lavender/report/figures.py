@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from lavender.base.lazy_import import pandas as pd
 from lavender.report import drawing
 from lavender.report.tables import ENGINE_NAME, Contents, format_size, is_plug_in, rank_solvers
 from lavender.report.text import format_count, format_power, format_residual, format_speed, format_time
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 MAX_LINES = 6  # Largest number of solvers in a figure, without `ALWAYS_DRAWN`, plug-ins and the engine.
 ALWAYS_DRAWN = (

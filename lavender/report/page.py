@@ -23,10 +23,10 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from lavender.base.errors import InputError, require_packages
+from lavender.base.lazy_import import pandas as pd
 from lavender.report.render import format_cells, list_number_heads
 
 if TYPE_CHECKING:
-    import pandas as pd
     from rich.console import Console
 
 DEFAULT_ERROR_LIMIT = (

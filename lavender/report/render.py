@@ -22,10 +22,10 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lavender.base.lazy_import import pandas as pd
 from lavender.report.text import NONE, escape_unprintable, format_sizes, format_times_in_one_unit
 
 if TYPE_CHECKING:
-    import pandas as pd
     from rich.console import Console
 
 MIN_HEAD_WIDTH = 8  # [columns] Heads do not fold at a smaller width.
@@ -39,8 +39,6 @@ NUMBER_CELL = re.compile(
 
 def format_cells(frame: pd.DataFrame) -> pd.DataFrame:
     """Return the texts of a frame's cells under heads with the units of its times, without empty columns."""
-    import pandas as pd
-
     heads = list(map(str, frame.columns))
     columns = [values.tolist() for _, values in frame.items()]
     is_float = [values.dtype.kind == "f" for _, values in frame.items()]

@@ -16,12 +16,13 @@ from dataclasses import asdict, dataclass, replace
 from itertools import groupby, product
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from lavender.base.arrays import FloatArray, check_sequence
 from lavender.base.errors import InputError, LavenderError, require_packages
+from lavender.base.lazy_import import pandas as pd
 from lavender.diagnostics.motion_error import motion_error
 from lavender.problem import Problem, check_problem
 from lavender.report import machine
@@ -51,9 +52,6 @@ from lavender.report.timing import (
 from lavender.report.workers import check_workers, connect_backend, map_unordered
 from lavender.solvers import registry
 from lavender.solvers.registry import SolverSpec
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 # If a step took less than this fraction of the time limit, no guarded solve (`timing`) precedes the next step's.
 UNGUARDED_TIME_RATIO = 0.05
@@ -110,7 +108,7 @@ def run(
     cases: Source | Iterable[Source] = (), solvers: str | Sequence[str] | None = None, plan: Plan | None = None,
     store: Store | str | Path | None = None, *, workers: int = 1, backend: str = "loky",
     watch: Watch | None = None, into: list[Row] | None = None, reuse: bool = True,
-) -> DataFrame:  # fmt: skip
+) -> pd.DataFrame:  # fmt: skip
     """Measure every solver on every case that it accepts.
 
     Parameters

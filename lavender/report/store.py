@@ -16,17 +16,15 @@ import math
 import warnings
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from lavender.base.errors import InputError, require_packages
+from lavender.base.lazy_import import pandas as pd
 from lavender.io.stored import as_path, make_folder, read_bytes
 from lavender.judge.solution import CONFIRMED
 from lavender.report.text import format_tolerance
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 Row: TypeAlias = dict[str, Any]  # Content of one line.
 KINDS = ("machine", "case", "run", "skip")
@@ -146,21 +144,19 @@ def open_store(store: Store | str | Path | None) -> contextlib.AbstractContextMa
     return contextlib.nullcontext(store) if store is None or isinstance(store, Store) else Store(store)
 
 
-def make_lines(rows: Iterable[Row], source: str = "", dropped: int = 0) -> DataFrame:
+def make_lines(rows: Iterable[Row], source: str = "", dropped: int = 0) -> pd.DataFrame:
     """Return a DataFrame with a row for each of `rows`, as `read` does.
 
     Its `attrs` have `source` and the number of incomplete lines that were `dropped`.
     """
     require_packages("a table of runs", "pandas")
-    import pandas as pd
-
     lines = pd.DataFrame(list(rows))
     lines = lines if "kind" in lines else pd.DataFrame({"kind": pd.Series(dtype=object)})
     lines.attrs = {"source": source, "dropped": dropped}
     return lines
 
 
-def read(path: str | Path) -> DataFrame:
+def read(path: str | Path) -> pd.DataFrame:
     """Read a file `records.jsonl`, or the one in a folder, as a DataFrame with a row for each line.
 
     An incomplete last line, which a killed measurement leaves, is dropped and counted in `attrs["dropped"]`.
@@ -171,8 +167,6 @@ def read(path: str | Path) -> DataFrame:
         The file does not exist, or a line is not a record.
     """
     require_packages("a table of runs", "pandas")
-    import pandas as pd
-
     path = as_path(path)
     path = path / "records.jsonl" if path.is_dir() else path
     content = read_bytes(path, "records")
@@ -199,10 +193,8 @@ def read(path: str | Path) -> DataFrame:
 # -- parts -------------------------------------------------------------------------------------------------
 
 
-def convert_columns(lines: DataFrame, kind: str, columns: Row) -> DataFrame:
+def convert_columns(lines: pd.DataFrame, kind: str, columns: Row) -> pd.DataFrame:
     """Return the lines of one kind with these columns, in the types of the defaults, which replace missing values."""
-    import pandas as pd
-
     some, converted = lines[lines["kind"] == kind], {}
     for name, default in columns.items():
         values = some[name] if name in some else pd.Series(None, index=some.index, dtype=object)
@@ -218,7 +210,7 @@ def convert_columns(lines: DataFrame, kind: str, columns: Row) -> DataFrame:
     return pd.DataFrame(converted, index=some.index)
 
 
-def select_runs(lines: DataFrame) -> DataFrame:
+def select_runs(lines: pd.DataFrame) -> pd.DataFrame:
     """Return a row for each run, with facts about its case and its machine; docs/report.md lists the columns.
 
     Raises
@@ -248,7 +240,7 @@ def select_runs(lines: DataFrame) -> DataFrame:
     return runs.astype(dict.fromkeys(texts, "category"))
 
 
-def select_cases(lines: DataFrame) -> DataFrame:
+def select_cases(lines: pd.DataFrame) -> pd.DataFrame:
     """Return the last description of each case, by its name; of two sequences with one name, the steps of the last."""
     cases = convert_columns(lines, "case", CASE_DETAILS | CASE_COLUMNS).drop_duplicates("case", keep="last")
     cases = cases.astype(dict.fromkeys(("case", "sequence", "identity", "source", "structure"), object))
@@ -257,7 +249,7 @@ def select_cases(lines: DataFrame) -> DataFrame:
     return cases.set_index("case", drop=False)
 
 
-def select_skips(lines: DataFrame) -> DataFrame:
+def select_skips(lines: pd.DataFrame) -> pd.DataFrame:
     """Return the pairs that did not run, and with an empty `solver` the cases that did not load and never loaded later.
 
     `sequence` is the sequence of a step that did not load.
@@ -271,7 +263,7 @@ def select_skips(lines: DataFrame) -> DataFrame:
     return skips.loc[skips.index[np.array(is_open, bool)]].astype(object)
 
 
-def select_machines(lines: DataFrame) -> dict[str, Row]:
+def select_machines(lines: pd.DataFrame) -> dict[str, Row]:
     """Return the last description of each machine with its versions and plan, by its run, in order of time."""
     machines: dict[str, Row] = {}
     defaults = {"run": "", "started": "", "lavender": "", "python": "", "platform": "", "cpu": "", "cores": 1,
@@ -284,7 +276,7 @@ def select_machines(lines: DataFrame) -> dict[str, Row]:
     return machines
 
 
-def select_solvers(lines: DataFrame, names: Iterable[str]) -> DataFrame:
+def select_solvers(lines: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
     """Return the lines about some solvers, and the lines about machines and cases."""
     own = lines["solver"] if "solver" in lines else lines["kind"].map({})
     known = sorted({str(name) for name in own.dropna()} - {""})

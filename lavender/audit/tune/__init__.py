@@ -1,7 +1,7 @@
 """Choose settings of MuJoCo: measured on worlds of a model (`sweep`), and recommended as lines to copy."""
 
 from lavender.audit.settings import MujocoSetting
-from lavender.audit.tune.measured import Measured
+from lavender.audit.tune.mujoco_settings import Measured
 from lavender.audit.tune.recommendation import Tuning
 from lavender.audit.tune.sweep import tune
 

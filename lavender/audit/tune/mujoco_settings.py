@@ -26,7 +26,6 @@ import numpy as np
 from lavender.audit.audit import MAX_PROBLEMS_IN_MEMORY
 from lavender.audit.settings import OPTIONS, MujocoSetting, get_option_value
 from lavender.audit.simulated_worlds import Runs, has_diverged, simulate_world
-from lavender.audit.tune.measured import Measured, make_unmeasured
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.batch.residuals import residual_many
@@ -38,6 +37,7 @@ from lavender.report.runner import Event
 MAX_TIME_RATIO = 1.25
 # The errors of every fourth stretch come first: they exclude most settings that are not accurate enough.
 MIN_JUDGED_PARTS = 4
+ERROR_QUANTILE = 0.99  # Settings are compared by this quantile of the error over all steps.
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
@@ -68,19 +68,14 @@ CONVERGED_OPTIONS = {"solver": "Newton", "iterations": 300, "tolerance": 0.0, "l
                      "ls_tolerance": 1e-4}  # fmt: skip
 
 
+@dataclass
 class Progress:
-    """Number of measurements that are done and, estimated, to come.
+    """Number of measurements that are done and, estimated, to come."""
 
-    Parameters
-    ----------
-    watch : callable, optional
-        Called with an `Event` at the beginning of each measurement.
-    """
-
-    def __init__(self, watch: Callable[[Event], None] | None) -> None:
-        self.watch = watch
-        self.done = self.expected = 0
-        self.loads: list[float | None] = []  # Number of runnable processes at each timing.
+    watch: Callable[[Event], None] | None  # Called at the beginning of each measurement.
+    done: int = 0
+    expected: int = 0
+    loads: list[float | None] = field(default_factory=list)  # Number of runnable processes at each timing.
 
     def begin_measurement(self, kind: str, text: str) -> None:
         """Show the progress before a measurement, "judging" or "timing", which then counts as done."""
@@ -93,24 +88,43 @@ class Progress:
 
 
 @dataclass(eq=False)
+class Measured:
+    """Results of one setting on some worlds."""
+
+    setting: MujocoSetting
+    solver: str
+    error: FloatArray = field(repr=False)  # (steps,) m/s
+    motion: FloatArray = field(repr=False)  # (stretches,) m
+    # (steps,) s: each time is the minimum of all repeats, which removes interruptions; infinite if it was not timed.
+    times: FloatArray = field(repr=False)
+    rows: Any = field(default=(), repr=False)  # (steps,) int
+    contacts: Any = field(default=(), repr=False)  # (steps,) int
+
+    @property
+    def mean_step_time(self) -> float:
+        """Mean time of a step [s]; infinite if it was not timed."""
+        return float(self.times.mean())
+
+    @property
+    def worst_error(self) -> float:
+        """Error [m/s] that 1 % of the steps exceed."""
+        return float(np.quantile(self.error, ERROR_QUANTILE, method="higher"))
+
+    @property
+    def worst_motion(self) -> float:
+        """Distance [m] that 1 % of the stretches exceed."""
+        return float(np.quantile(self.motion, ERROR_QUANTILE, method="higher"))
+
+
+@dataclass(eq=False)
 class Stage:
-    """Worlds of a MuJoCo model on which settings are measured.
+    """Worlds of a MuJoCo model on which settings are measured."""
 
-    Parameters
-    ----------
-    mj, model
-        The module mujoco and the model with its own setting.
-    starts : (n, size)
-        State at the start of each stretch.
-    controls : (n, horizon, nu)
-    ends : (n, bodies, 3) m
-        Positions of the bodies after each stretch of the converged run.
-    """
-
-    mj: Any
-    model: Any
-    starts: FloatArray
-    controls: FloatArray
+    mj: Any  # The module mujoco.
+    model: Any  # mujoco.MjModel with its own setting.
+    starts: FloatArray  # (n, size): state at the start of each stretch.
+    controls: FloatArray  # (n, horizon, nu)
+    # (n, bodies, 3) m: positions of the bodies after each stretch of the converged run.
     ends: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
@@ -163,7 +177,8 @@ class Stage:
         After a part of the stretches with an error above `limit` [m/s], the others are not judged.
         """
         mj, model = self.mj, setting.apply_to(self.mj, self.model)
-        result = make_unmeasured(setting, str(get_option_value(mj, model, "solver")))
+        never = np.full(1, np.inf)
+        result = Measured(setting, str(get_option_value(mj, model, "solver")), never, never, never)
         n, horizon, _ = self.controls.shape
         states = np.empty((n * horizon, self.starts.shape[1]))
         judge = copy.copy(model)
@@ -190,6 +205,16 @@ class Stage:
             return result
         sizes: dict[str, Any] = {"rows": rows[judged], "contacts": contacts[judged]}
         return replace(result, error=error[judged], motion=distance, **sizes)
+
+    def judge_settings(
+        self, settings: list[MujocoSetting], progress: Progress, limit: float = np.inf
+    ) -> list[Measured]:
+        """Judge settings one after the other (`judge_setting`)."""
+        results = []
+        for setting in settings:
+            progress.begin_measurement("judging", setting.short_name)
+            results.append(self.judge_setting(setting, limit))
+        return results
 
     def time_settings(self, settings: list[Measured], repeats: int, progress: Progress) -> None:
         """Time the steps of all settings, which alternate in `repeats` rounds; the first is the present setting.

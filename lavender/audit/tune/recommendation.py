@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from lavender.audit.page import SHOWN_RATIO, ResultPage, StepSizes
 from lavender.audit.provenance import format_provenance
 from lavender.audit.settings import MERGE_NOTE, MujocoSetting
-from lavender.audit.tune.measured import Measured
-from lavender.problem.derived import cached_property
+from lavender.audit.tune.mujoco_settings import Measured
+from lavender.base.lazy_import import markupsafe
+from lavender.base.lazy_import import pandas as pd
 from lavender.report import drawing
 from lavender.report.page import DEFAULT_ERROR_LIMIT, Page, fold_table, tabulate_frame
 from lavender.report.text import NONE, format_count, format_speed
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 # Times that differ by at most this fraction count as equal: noise is a few per cent.
 TIME_NOISE_FRACTION = 0.05
@@ -29,54 +27,28 @@ CHOICES_NOTE = (
 )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Tuning:
-    """Result of `tune`; the first of `measured` and of `held` is the model's own setting.
+    """Result of `tune`; the first of `measured` and of `held` is the model's own setting."""
 
-    Parameters
-    ----------
-    model : str
-        Name of the model or scene, or its file.
-    horizon : int
-        Number of steps of a stretch.
-    measured : list of Measured
-        Results on the worlds with even numbers.
-    held : list of Measured
-        Results of the model's own setting and of the chosen settings on the worlds with odd numbers, which are held
-        back; empty if Ctrl-C ended the measurement before.
-    threshold : float, m/s, m
-        Errors [m/s] and distances [m] up to this number count as accurate enough.
-    stopped : bool
-        The measurement was stopped by Ctrl-C.
-    sizes : StepSizes, optional
-        Rows and contacts of the steps of all worlds with the model's own setting.
-    busy : str
-        A warning if other processes used the processors during the timing; else empty.
-    notes : tuple of str
-        Sentences about the differences from a simulation of the model as it is: no sleep, a smaller spread.
-    n_held_worlds : int
-        Number of worlds held back.
-    error_limit : float, m/s, optional
-        The fastest setting whose error does not exceed this number in any step is also recommended.
-    held_errors : dict
-        Largest error [m/s] on the worlds held back, of the settings that were judged there.
-    provenance : dict
-        Result of `describe_provenance`.
-    """
-
-    model: str
-    horizon: int
-    measured: list[Measured]
+    model: str  # Name of the model or scene, or its file.
+    horizon: int  # Number of steps of a stretch.
+    measured: list[Measured]  # Results on the worlds with even numbers.
+    # Results of the model's own setting and of the chosen settings on the worlds with odd numbers, which are held back;
+    # empty if Ctrl-C ended the measurement before.
     held: list[Measured]
-    threshold: float
-    stopped: bool = False
-    sizes: StepSizes | None = None
-    busy: str = ""
+    threshold: float  # Errors [m/s] and distances [m] up to this number count as accurate enough.
+    stopped: bool = False  # Whether Ctrl-C stopped the measurement.
+    sizes: StepSizes | None = None  # Of the steps of all worlds with the model's own setting.
+    busy: str = ""  # A warning if other processes used the processors during the timing; else empty.
+    # Sentences about the differences from a simulation of the model as it is: no sleep, a smaller spread.
     notes: tuple[str, ...] = ()
     n_held_worlds: int = 0
+    # [m/s] The fastest setting whose error does not exceed this number in any step is also recommended.
     error_limit: float | None = None
-    held_errors: Mapping[MujocoSetting, float] = field(default_factory=dict)
-    provenance: dict[str, Any] = field(default_factory=dict)
+    # Largest error [m/s] on the worlds held back, of the settings that were judged there.
+    held_errors: dict[MujocoSetting, float] = field(default_factory=dict)
+    provenance: dict[str, Any] = field(default_factory=dict)  # Result of `describe_provenance`.
 
     @property
     def present_result(self) -> Measured:
@@ -101,7 +73,7 @@ class Tuning:
         )
         return all(x <= max(own, threshold) for x, own in pairs)
 
-    @cached_property
+    @property
     def faster(self) -> Measured | None:
         """Fastest setting that is accurate enough and faster than the present setting; None if there is none.
 
@@ -124,7 +96,7 @@ class Tuning:
         fastest = min((m.mean_step_time for m in settings), default=0.0)
         return [m for m in settings if (1.0 - TIME_NOISE_FRACTION) * m.mean_step_time <= fastest]
 
-    @cached_property
+    @property
     def closer(self) -> Measured | None:
         """Most accurate setting that is as fast as the present one.
 
@@ -184,14 +156,16 @@ class Tuning:
             "contact may be neither with it. Start from states with contact (--states FILE), or take more --steps."
         )
 
-    def _find_held_back(self, m: Measured) -> Measured | None:
-        """Return the result of a setting on the worlds held back; None if it was not measured there."""
-        return next((h for h in self.held if h.setting == m.setting), None)
+    def _format_held_back(self, m: Measured) -> tuple[str, str] | None:
+        """Return the relative time and the worst error on the worlds held back; None if they were not measured."""
+        held = next((h for h in self.held if h.setting == m.setting), None)
+        if held is None:
+            return None
+        ratio = held.mean_step_time / self.held[0].mean_step_time
+        return f"{ratio:.2f}", format_speed(float(held.error.max()))
 
     def _tabulate_settings(self, settings: Iterable[Measured]) -> pd.DataFrame:
         """Build the table of some settings."""
-        import pandas as pd
-
         now = self.present_result.mean_step_time
         rows = [
             (m.setting.short_name, f"{m.mean_step_time / now:.2f}", m.worst_error, float(m.error.max()), m.worst_motion)
@@ -242,27 +216,17 @@ class Tuning:
         first = f"Set {m.setting.short_name}: {time}, and {worst}."
         if self.error_limit is not None and self.within_limit is None:
             first = f"None of {n} settings is within the limit. {first}"
-        return [first, own, *filter(None, [self._describe_held_back(m)])]
-
-    def _describe_held_back(self, m: Measured) -> str:
-        """Return the results of a setting on the worlds held back; empty if it was not measured there."""
-        held = self._find_held_back(m)
+        held = self._format_held_back(m)
         if held is None:
-            return ""
-        ratio, worst = (
-            held.mean_step_time / self.held[0].mean_step_time,
-            format_speed(float(held.error.max())),
-        )
-        return (
-            f"On {format_count(self.n_held_worlds, 'world')} held back from the choice: {ratio:.2f} of the time, worst "
-            f"error {worst} in {format_count(len(held.error), 'step')}."
-        )
+            return [first, own]
+        return [first, own, (
+            f"On {format_count(self.n_held_worlds, 'world')} held back from the choice: {held[0]} of the time, worst "
+            f"error {held[1]} in {format_count(len(self.held[0].error), 'step')}."
+        )]  # fmt: skip
 
     @property
     def choices(self) -> pd.DataFrame:
         """The present setting and the advised ones: option, relative time and errors, also on worlds held back."""
-        import pandas as pd
-
         now = self.present_result
         named = [("now", now), ("as fast, more accurate", self.closer), ("as accurate, faster", self.faster)]
         if self.error_limit is not None:
@@ -273,10 +237,7 @@ class Tuning:
         for name, m in named:
             if m is None:
                 continue
-            held, texts = self._find_held_back(m), [NONE, NONE]
-            if held is not None:
-                ratio = held.mean_step_time / self.held[0].mean_step_time
-                texts = [f"{ratio:.2f}", format_speed(float(held.error.max()))]
+            texts = self._format_held_back(m) or (NONE, NONE)
             time = f"{m.mean_step_time / now.mean_step_time:.2f}"
             worst = format_speed(self._compute_largest_error(m))
             rows.append((name, m.setting.short_name, time, format_speed(m.worst_error), worst, *texts))
@@ -341,9 +302,7 @@ class Tuning:
             warnings.append(f"{self.busy} Errors are not affected.")
         blocks: list[Any] = []
         if folder is not None:
-            from markupsafe import Markup
-
-            drawn = [] if self.reason_without_line else [Markup(self.draw_settings(folder))]
+            drawn = [] if self.reason_without_line else [markupsafe.Markup(self.draw_settings(folder))]
             note = "" if self.reason_without_line else CHOICES_NOTE
             choices = tabulate_frame(self.choices, title="Choices", note=note)
             blocks.append({"pair": [drawn, [choices]]})

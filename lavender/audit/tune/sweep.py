@@ -20,7 +20,6 @@ from lavender.audit.page import StepSizes
 from lavender.audit.provenance import describe_provenance
 from lavender.audit.settings import MujocoSetting
 from lavender.audit.simulated_worlds import Runs, can_any_geoms_collide, count_engine_warnings
-from lavender.audit.tune.measured import Measured
 from lavender.audit.tune.mujoco_settings import Progress, Stage, list_first_settings, list_variants
 from lavender.audit.tune.recommendation import Tuning
 from lavender.base.arrays import check_float, check_int
@@ -92,100 +91,75 @@ def tune(
     runs = Runs.of_model(model, worlds, steps, control=control, seed=seed).with_start_states(states)
     # Raise the error of an unsupported model here, before any world is simulated.
     from_mujoco_many(runs.model, np.zeros((0, runs.model.nq + runs.model.nv)))
-    can_touch = can_any_geoms_collide(runs.mj, runs.model)
-    with count_engine_warnings(runs.mj):  # Settings with which worlds diverge are left out.
-        return _run_tuning(runs, spread, horizon, repeats, threshold, can_touch, error_limit, watch)
-
-
-def _run_tuning(
-    runs: Runs, spread: float | None, horizon: int, repeats: int, threshold: float, can_touch: bool,
-    error_limit: float | None, watch: Callable[[Event], None] | None,
-) -> Tuning:  # fmt: skip
-    """Measure settings on the worlds with even numbers, and the chosen settings on the others.
-
-    The parameters are described in `tune`; `can_touch` states whether bodies of the model can collide.
-    """
-    progress = Progress(watch)
-    held_errors: dict[MujocoSetting, float] = {}
-    measured: list[Measured] = []
-    held: list[Measured] = []
-    sizes: StepSizes | None = None
-
-    def make_result(stopped: bool) -> Tuning:
-        """Build the result so far."""
-        timed = [m for m in measured if np.isfinite(m.mean_step_time)]
-        busy = machine.make_busy_warning(progress.loads, os.cpu_count() or 1, TUNE_BUSY_CONSEQUENCE)
-        return Tuning(
-            runs.name, horizon, timed, held, threshold=threshold, stopped=stopped, sizes=sizes, busy=busy,
-            n_held_worlds=runs.worlds // 2, error_limit=error_limit, held_errors=dict(held_errors),
-            notes=tuple(filter(None, (*runs.notes, note))),
-            provenance=describe_provenance(runs.model, runs.name),
-        )  # fmt: skip
-
-    def judge(stage: Stage, settings: list[MujocoSetting]) -> list[Measured]:
-        """Return the judged results of settings on a stage: in part, of settings too inaccurate to be chosen."""
-        results, limit = [], np.inf
-        if measured and stage is not held_back:
-            limit = max(float(measured[0].error.max()), threshold, error_limit or 0.0)
-        for setting in settings:
-            progress.begin_measurement("judging", setting.short_name)
-            results.append(stage.judge_setting(setting, limit))
-        return results
-
-    note = ""
     if watch is not None:
         watch(Event(0, 0, "simulating the worlds", ""))
-    try:
-        runs, note = runs.choose_spread(spread)
-        halves = [range(i, runs.worlds, 2) for i in (0, 1)]
-        stage, held_back = (Stage.from_stretches_of_runs(runs, half, horizon) for half in halves)
-        own, first_settings = MujocoSetting(), list_first_settings(runs.mj, runs.model)
-        n_variants = len(list_variants(runs.mj, runs.model, own)) * EXPECTED_VARIED_SETTINGS
-        n_first, n_trial = len(first_settings), min(N_TRIAL_ROUNDS, repeats)
-        # Three settings on the worlds held back, each timed in twice as many rounds.
-        n_held = 3 * (1 + 2 * repeats)
-        progress.expected = n_first * (1 + n_trial + repeats) + n_variants * (1 + repeats) + n_held
-        measured += judge(stage, [own])
-        if not np.isfinite(measured[0].error).all():
-            raise InputError(
-                f"{runs.name}: worlds diverge with the model's own setting, so other settings cannot be "
-                "compared with it: give other controls, states or fewer steps"
-            )
-        last = judge(held_back, [own])
-        both = [*measured, *last]
-        rows, contacts = (np.concatenate([getattr(m, name) for m in both]) for name in ("rows", "contacts"))
-        sizes = StepSizes(rows, contacts, can_touch)
-        if not sizes.has_enough_contact:
-            progress.expected = repeats
-            stage.time_settings(measured, repeats, progress)
-            return make_result(False)
-        measured += judge(stage, first_settings[1:])
-        stage.time_settings(measured, n_trial, progress)
-        limit = MAX_VARIED_TIME_RATIO * measured[0].mean_step_time
-        near = [m.setting for m in make_result(False).pareto_front if m.mean_step_time <= limit]
-        known = {m.setting for m in measured}
-        more = dict.fromkeys(
-            x for s in [own, *near] for x in list_variants(runs.mj, runs.model, s) if x not in known
+    with count_engine_warnings(runs.mj):  # Settings with which worlds diverge are left out.
+        runs = runs.choose_spread(spread)
+        tuning = Tuning(
+            runs.name, horizon, [], [], threshold, notes=runs.notes,
+            n_held_worlds=worlds // 2, error_limit=error_limit, held_errors={},
+            provenance=describe_provenance(runs.model, runs.name),
+        )  # fmt: skip
+        progress = Progress(watch)
+        try:
+            _measure_settings(tuning, runs, repeats, progress)
+        except KeyboardInterrupt:
+            if not tuning.measured or not np.isfinite(tuning.present_result.mean_step_time):
+                raise
+            tuning.stopped = True
+    tuning.measured = [m for m in tuning.measured if np.isfinite(m.mean_step_time)]
+    tuning.busy = machine.make_busy_warning(progress.loads, os.cpu_count() or 1, TUNE_BUSY_CONSEQUENCE)
+    return tuning
+
+
+def _measure_settings(tuning: Tuning, runs: Runs, repeats: int, progress: Progress) -> None:
+    """Measure settings on the worlds with even numbers, and the chosen settings on the others; add the results."""
+    measured, held_errors, error_limit = tuning.measured, tuning.held_errors, tuning.error_limit
+    halves = [range(i, runs.worlds, 2) for i in (0, 1)]
+    stage, held_back = (Stage.from_stretches_of_runs(runs, half, tuning.horizon) for half in halves)
+    own, first_settings = MujocoSetting(), list_first_settings(runs.mj, runs.model)
+    n_variants = len(list_variants(runs.mj, runs.model, own)) * EXPECTED_VARIED_SETTINGS
+    n_first, n_trial = len(first_settings), min(N_TRIAL_ROUNDS, repeats)
+    # Three settings on the worlds held back, each timed in twice as many rounds.
+    n_held = 3 * (1 + 2 * repeats)
+    progress.expected = n_first * (1 + n_trial + repeats) + n_variants * (1 + repeats) + n_held
+    measured += stage.judge_settings([own], progress)
+    if not np.isfinite(measured[0].error).all():
+        raise InputError(
+            f"{runs.name}: worlds diverge with the model's own setting, so other settings cannot be "
+            "compared with it: give other controls, states or fewer steps"
         )
-        progress.expected = len(more) + (len(measured) + len(more)) * repeats + n_held
-        measured += judge(stage, list(more))
+    held = held_back.judge_settings([own], progress)
+    both = [*measured, *held]
+    rows, contacts = (np.concatenate([getattr(m, name) for m in both]) for name in ("rows", "contacts"))
+    tuning.sizes = StepSizes(rows, contacts, can_any_geoms_collide(runs.mj, runs.model))
+    if not tuning.sizes.has_enough_contact:
+        progress.expected = repeats
         stage.time_settings(measured, repeats, progress)
-        chosen = make_result(False)
-        other = dict.fromkeys(m.setting for m in (chosen.faster, chosen.closer) if m is not None)
-        last += judge(held_back, list(other))
-        held_errors |= {m.setting: float(m.error.max()) for m in last}
-        # Judge the fastest setting within the limit on the worlds held back; if it exceeds the limit there, the next.
-        tested: dict[MujocoSetting, Measured] = {m.setting: m for m in last}
-        while error_limit is not None and (setting := make_result(False).limit_choice.setting) not in tested:
-            (tested[setting],) = judge(held_back, [setting])
-            held_errors[setting] = float(tested[setting].error.max())
-        if error_limit is not None and all(m.setting != setting for m in last):
-            last.append(tested[setting])
-        progress.expected = 2 * repeats * len(last)
-        held_back.time_settings(last, 2 * repeats, progress)
-        held += last if np.isfinite(last[0].mean_step_time) else []
-    except KeyboardInterrupt:
-        if not measured or not np.isfinite(measured[0].mean_step_time):
-            raise
-        return make_result(True)
-    return make_result(False)
+        return
+    # Settings with a larger error cannot be chosen.
+    limit = max(float(measured[0].error.max()), tuning.threshold, error_limit or 0.0)
+    measured += stage.judge_settings(first_settings[1:], progress, limit)
+    stage.time_settings(measured, n_trial, progress)
+    longest = MAX_VARIED_TIME_RATIO * measured[0].mean_step_time
+    near = [m.setting for m in tuning.pareto_front if m.mean_step_time <= longest]
+    known = {m.setting for m in measured}
+    more = dict.fromkeys(
+        x for s in [own, *near] for x in list_variants(runs.mj, runs.model, s) if x not in known
+    )
+    progress.expected = len(more) + (len(measured) + len(more)) * repeats + n_held
+    measured += stage.judge_settings(list(more), progress, limit)
+    stage.time_settings(measured, repeats, progress)
+    other = dict.fromkeys(m.setting for m in (tuning.faster, tuning.closer) if m is not None)
+    held += held_back.judge_settings(list(other), progress)
+    held_errors |= {m.setting: float(m.error.max()) for m in held}
+    # Judge the fastest setting within the limit on the worlds held back; if it exceeds the limit there, the next.
+    tested = {m.setting: m for m in held}
+    while error_limit is not None and (setting := tuning.limit_choice.setting) not in tested:
+        (tested[setting],) = held_back.judge_settings([setting], progress)
+        held_errors[setting] = float(tested[setting].error.max())
+    if error_limit is not None and all(m.setting != setting for m in held):
+        held.append(tested[setting])
+    progress.expected = 2 * repeats * len(held)
+    held_back.time_settings(held, 2 * repeats, progress)
+    tuning.held = held if np.isfinite(held[0].mean_step_time) else []
