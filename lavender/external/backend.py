@@ -102,9 +102,14 @@ def _call_through_qpsolvers(
     if backend.prefers_dense:
         size, nonzeros = n * (n + len(program.t)), len(program.P[2]) + len(program.J[2])
         dense = size <= max(MAX_DENSE_ENTRIES, MAX_DENSE_FILL * nonzeros)
-    if start is not None and backend.starts:
-        settings |= _make_start_settings(backend, program, start)
-    x0 = settings.pop("initvals", None)
+    x0 = start[0] if start is not None and backend.starts else None
+    if start is not None and backend.name == "proxqp":
+        from proxsuite import proxqp
+
+        y, z, box = program.split_multipliers(start[1])
+        z = np.concatenate([z, box]) if (program.variable >= 0).any() else z
+        settings |= {name: part for name, part in (("y", y), ("z", z)) if len(part)}
+        settings["initial_guess"] = proxqp.InitialGuess.WARM_START
     settings |= extra
     equations, inequalities, lb, ub = program.split_rows(backend.finite)
     a = b = g = h = None
@@ -128,14 +133,21 @@ def _call_through_qpsolvers(
     status, text = _get_status(solution, extras)
     x = None if solution.x is None else np.asarray(solution.x, float).ravel()
     lam = program.join_multipliers(solution.y, solution.z, solution.z_box, backend.finite)
-    iterations = _get_iterations(extras)
+    count = _find_value(
+        extras, "iter", "iterations", "num_iterations", "nbIter", "num_iter", "iter_num", "nWSR", "stats"
+    )
+    if isinstance(count, list) and count and isinstance(count[0], dict):
+        count = len(count)  # qtqp returns the statistics of each iteration.
+    # quadprog returns two counts, of added and of dropped constraints.
+    count = count[0] if isinstance(count, (tuple, list, np.ndarray)) and len(count) else count
+    work = {"iterations": int(count)} if isinstance(count, (int, np.integer)) else {}
     unsolved = "not solved" if x is not None else "not solved, nothing returned"
     message = text or ("solved" if solution.found else unsolved)
     if backend.settings is None:
         message += ", at its own tolerance"
     if backend.jax and not sys.modules["jax"].config.jax_enable_x64:
         message += "; JAX computes in 32 bits: jax.config.update('jax_enable_x64', True) changes that"
-    return Answer(status, message, x, lam, {} if iterations is None else {"iterations": iterations})
+    return Answer(status, message, x, lam, work)
 
 
 def _find_value(extras: dict[str, Any], *names: str) -> Any:
@@ -146,18 +158,6 @@ def _find_value(extras: dict[str, Any], *names: str) -> Any:
             if value is not None:
                 return value
     return None
-
-
-def _get_iterations(extras: dict[str, Any]) -> int | None:
-    """Return the number of iterations from the additional data of a backend, or None if they do not contain it."""
-    value = _find_value(
-        extras, "iter", "iterations", "num_iterations", "nbIter", "num_iter", "iter_num", "nWSR", "stats"
-    )
-    if isinstance(value, list) and value and isinstance(value[0], dict):
-        return len(value)  # qtqp returns the statistics of each iteration.
-    # quadprog returns two counts, of added and of dropped constraints.
-    value = value[0] if isinstance(value, (tuple, list, np.ndarray)) and len(value) else value
-    return int(value) if isinstance(value, (int, np.integer)) else None
 
 
 def _get_status(solution: Any, extras: dict[str, Any]) -> tuple[Status, str]:
@@ -172,19 +172,3 @@ def _get_status(solution: Any, extras: dict[str, Any]) -> tuple[Status, str]:
         return ecos.get(int(flag), Status.NUMERICAL_ERROR), text
     status = classify_status(text)
     return Status.NUMERICAL_ERROR if status is Status.CONVERGED else status, text
-
-
-def _make_start_settings(
-    backend: Backend, program: ScaledProgram, start: tuple[FloatArray, FloatArray]
-) -> dict[str, Any]:
-    """Return the settings that start a backend from x (n,) and multipliers (m,) in scaled units."""
-    x, lam = start
-    if backend.name != "proxqp":
-        return {"initvals": x}
-    from proxsuite import proxqp
-
-    y, z, box = program.split_multipliers(lam)
-    z = np.concatenate([z, box]) if (program.variable >= 0).any() else z
-    settings = {"initvals": x, "initial_guess": proxqp.InitialGuess.WARM_START}
-    settings |= {"y": y} if len(y) else {}
-    return settings | ({"z": z} if len(z) else {})

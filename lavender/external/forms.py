@@ -153,28 +153,23 @@ def choose_program_form(problem: Problem, form: str, definite: bool = False) -> 
     if problem.qp is not None:
         return "program"
     if rows is None:
-        is_singular = problem.generalized is not None and (definite or _has_singular_delassus(problem))
-        return "velocity" if is_singular else "impulse"
+        if problem.generalized is None:
+            return "impulse"
+        if definite or np.count_nonzero(problem.compliance == 0.0) > problem.generalized.nv:
+            return "velocity"
+        if problem.m > MAX_PIVOT_ROWS:
+            return "impulse"
+        root = 1.0 / np.sqrt(problem.d)
+        try:
+            pivots = np.square(np.linalg.cholesky(root[:, None] * problem.dense() * root).diagonal())
+        except np.linalg.LinAlgError:
+            return "velocity"
+        return "velocity" if (pivots <= MAX_SINGULAR_DELASSUS_PIVOT).any() else "impulse"
     moving = rows.inv_mass[rows.inv_mass > 0.0]
     ratio = moving.max() / moving.min() if len(moving) else 1.0
     n_slacks = np.count_nonzero(np.isfinite(problem.cones.lower) & np.isfinite(problem.cones.upper))
     is_smaller = problem.m > 6 * rows.n_bodies + n_slacks
     return "velocity" if definite or is_smaller or ratio >= VELOCITY_FORM_MASS_RATIO else "impulse"
-
-
-def _has_singular_delassus(problem: Problem) -> bool:
-    """Return whether A of a problem with J and M is singular."""
-    assert problem.generalized is not None
-    if np.count_nonzero(problem.compliance == 0.0) > problem.generalized.nv:
-        return True
-    if problem.m > MAX_PIVOT_ROWS:
-        return False
-    root = 1.0 / np.sqrt(problem.d)
-    try:
-        pivots = np.square(np.linalg.cholesky(root[:, None] * problem.dense() * root).diagonal())
-    except np.linalg.LinAlgError:
-        return True
-    return bool((pivots <= MAX_SINGULAR_DELASSUS_PIVOT).any())
 
 
 def build_form(problem: Problem, form: str) -> Form:
@@ -234,7 +229,10 @@ def _list_friction_components(
 def _build_impulse_form(problem: Problem, unknown: IntpArray, fixed: FloatArray) -> Form:
     """Build the impulse form: min 1/2 l.A l - b.l over the bounds or friction cones of a symmetric problem."""
     c, k, a = problem.cones, len(unknown), problem.csr
-    hessian = _mirror_lower_triangle(a[unknown][:, unknown])
+    # Both triangles are made from the lower one, equal in every bit.
+    low, off = sp.tril(a[unknown][:, unknown], 0, "coo"), sp.tril(a[unknown][:, unknown], -1, "coo")
+    places = np.concatenate([low.row, off.col]), np.concatenate([low.col, off.row])
+    hessian = sp.csr_matrix((np.concatenate([low.data, off.data]), places), (k, k))
     q = -(problem.b - (a @ fixed if fixed.any() else 0.0))[unknown]
     root = np.ones(k)
     components = _list_friction_components(problem, unknown, root)
@@ -361,16 +359,6 @@ def _list_velocity_rows(
 def _list_cone_sizes(components: list[FrictionComponent]) -> tuple[int, ...]:
     """Return the size of the second-order cone of each component of several rows."""
     return tuple(1 + len(tangents) for _, tangents, _ in components if len(tangents) > 1)
-
-
-def _mirror_lower_triangle(matrix: sp.csr_array) -> sp.csr_matrix:
-    """Return A from its lower triangle, with both triangles equal in every bit."""
-    entries = matrix.tocoo()
-    is_lower = entries.row >= entries.col
-    i, j, value = entries.row[is_lower], entries.col[is_lower], entries.data[is_lower]
-    off = i > j
-    data = np.concatenate([value, value[off]])
-    return sp.csr_matrix((data, (np.concatenate([i, j[off]]), np.concatenate([j, i[off]]))), matrix.shape)
 
 
 def _build_matrix(rows: list[Entries], columns: int) -> sp.csr_matrix:

@@ -36,11 +36,8 @@ def find_infeasibility_proof(
     if not len(program.t):
         return None
     rows = program.without_cost()
-    scaled, e, is_equation = (
-        rows.scaled.without_far_rows(),
-        rows.scales[1],
-        np.arange(len(rows.t)) < rows.free,
-    )
+    scaled, e = rows.scaled.without_far_rows(), rows.scales[1]
+    is_equation = np.arange(len(rows.t)) < rows.free
     candidates = [] if multipliers is None else [multipliers]
     for attempt in range(2):
         for lam in candidates:
@@ -84,34 +81,28 @@ def find_ray(
     at_bound = np.abs(jac @ d) <= RAY_TOLERANCE * (abs(jac) @ np.abs(d))
     at_bound[:free] = True
     rays = [_project_to_kernel(d, sp.vstack([hessian, jac[at_bound]])), d]
-    ray = next((r for r in rays if _is_ray(hessian, jac, scaled.q, free, r)), None)
-    if ray is None:
+    for ray in rays:
+        # The objective must decrease without end along the ray, up to RAY_TOLERANCE of the terms of each row.
+        size = np.abs(ray)
+        slope, limits = jac @ ray, RAY_TOLERANCE * (abs(jac) @ size)
+        is_level = (np.abs(hessian @ ray) <= RAY_TOLERANCE * (abs(hessian) @ size)).all()
+        is_allowed = (np.abs(slope[:free]) <= limits[:free]).all() and (slope[free:] >= -limits[free:]).all()
+        if is_level and is_allowed and scaled.q @ ray < -RAY_TOLERANCE * (np.abs(scaled.q) @ size):
+            break
+    else:
         return None
-    point = x
-    if point is None or not _is_feasible(program, point):
+    if x is None or not _is_feasible(program, x):
         if deadline.has_passed():
             return None
         none, t = np.full(n, np.inf), (scaled.t[:free], scaled.t[free:])
         found = _solve_linear_program(np.zeros(n), jac[:free], jac[free:], -none, none, deadline, *t)
         if found is None:
             return None
-        point = found * (scale * sigma)
-        if not _is_feasible(program, point):
+        x = found * (scale * sigma)
+        if not _is_feasible(program, x):
             return None
     ray = ray * scale
-    return ray / np.abs(ray).max(), point
-
-
-def _is_ray(hessian: Any, jac: Any, q: FloatArray, free: int, d: FloatArray) -> bool:
-    """Return whether the objective decreases without end along d, up to RAY_TOLERANCE of the terms of each row."""
-    size = np.abs(d)
-    slope, terms = jac @ d, abs(jac) @ size
-    return bool(
-        (np.abs(hessian @ d) <= RAY_TOLERANCE * (abs(hessian) @ size)).all()
-        and (np.abs(slope[:free]) <= RAY_TOLERANCE * terms[:free]).all()
-        and (slope[free:] >= -RAY_TOLERANCE * terms[free:]).all()
-        and q @ d < -RAY_TOLERANCE * (np.abs(q) @ size)
-    )
+    return ray / np.abs(ray).max(), x
 
 
 def _is_feasible(program: ConvexProgram, x: FloatArray) -> bool:

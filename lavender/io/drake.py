@@ -118,7 +118,11 @@ def _build_problem(
             f"the plant has {plant.num_constraints()} constraints (couplers, distances, balls, welds); only "
             "joints, point contacts and joint limits are supported"
         )
-    _check_no_locked_joints(plant, context)
+    # Drake leaves out the velocities of locked joints, and crashes the process if their bodies have contacts.
+    joints = list_joints(plant)
+    locked = [joint.name() for joint in joints if joint.num_velocities() and joint.is_locked(context)]
+    if locked:
+        raise CapabilityError(f"the joints {', '.join(locked):.200} are locked; welds are supported")
     dynamics, v_free = compute_free_motion(plant, context, dt)
     contacts = _read_contacts(plant, context)
     limits = _read_joint_limits(plant, context)
@@ -140,17 +144,11 @@ def _build_problem(
     return problem, impulses
 
 
-def _check_no_locked_joints(plant: Any, context: Any) -> None:
-    """Raise CapabilityError for locked joints.
-
-    Drake leaves out the velocities of locked joints, and crashes the process if their bodies have contacts.
-    """
+def list_joints(plant: Any) -> list[Any]:
+    """Return the joints of a plant."""
     from pydrake.multibody.tree import JointIndex
 
-    joints = [plant.get_joint(JointIndex(int(i))) for i in plant.GetJointIndices()]
-    locked = [joint.name() for joint in joints if joint.num_velocities() and joint.is_locked(context)]
-    if locked:
-        raise CapabilityError(f"the joints {', '.join(locked):.200} are locked; welds are supported")
+    return [plant.get_joint(JointIndex(int(i))) for i in plant.GetJointIndices()]
 
 
 @dataclass(frozen=True)
@@ -179,7 +177,7 @@ class _Limit:
 
 def compute_free_motion(plant: Any, context: Any, dt: float) -> tuple[FloatArray, FloatArray]:
     """Return A (nv, nv) and v* (nv,) of SAP's discretisation (see the module)."""
-    from pydrake.multibody.tree import JacobianWrtVariable, JointActuatorIndex, JointIndex, MultibodyForces_
+    from pydrake.multibody.tree import JacobianWrtVariable, JointActuatorIndex, MultibodyForces_
 
     nv = int(plant.num_velocities())
     forces = MultibodyForces_[float](plant)
@@ -208,8 +206,7 @@ def compute_free_motion(plant: Any, context: Any, dt: float) -> tuple[FloatArray
             [applied_force.F_Bq_W.rotational(), applied_force.F_Bq_W.translational()]
         )
     damping = np.zeros(nv)
-    for i in plant.GetJointIndices():
-        joint = plant.get_joint(JointIndex(int(i)))
+    for joint in list_joints(plant):
         start = joint.velocity_start()
         damping[start : start + joint.num_velocities()] = joint.GetDampingVector(context)
     mass = np.array(plant.CalcMassMatrix(context))
@@ -241,7 +238,9 @@ def _read_contacts(plant: Any, context: Any) -> list[_Contact]:
         pair = info.point_pair()
         bodies = [plant.get_body(x) for x in (info.bodyA_index(), info.bodyB_index())]
         normal = -np.array(pair.nhat_BA_W)
-        axes = np.stack([normal, *_make_tangents(normal)])
+        first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+        first /= np.linalg.norm(first)
+        axes = np.stack([normal, first, np.cross(normal, first)])
         jac = [
             plant.CalcJacobianTranslationalVelocity(
                 context, JacobianWrtVariable.kV, body.body_frame(),
@@ -265,23 +264,11 @@ def _read_contacts(plant: Any, context: Any) -> list[_Contact]:
     return contacts
 
 
-def _make_tangents(normal: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return two unit vectors (3,) orthogonal to the unit vector `normal` and to each other."""
-    axis = np.zeros(3)
-    axis[int(np.argmin(np.abs(normal)))] = 1.0
-    first_axis = np.cross(normal, axis)
-    first_axis /= np.linalg.norm(first_axis)
-    return first_axis, np.cross(normal, first_axis)
-
-
 def _read_joint_limits(plant: Any, context: Any) -> list[_Limit]:
     """Return the finite limits of joints with one velocity, the only ones that SAP supports."""
-    from pydrake.multibody.tree import JointIndex
-
     limits = []
     nv = int(plant.num_velocities())
-    for i in plant.GetJointIndices():
-        joint = plant.get_joint(JointIndex(int(i)))
+    for joint in list_joints(plant):
         if joint.num_velocities() != 1 or joint.num_positions() != 1:
             continue
         velocity, is_angular = joint.velocity_start(), joint.type_name() == "revolute"

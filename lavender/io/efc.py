@@ -186,7 +186,17 @@ def from_efc(
     precision = get_common_precision(jac, mass, before)
     before = as_array("qvel", before, (n, nv), finite=False)
     if qfrc_smooth is not None:
-        _check_mass(mass, smooth, as_array("qfrc_smooth", qfrc_smooth, (n, nv), finite=False), precision)
+        # M a0 must be the unconstrained force, up to MASS_TOLERANCES.
+        force = as_array("qfrc_smooth", qfrc_smooth, (n, nv), finite=False)
+        dense = mass.astype(float)
+        gap = np.abs(np.einsum("nij,nj->ni", dense, smooth) - force).max(axis=1, initial=0.0)
+        size = np.einsum("nij,nj->ni", np.abs(dense), np.abs(smooth)).max(axis=1, initial=0.0)
+        bad = np.flatnonzero(gap > MASS_TOLERANCES[precision] * size)
+        if len(bad):
+            raise CapabilityError(
+                f"world {bad[0]}: M qacc_smooth differs from qfrc_smooth by {(gap / size)[bad[0]]:.1e} of their size: "
+                "give the M of this step, and use an integrator that does not add damping to M"
+            )
     free = before + dt * smooth
     step = max(1, CHUNK_ENTRIES // max(1, m * nv))
     for i in range(0, n, step):
@@ -346,12 +356,10 @@ def from_mujoco_many(
     if scratch is not None and (
         not isinstance(scratch, MujocoScratch) or scratch.model is not model or threads > 1
     ):
-        given = (
-            f"of another model, with {threads} threads"
-            if isinstance(scratch, MujocoScratch)
-            else type(scratch)
+        raise InputError(
+            f"scratch is {scratch!r:.60}, with threads={threads}; MujocoScratch(model) of this model is needed, "
+            "with threads=1"
         )
-        raise InputError(f"scratch is {given}; MujocoScratch(model) of this model is needed, with threads=1")
 
     has_moving_surfaces, kind = bool(getattr(model, "flg_surfacevel", 0)), int(kinds[size])
 
@@ -385,8 +393,16 @@ def from_mujoco_many(
             blocks = single.make_blocks(step, data, 1)
             rows = copy_rows(step, blocks)
             rows_of_states[i] = *rows, blocks
-            if velocity is not None:
-                velocity[i] = _predict_velocity(mj, model, data, mover, rows)
+            if velocity is None:
+                continue
+            if model.opt.integrator == mj.mjtIntegrator.mjINT_RK4:
+                velocity[i] = np.nan  # RK4 uses the answers of four forward passes.
+            elif mover == "acceleration":
+                velocity[i] = data.qvel + dt * data.qacc
+            else:
+                force, scale = rows[1][:, 2], rows[1][:, 4]
+                force = np.divide(force, scale, out=np.zeros(len(force)), where=scale != 0.0)
+                velocity[i] = single.integrate_forces(mj, model, data, rows[0], force)
         if scratch is not None:
             scratch.keep_data(data)
         return step
@@ -422,22 +438,6 @@ def from_mujoco_many(
     batch.names_of, batch.angular_of = name_blocks_of_world, find_angular_rows_of_world
     batch.contact_counts = contact_counts
     return Imported(batch, lam)
-
-
-def _predict_velocity(mj: Any, model: Any, data: Any, moved_by: str, rows: Any) -> FloatArray:
-    """Return the velocity (nv,) after the step from the rows of `copy_rows`; `data` is advanced.
-
-    It is NaN with RK4, which uses the answers of four forward passes.
-    """
-    if model.opt.integrator == mj.mjtIntegrator.mjINT_RK4:
-        return np.full(model.nv, np.nan)
-    if moved_by == "acceleration":
-        velocity: FloatArray = data.qvel + model.opt.timestep * data.qacc
-        return velocity
-    jac, numbers, _ = rows
-    force, scale = numbers[:, 2], numbers[:, 4]
-    force = np.divide(force, scale, out=np.zeros(len(force)), where=scale != 0.0)
-    return single.integrate_forces(mj, model, data, jac, force)
 
 
 def _merge_lower_triangles(
@@ -518,19 +518,6 @@ def _convert_mass(values: Any, n: int, nv: int) -> Any:
     full[:, row, col] = values
     full[:, col, row] = values
     return full
-
-
-def _check_mass(mass: Any, smooth: FloatArray, force: FloatArray, precision: str) -> None:
-    """Raise CapabilityError if M a0 differs from the unconstrained force `force` by more than MASS_TOLERANCES."""
-    gap = np.abs(np.einsum("nij,nj->ni", mass.astype(float), smooth) - force).max(axis=1, initial=0.0)
-    size = np.einsum("nij,nj->ni", np.abs(mass.astype(float)), np.abs(smooth)).max(axis=1, initial=0.0)
-    bad = np.flatnonzero(gap > MASS_TOLERANCES[precision] * size)
-    if len(bad):
-        i = bad[0]
-        raise CapabilityError(
-            f"world {i}: M qacc_smooth differs from qfrc_smooth by {gap[i] / size[i]:.1e} of their size: "
-            "give the M of this step, and use an integrator that does not add damping to M"
-        )
 
 
 def _find_elliptic_contacts(contacts: Any, elliptic: Any) -> tuple[Any, ...]:

@@ -22,6 +22,7 @@ impulses that have the wrong sign.
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -65,10 +66,29 @@ class EngineMotion:
         rigid = np.where(problem.d > 0.0, problem.d, np.inf)
         ratio = float(np.min(self.compliance / rigid, where=self.compliance > 0.0, initial=1.0))
         is_stiff = ratio <= MAX_STIFF_RATIO and problem.m * general.nv <= MAX_MOTION_ENTRIES
+        if not is_stiff and self.moved_by == "forces":
+            return forces
         if not is_stiff:
-            return forces if self.moved_by == "forces" else self._compare_with_solution(problem, forces)
-        digits = float(-np.log10(ratio))
-        found = self._judge_stiff_rows(problem, forces)
+            for solver in SOLVERS:
+                solution = solve(problem, solver, tol=EXACT_TOL, impulse=self.impulse)
+                own = solution.residual
+                if own.relative <= EXACT_TOL or own.velocity <= MAX_SOLUTION_ERROR * forces.velocity:
+                    break
+            else:
+                return forces
+            delta = self.change - general.change(solution.impulse)
+            rounding = self._estimate_rounding(problem) + own.velocity_by_row
+            return _make_velocity_error(problem, forces, general.velocity_of(delta), rounding)
+        digits, found = float(-np.log10(ratio)), forces
+        boundary = _find_boundary_normals(problem, self.impulse)
+        # The step (2) is not possible if M is not positive definite to rounding.
+        with contextlib.suppress(np.linalg.LinAlgError):
+            step = _compute_newton_step(problem, self.compliance, self.impulse, self.change, boundary)
+            slack = general.velocity_of(self.change) - problem.b + self.compliance * self.impulse - step[1]
+            error = _compute_error(problem, self.impulse, step[0], slack, boundary)
+            rounding = self._estimate_rounding(problem) / np.where(problem.d > 0.0, problem.d, np.inf)
+            by_step = replace_error(forces, problem, error, rounding)
+            found = by_step if by_step.velocity < forces.velocity else forces
         if self.moved_by == "acceleration":
             return replace(found, lost_digits=digits)
         # The raised compliances of the problem do not belong to these forces: compare motions.
@@ -78,21 +98,6 @@ class EngineMotion:
         if not found.velocity < MAX_SOLUTION_ERROR * moved.velocity:
             return replace(forces, lost_digits=digits)
         return replace(moved, moved_by="impulse", lost_digits=digits, acceleration_error=found.velocity)
-
-    def _compare_with_solution(self, problem: Problem, forces: Residual) -> Residual:
-        """Return the error (1); the residual of the forces if the problem cannot be solved."""
-        general = problem.generalized
-        assert general is not None
-        for solver in SOLVERS:
-            solution = solve(problem, solver, tol=EXACT_TOL, impulse=self.impulse)
-            own = solution.residual
-            if own.relative <= EXACT_TOL or own.velocity <= MAX_SOLUTION_ERROR * forces.velocity:
-                break
-        else:
-            return forces
-        delta = self.change - general.change(solution.impulse)
-        rounding = self._estimate_rounding(problem) + own.velocity_by_row
-        return _make_velocity_error(problem, forces, general.velocity_of(delta), rounding)
 
     def _estimate_rounding(self, problem: Problem) -> FloatArray:
         """Return the rounding of the slack of each row (m,) [m/s]."""
@@ -110,21 +115,6 @@ class EngineMotion:
         of_jacobian = np.bincount(rows, weights=np.abs(entries) * moved[columns], minlength=problem.m)
         terms: FloatArray = of_jacobian + np.abs(problem.b) + self.compliance * np.abs(self.impulse)
         return ROUNDOFF_OF_PRECISION[problem.precision] * terms
-
-    def _judge_stiff_rows(self, problem: Problem, forces: Residual) -> Residual:
-        """Return the error by one step (2), or the residual of the forces if it is smaller."""
-        general, impulse = problem.generalized, self.impulse
-        assert general is not None
-        boundary = _find_boundary_normals(problem, impulse)
-        try:
-            delta, correction = _compute_newton_step(problem, self.compliance, impulse, self.change, boundary)
-        except np.linalg.LinAlgError:  # M is not positive definite to rounding.
-            return forces
-        slack = general.velocity_of(self.change) - problem.b + self.compliance * impulse - correction
-        error = _compute_error(problem, impulse, delta, slack, boundary)
-        rounding = self._estimate_rounding(problem) / np.where(problem.d > 0.0, problem.d, np.inf)
-        found = replace_error(forces, problem, error, rounding)
-        return found if found.velocity < forces.velocity else forces
 
 
 def _make_velocity_error(
@@ -210,21 +200,19 @@ def _compute_error(
         own = np.append(first, rows) if is_cone else rows
         error[own] = step[own]
         if impulse[first] + delta[first] <= 0.0:
-            error[own] = -_project_on_cone(-step[own], d[own], mu) if is_cone else 0.0
+            if not is_cone:
+                error[own] = 0.0
+                continue
+            # Project the impulse -step on the friction cone in the metric of d.
+            root = np.sqrt(d[own])
+            y = -root * step[own]
+            slope, size = mu * root[1] / root[0], float(np.linalg.norm(y[1:]))
+            if size > slope * y[0]:
+                length = max(0.0, (float(y[0]) + slope * size) / (1.0 + slope * slope))
+                error[own] = -np.append(length, y[1:] * (slope * length / size)) / root
         elif int(rows[0]) in boundary:
             outward = boundary[int(rows[0])][1]
             if outward @ step[own] < 0.0:  # The update leaves the set and is projected on its boundary.
                 normal = outward / d[own]
                 error[own] -= normal * float(outward @ step[own]) / float(outward @ normal)
     return error
-
-
-def _project_on_cone(impulse: FloatArray, d: FloatArray, mu: float) -> FloatArray:
-    """Return the projection of an impulse, normal first, on the friction cone in the metric of d."""
-    root = np.sqrt(d)
-    y = root * impulse
-    slope, size = mu * root[1] / root[0], float(np.linalg.norm(y[1:]))
-    if size <= slope * y[0]:
-        return impulse
-    along = max(0.0, (float(y[0]) + slope * size) / (1.0 + slope * slope))
-    return np.append(along, y[1:] * (slope * along / size)) / root

@@ -200,12 +200,14 @@ def _read_file(r: HDF5Reader) -> Contents:
     matrices, names = ([name for name in shapes if len(shapes[name]) == k] for k in (2, 1))
     for name in names:
         r.find_dataset(f"{vectors}/{name}", "iuf", shapes[name][0])
-    guesses = _list_guess_groups(r)
+    count = r.read_integer("guesses/number_of_guesses") if r.has_path("guesses") else 0
+    if count < 0 or (count > 0 and count > len(r.find_node("guesses"))):
+        raise InputError(f"guesses/number_of_guesses is {count}; it has {len(r.find_node('guesses')) - 1}")
     values: dict[str, Any] = {name: r.read_matrix(f"{group}/{name}", shapes[name]) for name in matrices}
     values |= {name: r.read_vector(f"{vectors}/{name}", shapes[name][0]) for name in names}
     return Contents(
         group, spacedim, values, solution=_read_point(r, "solution", n, m, p) if r.has_path("solution") else {},
-        guesses=tuple(_read_point(r, guess, n, m, p) for guess in guesses),
+        guesses=tuple(_read_point(r, f"guesses/{i + 1}", n, m, p) for i in range(count)),
         info={name: r.read_text(f"{group}/info/{name}") for name in ("title", "description", "math_info")},
         compare=r.read_text("reference/compare"),
     )  # fmt: skip
@@ -220,16 +222,6 @@ def _read_point(r: HDF5Reader, group: str, n: int, m: int, p: int) -> dict[str, 
     if p and "l" not in point:
         raise InputError(f"{group} has no dataset l; the multipliers of the {p} equations are needed in it")
     return point
-
-
-def _list_guess_groups(r: HDF5Reader) -> list[str]:
-    """Return the names of the groups of the guesses."""
-    if not r.has_path("guesses"):
-        return []
-    count = r.read_integer("guesses/number_of_guesses")
-    if count < 0 or count > len(r.find_node("guesses")):
-        raise InputError(f"guesses/number_of_guesses is {count}; it has {len(r.find_node('guesses')) - 1}")
-    return [f"guesses/{i + 1}" for i in range(count)]
 
 
 # -- writing --------------------------------------------------------------------------------------

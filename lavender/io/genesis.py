@@ -23,7 +23,6 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray
 from lavender.base.errors import CapabilityError, InputError
 from lavender.io.efc import ELLIPTIC, EQUALITY, FRICTION, from_efc
 from lavender.io.engine_step import Claims, EngineStep
@@ -68,28 +67,22 @@ def from_genesis(scene: Any) -> EngineStep:
         )
     try:
         step = _convert_solver_arrays(scene, solver)
-        hidden = _find_hidden_friction(scene)
+        # Coefficients of materials, and whether a plane has none and therefore the default one.
+        coefficients, has_default_plane = [DEFAULT_FRICTION], False
+        for entity in getattr(scene, "entities", ()):
+            coefficient = getattr(entity.material, "friction", None)
+            if coefficient is not None:
+                coefficients.append(float(coefficient))
+            has_default_plane |= coefficient is None and type(entity.morph).__name__ == "Plane"
     except AttributeError as error:
         raise CapabilityError(f"an attribute of this scene is missing: {error}. {GENESIS_ADVICE}") from None
-    if hidden is not None:
+    if has_default_plane and min(coefficients) < DEFAULT_FRICTION:
         warnings.warn(
-            f"a body has friction {hidden:g}, and a plane the default of {DEFAULT_FRICTION:g}. Genesis uses the larger "
-            "coefficient, so contacts of both have the default: give the plane's material a friction",
+            f"a body has friction {min(coefficients):g}, and a plane the default of {DEFAULT_FRICTION:g}. Genesis "
+            "uses the larger coefficient, so contacts of both have the default: give the plane's material a friction",
             stacklevel=2,
         )
     return step
-
-
-def _find_hidden_friction(scene: Any) -> float | None:
-    """Return the smallest coefficient of a material that is below the default one of a plane; None without one."""
-    coefficients, has_default_plane = [DEFAULT_FRICTION], False
-    for entity in getattr(scene, "entities", ()):
-        coefficient = getattr(entity.material, "friction", None)
-        if coefficient is not None:
-            coefficients.append(float(coefficient))
-        has_default_plane |= coefficient is None and type(entity.morph).__name__ == "Plane"
-    smallest = min(coefficients)
-    return smallest if has_default_plane and smallest < DEFAULT_FRICTION else None
 
 
 def _convert_solver_arrays(scene: Any, solver: Any) -> EngineStep:
@@ -117,9 +110,18 @@ def _convert_solver_arrays(scene: Any, solver: Any) -> EngineStep:
         [index < ends[0], index < ends[1], index < ends[2]], [EQUALITY, FRICTION[0], contact_type], LIMIT
     )
     loss = _copy_to_host(constraints.efc_frictionloss, m).T
-    contacts = (
-        _list_elliptic_contacts(loss, ends[1, :, 0], contact_rows // size, size) if is_elliptic else None
-    )
+    contacts = None
+    if is_elliptic:
+        # The first row of a contact stores its coefficient of sliding friction in `loss` (n, m), and each row of
+        # torsional or rolling friction its own coefficient.
+        count = contact_rows // size
+        world = np.repeat(np.arange(n), count)
+        number = np.arange(len(world)) - np.repeat(np.cumsum(count) - count, count)
+        address = ends[1, world, 0] + size * number
+        friction = np.repeat(loss[world, address][:, None], 5, axis=1).astype(float)
+        for j in range(ROWS_OF_NORMAL_AND_TANGENTS, size):
+            friction[:, j - 1] = loss[world, address + j]
+        contacts = world, address, np.full(len(world), size), friction
     dofs, dt = solver.dyn_state.dofs, float(solver.substep_dt)
     jac = np.ascontiguousarray(np.moveaxis(_copy_to_host(constraints.jac, m), 2, 0))
     velocity = _copy_to_host(dofs.vel).T.astype(float) - dt * _copy_to_host(dofs.acc).T
@@ -146,22 +148,6 @@ def _convert_solver_arrays(scene: Any, solver: Any) -> EngineStep:
     if result.impulse is None:
         raise AssertionError("from_efc returns impulses if it is given forces")
     return EngineStep(result.batch, result.impulse, Claims(converged, np.full(n, -1), {}))
-
-
-def _list_elliptic_contacts(loss: FloatArray, first: Any, count: Any, size: int) -> tuple[Any, Any, Any, Any]:
-    """Return (world, efc_address, dim, friction) of all elliptic contacts.
-
-    The first row of a contact stores its coefficient of sliding friction in `loss` (n, m), and each row of torsional
-    or rolling friction its own coefficient.
-    """
-    world = np.repeat(np.arange(len(count)), count)
-    number = np.arange(len(world)) - np.repeat(np.cumsum(count) - count, count)
-    address = first[world] + size * number
-    coefficient = loss[world, address]
-    friction = np.repeat(coefficient[:, None], 5, axis=1).astype(float)
-    for j in range(ROWS_OF_NORMAL_AND_TANGENTS, size):
-        friction[:, j - 1] = loss[world, address + j]
-    return world, address, np.full(len(world), size), friction
 
 
 def _check_configuration(scene: Any, solver: Any) -> None:

@@ -100,23 +100,19 @@ class HDF5Reader:
             elif nz == -1:
                 a = sp.csr_array(build_checked_csr(p, i, x, n, m).T)
             else:
-                a = _build_from_triplets(p, i, x, nz, m, n)
+                if min(len(p), len(i), len(x)) < nz:
+                    sizes = f"{len(p)}, {len(i)} and {len(x)}"
+                    raise InputError(f"nz announces {nz} triplets; p, i and x have {sizes}")
+                p, i, x = p[:nz].astype(np.int64), i[:nz].astype(np.int64), x[:nz]
+                if nz and (p.min() < 0 or i.min() < 0 or p.max() >= n or i.max() >= m):
+                    raise InputError(
+                        f"row indices i or column indices p are outside of the matrix ({m}, {n})"
+                    )
+                a = sp.csr_array(sp.coo_array((x, (i, p)), shape=(m, n)))
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
         as_array(f"{path}/x", a.data, (None,), copy=False)
         return a
-
-
-def _build_from_triplets(
-    p: np.ndarray, i: np.ndarray, x: np.ndarray, nz: int, m: int, n: int
-) -> sp.csr_array:
-    """Return the matrix (m, n) of nz triplets: columns p, rows i, values x."""
-    if min(len(p), len(i), len(x)) < nz:
-        raise InputError(f"nz announces {nz} triplets; p, i and x have {len(p)}, {len(i)} and {len(x)}")
-    p, i, x = p[:nz], i[:nz], x[:nz]
-    if nz and (p.min() < 0 or i.min() < 0 or p.max() >= n or i.max() >= m):
-        raise InputError(f"row indices i or column indices p are outside of the matrix ({m}, {n})")
-    return sp.csr_array(sp.coo_array((x, (i.astype(np.int64), p.astype(np.int64))), shape=(m, n)))
 
 
 def write_matrix(group: Any, a: sp.csr_array) -> None:

@@ -156,7 +156,13 @@ class _Layout:
         self.velocity_position = COLUMNS_PER_BODY * self.first_body[self.velocity_world] + within
         # For each row of joint dynamics and each effort row: world, index within the world, index in the joints'
         # arrays.
-        self.soft_rows = {kind: self._find_soft_rows(kind) for kind in ("dynamic", "effort")}
+        self.soft_rows = {}
+        for kind in ("dynamic", "effort"):
+            names = f"num_joint_{kind}_cts", f"joint_{kind}_cts_offset", f"joint_{kind}_cts_group_offset"
+            count, offset, group = (_as_int(getattr(info, name))[:n] for name in names)
+            world = np.repeat(np.arange(n), count)
+            k = np.arange(len(world)) - _cumulate_counts(count)[world]
+            self.soft_rows[kind] = world, group[world] + k, offset[world] + k
         # For each joint: index within its world of its first kinematic row, and the number of its kinematic rows.
         world, count = _as_int(joints.wid), _as_int(joints.num_kinematic_cts)
         per_world: Any = np.bincount(world, count, minlength=n).astype(np.int64)
@@ -165,14 +171,6 @@ class _Layout:
         self.joint_rows = group + per_world
         self.joint_world, self.joint_size = world[count > 0], count[count > 0]
         self.joint_begin = (group[world] + before[:-1] - _cumulate_counts(per_world)[world])[count > 0]
-
-    def _find_soft_rows(self, kind: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the world, the index in the world and the position in the joints' array of each row of a kind."""
-        names = f"num_joint_{kind}_cts", f"joint_{kind}_cts_offset", f"joint_{kind}_cts_group_offset"
-        count, offset, group = (_as_int(getattr(self.info, name))[: self.n] for name in names)
-        world = np.repeat(np.arange(self.n), count)
-        k = np.arange(len(world)) - _cumulate_counts(count)[world]
-        return world, group[world] + k, offset[world] + k
 
 
 class _Worlds:
@@ -234,7 +232,13 @@ class _Worlds:
         moves = ~np.repeat(is_fixed, COLUMNS_PER_BODY)[velocity_position]
         jac, products = self._form_jacobian(free, moves)
         target = products - _copy_as_float64(self.problem.v_f)[self.position] / scale
-        self.compliance = self._compute_row_compliance()
+        stored, joints = self.problem.compliance, self.engine.data.joints
+        soft = np.zeros(len(self.index)) if stored is None else _copy_as_float64(stored)[self.position]
+        for kind, values in (("dynamic", joints.inv_m_j), ("effort", joints.inv_m_a)):
+            world, row, position = self.layout.soft_rows[kind]
+            if len(world):
+                soft[self.row_ptr[world] + row] += _copy_as_float64(values)[position]
+        self.compliance = soft  # [1/kg, 1/(kg m^2)]
         lower, upper, mu = self._compute_row_bounds(scale)
         wrong = self._find_worlds_of_rows(
             ~np.isfinite(target) | ~np.isfinite(self.compliance) | ~(scale > 0.0)
@@ -243,7 +247,17 @@ class _Worlds:
         is_wrong_row = wrong[self.world]
         lower[is_wrong_row], upper[is_wrong_row], mu[is_wrong_row] = -np.inf, np.inf, 0.0
         free[wrong[self.layout.velocity_world]] = np.nan
-        begins = self._mark_block_begins()
+        begins = ~self.is_contact_row | self.begins_contact
+        layout = self.layout
+        if (layout.joint_rows != self.joints).any():
+            raise CapabilityError(
+                "the joint rows of the solver are not its dynamic rows followed by its kinematic rows, "
+                f"which this importer needs. {KAMINO_ADVICE}"
+            )
+        # All kinematic rows of a joint form one block.
+        start, size = self.row_ptr[layout.joint_world] + layout.joint_begin, layout.joint_size
+        begins[np.repeat(start - _cumulate_counts(size)[:-1], size) + np.arange(size.sum())] = False
+        begins[start] = True
         first = np.flatnonzero(begins)
         cones = Cones(
             ptr=np.append(first, len(begins)).astype(np.int32),
@@ -331,16 +345,6 @@ class _Worlds:
             mass[ptr[world] + (corner + column) * nv + corner + row] = entry
         return mass, is_fixed
 
-    def _compute_row_compliance(self) -> FloatArray:
-        """Return the compliance of each row [1/kg, 1/(kg m^2)]."""
-        stored, joints = self.problem.compliance, self.engine.data.joints
-        soft = np.zeros(len(self.index)) if stored is None else _copy_as_float64(stored)[self.position]
-        for kind, values in (("dynamic", joints.inv_m_j), ("effort", joints.inv_m_a)):
-            world, row, position = self.layout.soft_rows[kind]
-            if len(world):
-                soft[self.row_ptr[world] + row] += _copy_as_float64(values)[position]
-        return soft
-
     def _compute_row_bounds(self, scale: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return lower bounds, upper bounds [N s] and friction coefficients of all rows; 0 on rows of joints."""
         problem, world, index = self.problem, self.world, self.index
@@ -357,24 +361,15 @@ class _Worlds:
         mu[at] = _copy_as_float64(problem.mu)[k]
         return lower, upper, mu
 
-    def _mark_block_begins(self) -> np.ndarray:
-        """Return a mask of the rows that begin a block: all kinematic rows of a joint form one block."""
-        begins = ~self.is_contact_row | self.begins_contact
-        layout = self.layout
-        if (layout.joint_rows != self.joints).any():
-            raise CapabilityError(
-                "the joint rows of the solver are not its dynamic rows followed by its kinematic rows, "
-                f"which this importer needs. {KAMINO_ADVICE}"
-            )
-        start, size = self.row_ptr[layout.joint_world] + layout.joint_begin, layout.joint_size
-        begins[np.repeat(start - _cumulate_counts(size)[:-1], size) + np.arange(size.sum())] = False
-        begins[start] = True
-        return begins
-
     def _make_block_namer(self, first: np.ndarray) -> Callable[[int], list[str]]:
         """Return a function that returns the names of a world's blocks, given the first row of each block."""
         model = self.engine._model
-        pairs = self._copy_contact_bodies()
+        # World (c,), number within the world (c,) and bodies (c, 2) of each contact; body -1 is the ground.
+        pairs = np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2), int)
+        if self.stored_contacts is not None and self.contacts.any():
+            data = self.stored_contacts.data
+            count = int(data.model_active_contacts.numpy()[0])
+            pairs = tuple(x.numpy()[:count].copy() for x in (data.wid, data.cid, data.bid_AB))
 
         def name_blocks_of_world(i: int) -> list[str]:
             joints = model.joints
@@ -400,15 +395,6 @@ class _Worlds:
             return names if len(names) == blocks else [f"block {k}" for k in range(blocks)]
 
         return name_blocks_of_world
-
-    def _copy_contact_bodies(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return world (c,), number within the world (c,) and bodies (c, 2) of each contact; body -1 is the ground."""
-        if self.stored_contacts is None or not self.contacts.any():
-            return np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2), int)
-        data = self.stored_contacts.data
-        count = int(data.model_active_contacts.numpy()[0])
-        world, number, pair = (x.numpy()[:count].copy() for x in (data.wid, data.cid, data.bid_AB))
-        return world, number, pair
 
     def compare_delassus_matrix(self, i: int) -> float:
         """Return the largest difference of the engine's D from J M^-1 J^T in world i, relative to D's largest entry."""

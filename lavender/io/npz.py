@@ -69,8 +69,13 @@ def read_npz(path: str | os.PathLike[str]) -> Stored:
     try:
         if "lavender_format" in archive:
             return _read_own_format(archive)
-        if {"b", "lo", "hi"} <= set(archive):
-            return _read_box_format(archive, Path(path).stem)
+        if {"b", "lo", "hi"} <= set(archive):  # w = A l - b, lo <= l <= hi complementary to w.
+            b = as_array("entry 'b'", archive["b"], (None,))
+            cones = _build_box_cones(archive, len(b))
+            problem = Problem(b, cones, _read_matrix(archive), name=Path(path).stem)
+            compare = str(archive.read_scalar("compare")) if "compare" in archive else ""
+            impulse, slack = (_read_vector(archive, name, problem) for name in ("l_ref", "w_ref"))
+            return Stored(problem, "box", impulse, slack, compare)
         if "q" in archive:
             return Stored(_read_program(archive, name=Path(path).stem), "program")
     except InputError as error:
@@ -190,24 +195,20 @@ def _read_own_format(archive: Arrays) -> Stored:
     impulse = _read_vector(archive, "impulse", problem)
     if "moved_by" in meta:
         moved = _read_vector(archive, "engine_impulse", problem)
-        _add_motion(archive, problem, impulse if moved is None else moved, meta["moved_by"])
-    return Stored(problem, "lavender", impulse=impulse)
-
-
-def _add_motion(archive: Arrays, problem: Problem, impulse: FloatArray | None, moved_by: str) -> None:
-    """Add the motion of an engine to a problem in generalised coordinates."""
-    general = problem.generalized
-    if general is None or impulse is None or moved_by not in MOVERS:
-        raise InputError(
-            f"entry 'meta': moved_by is {moved_by!r:.60}; {' or '.join(MOVERS)} is needed, in generalised "
-            "coordinates and with the entry impulse"
+        moved = impulse if moved is None else moved
+        moved_by, general = meta["moved_by"], problem.generalized
+        if general is None or moved is None or moved_by not in MOVERS:
+            raise InputError(
+                f"entry 'meta': moved_by is {moved_by!r:.60}; {' or '.join(MOVERS)} is needed, in generalised "
+                "coordinates and with the entry impulse"
+            )
+        change, compliance, *momentum = (
+            as_array(f"entry {name!r}", archive[name], (n,), finite=False)
+            for name, n in zip(MOTION, (general.nv, problem.m, general.nv), strict=True)
+            if name in archive or name in MOTION[:2]
         )
-    change, compliance, *momentum = (
-        as_array(f"entry {name!r}", archive[name], (n,), finite=False)
-        for name, n in zip(MOTION, (general.nv, problem.m, general.nv), strict=True)
-        if name in archive or name in MOTION[:2]
-    )
-    problem.__dict__["engine_motion"] = EngineMotion(impulse, change, compliance, moved_by, *momentum)
+        problem.__dict__["engine_motion"] = EngineMotion(moved, change, compliance, moved_by, *momentum)
+    return Stored(problem, "lavender", impulse=impulse)
 
 
 def _read_meta(archive: Arrays) -> dict[str, Any]:
@@ -245,15 +246,6 @@ def _read_program(archive: Arrays, **more: Any) -> Problem:
 
 
 # -- plain box format --------------------------------------------------------------------------
-
-
-def _read_box_format(archive: Arrays, name: str) -> Stored:
-    """Read the box format: w = A l - b, lo <= l <= hi complementary to w; friction cones become contacts."""
-    b = as_array("entry 'b'", archive["b"], (None,))
-    problem = Problem(b, _build_box_cones(archive, len(b)), _read_matrix(archive), name=name)
-    compare = archive.read_scalar("compare") if "compare" in archive else ""
-    impulse, slack = (_read_vector(archive, name, problem) for name in ("l_ref", "w_ref"))
-    return Stored(problem, "box", impulse, slack, str(compare))
 
 
 def _build_box_cones(archive: Arrays, m: int) -> Cones:

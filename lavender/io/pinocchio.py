@@ -100,7 +100,16 @@ def from_pinocchio(
         import pinocchio as pin
     except ImportError:
         raise InputError("pinocchio cannot be imported: pip install pin, which provides models") from None
-    dt, correction = _check_arguments(constraint_models, constraint_datas, dt, correction)
+    for word, sequence in (("models", constraint_models), ("data", constraint_datas)):
+        if not (hasattr(sequence, "__len__") and hasattr(sequence, "__iter__")):
+            raise InputError(f"constraint {word}: got a {type(sequence).__name__}; a sequence is needed")
+    n_models, n_datas = len(constraint_models), len(constraint_datas)
+    if n_models != n_datas:
+        raise InputError(f"{n_datas} constraint data for {n_models} models; one for each is needed")
+    dt, correction = (
+        check_float("dt", dt, above=0.0),
+        check_float("correction", correction, low=0.0, high=1.0),
+    )
     _check_model(pin, model, data)
     nv = int(model.nv)
     q = np.array(as_array("q", q, (int(model.nq),)))
@@ -193,16 +202,6 @@ def _find_angular_velocities(model: Any) -> Any:
         begin = 0 if rotates else {"FreeFlyer": 3, "Planar": 2}.get(name, count)
         angular[first + begin : first + count] = True
     return angular
-
-
-def _check_arguments(models: Any, datas: Any, dt: Any, correction: Any) -> tuple[float, float]:
-    """Check the sequences of constraints; return dt and the correction as floats."""
-    for word, sequence in (("models", models), ("data", datas)):
-        if not (hasattr(sequence, "__len__") and hasattr(sequence, "__iter__")):
-            raise InputError(f"constraint {word}: got a {type(sequence).__name__}; a sequence is needed")
-    if len(models) != len(datas):
-        raise InputError(f"{len(datas)} constraint data for {len(models)} models; one for each is needed")
-    return check_float("dt", dt, above=0.0), check_float("correction", correction, low=0.0, high=1.0)
 
 
 def _compute_mass_and_acceleration(

@@ -359,18 +359,13 @@ class Recorder:
             self.leave_out(line, failure)
             return True
         if is_worst:
-            self._add_to_worst_files(error, name)
-        return True
-
-    def _add_to_worst_files(self, error: float, name: str) -> None:
-        """Add a file to the `keep_worst` files with the largest errors; remove the one it replaces, unless selected."""
-        if len(self._worst) < self.keep_worst:
             heapq.heappush(self._worst, (error, name))
-            return
-        _, removed = heapq.heapreplace(self._worst, (error, name))
-        if not self.lines[removed].get("selected"):
-            del self.lines[removed]
-            self._removed.append(removed)
+        if len(self._worst) > self.keep_worst:
+            _, removed = heapq.heappop(self._worst)
+            if not self.lines[removed].get("selected"):
+                del self.lines[removed]
+                self._removed.append(removed)
+        return True
 
 
 def read_recorded_state(folder: str | os.PathLike[str], file: str) -> dict[str, np.ndarray]:

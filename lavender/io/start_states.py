@@ -191,40 +191,36 @@ def read_states(mj: Any, model: Any, source: Any) -> StartStates:
     if isinstance(source, StartStates):
         return source
     if isinstance(source, str) and source == KEYFRAMES:
-        return _read_keyframes(mj, model)
+        if not model.nkey:
+            raise InputError("states are 'keyframes', and the model has none; a keyframe is needed")
+        data, vectors = mj.MjData(model), []
+        for key in range(model.nkey):
+            mj.mj_resetDataKeyframe(model, data, key)
+            vectors.append(_read_state_vector(mj, model, data))
+        controls = np.array(model.key_ctrl, float).reshape(model.nkey, model.nu)
+        return StartStates(np.array(vectors), controls)
     arrays, label = source if isinstance(source, Mapping) else {VECTOR: source}, "states"
     if isinstance(source, (str, os.PathLike)):
         label = f"states {os.fspath(source)}"
         arrays = read_arrays(source)
+    misfit = ""
+    versions = {*np.atleast_1d(arrays.get("mujoco", mj.__version__)).tolist()} - {mj.__version__}
+    if versions:
+        misfit = (
+            f"The start states are of MuJoCo {', '.join(sorted(versions))}, and {mj.__version__} is installed: "
+            "versions differ in inertias of meshes, in defaults and in the contents of a state, so that errors differ."
+        )
     try:
         states = _read_arrays(mj, model, arrays, label)
     except InputError as error:
-        other = _describe_other_version(mj, arrays)
-        raise InputError(f"{error}. {other}" if other else str(error)) from None
-    return dataclasses.replace(states, misfit=_describe_misfit(mj, model, arrays))
-
-
-def _describe_other_version(mj: Any, arrays: Mapping[str, Any]) -> str:
-    """Return a sentence on states that another version of MuJoCo wrote; else empty."""
-    versions = {*np.atleast_1d(arrays.get("mujoco", mj.__version__)).tolist()} - {mj.__version__}
-    if not versions:
-        return ""
-    return (
-        f"The start states are of MuJoCo {', '.join(sorted(versions))}, and {mj.__version__} is installed: versions "
-        "differ in inertias of meshes, in defaults and in the contents of a state, so that errors differ."
-    )
-
-
-def _describe_misfit(mj: Any, model: Any, arrays: Mapping[str, Any]) -> str:
-    """Return a sentence on states that belong to another model; else empty."""
-    if other := _describe_other_version(mj, arrays):
-        return other
-    if "model" in arrays and {*np.atleast_1d(arrays["model"]).tolist()} != {hash_model(model)}:
-        return (
+        raise InputError(f"{error}. {misfit}" if misfit else str(error)) from None
+    models = {*np.atleast_1d(arrays["model"]).tolist()} if "model" in arrays else set()
+    if models and not misfit and models != {hash_model(model)}:
+        misfit = (
             "The start states are of a model with other bodies, geoms, joints or equalities: if it was changed after "
             "loading, give the changed model as a mujoco.MjModel or as .mjb (mujoco.mj_saveModel)."
         )
-    return ""
+    return dataclasses.replace(states, misfit=misfit)
 
 
 def check_array_names(source: str, names: Iterable[str], valid: Iterable[str]) -> None:

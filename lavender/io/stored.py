@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import math
 import os
@@ -191,19 +192,17 @@ def check_figure_path(path: str | os.PathLike[str]) -> Path:
     return path
 
 
-def write_figure(canvas: Any, path: str | os.PathLike[str], **options: Any) -> None:
+def write_figure(canvas: Any, path: str | os.PathLike[str]) -> None:
     """Write a figure of matplotlib with `write_atomically`; the suffix selects the format (default: png)."""
     from matplotlib import rc_context
 
-    path = check_figure_path(path)
-    options["format"] = path.suffix[1:].lower()
+    path, content = check_figure_path(path), io.BytesIO()
     try:
         with rc_context({"pdf.fonttype": 42}):  # Embed TrueType fonts, since publishers reject Type 3 fonts.
-            write_atomically(path, lambda part: canvas.savefig(part, **options))
+            canvas.savefig(content, format=path.suffix[1:].lower())
     except (ValueError, OverflowError) as error:
-        if isinstance(error, InputError):
-            raise
         raise InputError(f"cannot write the figure {str(path)!r}: {error}") from None
+    write_bytes(path, content.getvalue())
 
 
 def as_path(path: str | os.PathLike[str]) -> Path:
@@ -224,24 +223,3 @@ def read_bytes(path: str | os.PathLike[str], role: str = "", count: int = -1) ->
     except (OSError, ValueError) as error:
         named = f"{role} {str(path)!r}" if role else path
         raise InputError(f"cannot read {named}: {getattr(error, 'strerror', None) or error}") from None
-
-
-def pack_header(magic: bytes, header: Mapping[str, Any]) -> bytes:
-    """Return the beginning of a file: magic word, length of the JSON header (8 bytes, little-endian), header."""
-    head = json.dumps(header).encode()
-    return magic + len(head).to_bytes(8, "little") + head
-
-
-def unpack_header(data: bytes, magic: bytes, max_bytes: int) -> tuple[Any, int]:
-    """Return the header of a file that `pack_header` began, and the position behind it.
-
-    Raises
-    ------
-    ValueError
-        The file has another magic word, or the header is incomplete or longer than `max_bytes`.
-    """
-    start = len(magic) + 8
-    end = start + int.from_bytes(data[len(magic) : start], "little")
-    if not data.startswith(magic) or not start < end <= min(len(data), start + max_bytes):
-        raise ValueError("header")
-    return json.loads(data[start:end]), end

@@ -140,8 +140,14 @@ def solve_qp(
     if isinstance(P, Problem):
         if isinstance(q, str):
             solver, q = q, None
-        problem = _update_program(P, q, h, b, (G, A, lb, ub))
-        qp = problem.qp
+        problem, qp = P, P.qp
+        if qp is None:
+            raise InputError("the problem contains no quadratic program; one of Problem.from_qp is needed")
+        if any(x is not None for x in (G, A, lb, ub)):
+            raise InputError("G, A, lb or ub is given with a problem; only q, h and b of it can be replaced")
+        if not (q is None and h is None and b is None):
+            qp = qp.with_vectors(q, h, b)
+            problem = Problem(**(qp.problem_fields() | {"qp": qp, "name": P.name, "copy": False}))
     else:
         if P is None:
             if q is None:
@@ -162,20 +168,6 @@ def solve_qp(
     if initvals is not None:
         task.initial_x = as_array("initvals", initvals, (len(qp.q),))
     return task.solve(begun)
-
-
-def _update_program(problem: Problem, q: Any, h: Any, b: Any, others: tuple[Any, ...]) -> Problem:
-    """Return the problem with another q, h and b; the same object without them."""
-    qp = problem.qp
-    if qp is None:
-        raise InputError("the problem contains no quadratic program; one of Problem.from_qp is needed")
-    if any(x is not None for x in others):
-        raise InputError("G, A, lb or ub is given with a problem; only q, h and b of it can be replaced")
-    if q is None and h is None and b is None:
-        return problem
-    qp = qp.with_vectors(q, h, b)
-    fields = qp.problem_fields() | {"qp": qp, "name": problem.name, "copy": False}
-    return Problem(**fields)
 
 
 class _Task:
@@ -213,6 +205,16 @@ class _Task:
 
     def solve(self, begun: float) -> QPSolution:
         """Run the solvers, search for proofs, and build the answer."""
+        if not len(self.qp.q):  # Judge the only point, or prove that a row contradicts itself.
+            target, free = self.qp.target, self.qp.free
+            self.start = np.zeros(len(target))
+            self._judge_start()
+            if not self.judge.error <= self.tol:
+                violation = np.append(np.abs(target[:free]), target[free:])
+                y = np.where(np.arange(len(target)) == np.argmax(violation), np.sign(target), 0.0)
+                proof = prove_infeasibility(self.problem, y)
+                self.proof = None if proof.reason else proof
+            return self._make_answer(begun)
         for step in self._list_steps():
             step()
             if self.judge.error <= self.judge.tol or self.proof is not None:
@@ -225,20 +227,26 @@ class _Task:
         # Large x makes the violations of rows that contradict each other small: a proof has precedence.
         has_budget = self.max_iter is None and not self.deadline.has_passed() and len(self.qp.q) > 0
         if not self.judge.strict_error <= self.judge.tol and not is_stopped and has_budget:
-            self._search_proofs()
+            # Search for a proof that no x satisfies the rows and, if no point is found, for a ray.
+            self.proof = self.proof or find_infeasibility_proof(
+                self.problem, self.program, self.rays[-1] if self.rays else None, self.deadline
+            )
+            if self.proof is None and self.qp.is_singular:
+                found = find_ray(self.program, self.judge.x, self.deadline)
+                if found is not None:
+                    self.ray, self.judge.x = mark_read_only(found[0]), found[1]
+                    self.judge.lam = np.zeros(len(self.qp.target))
         return self._make_answer(begun)
 
     def _list_steps(self) -> Iterator[Any]:
         """Yield the runs to do, one after the other, until a point meets tol."""
         spec = self.spec
-        if not len(self.qp.q):
-            yield self._judge_without_variables
-            return
         if self.start is not None and self.tol > 0.0 and (spec.delegates or spec.external):
             yield self._judge_start
         if spec.delegates and spec.builtin:
             if not self.qp.is_singular:
-                yield self._solve_over_rows
+                # A Newton step improves the point of the constraint problem in J and M if it misses tol.
+                yield partial(self._run_solve, max(AUTO_TOL_RATIO * self.tol, MIN_TOL), self.start)
             if not self.options:
                 for backend in program_backends():
                     yield partial(self._call_backend, backend, {})
@@ -246,17 +254,6 @@ class _Task:
             yield partial(self._call_backend, spec, self.options)
         else:
             yield self._solve_constraint_problem
-
-    def _judge_without_variables(self) -> None:
-        """Judge the only point of a program without variables, or prove that a row contradicts itself."""
-        target, free = self.qp.target, self.qp.free
-        self.start = np.zeros(len(target))
-        self._judge_start()
-        if not self.judge.error <= self.tol:
-            violation = np.append(np.abs(target[:free]), target[free:])
-            y = np.where(np.arange(len(target)) == np.argmax(violation), np.sign(target), 0.0)
-            proof = prove_infeasibility(self.problem, y)
-            self.proof = None if proof.reason else proof
 
     def _judge_start(self) -> None:
         """Judge the start: if it meets tol, nothing runs."""
@@ -283,10 +280,6 @@ class _Task:
         if result.status is INFEASIBLE and result.point is not None:
             self.rays.append(result.point[1])
         self.runs.append(Run(spec.name, result.status, result.message, result.work, judge.error))
-
-    def _solve_over_rows(self) -> None:
-        """Solve the constraint problem in J and M by `auto`; improve its point by a Newton step if it misses tol."""
-        self._run_solve(max(AUTO_TOL_RATIO * self.tol, MIN_TOL), self.start)
 
     def _solve_constraint_problem(self) -> None:
         """Solve the constraint problem by the named solver, with smaller tol until the program's error meets tol."""
@@ -320,18 +313,6 @@ class _Task:
         run = Run(self.spec.name, solution.status, solution.message, dict(solution.work), self.judge.error)
         self.runs.append(run._replace(form=solution.solver.form))
         return solution
-
-    def _search_proofs(self) -> None:
-        """Search for a proof that no x satisfies the rows and, if no point is found, for a ray."""
-        judge, rays = self.judge, self.rays
-        self.proof = self.proof or find_infeasibility_proof(
-            self.problem, self.program, rays[-1] if rays else None, self.deadline
-        )
-        if self.proof is None and self.qp.is_singular:
-            found = find_ray(self.program, judge.x, self.deadline)
-            if found is not None:
-                self.ray, point = mark_read_only(found[0]), found[1]
-                judge.x, judge.lam = point, np.zeros(len(self.qp.target))
 
     def _make_answer(self, begun: float) -> QPSolution:
         """Build the answer, with the status that the judge confirms."""

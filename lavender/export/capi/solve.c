@@ -374,19 +374,6 @@ int32_t lav_impulse(lav_solver *solver, double *out, int32_t n) {
   return leave(solver, LAV_OK);
 }
 
-int32_t lav_velocity(lav_solver *solver, double *out, int32_t n) {
-  int32_t i;
-  GIVE_BACK(enter(solver));
-  if (!solver->ready) return leave(solver, LAV_ERROR_NO_PROBLEM);
-  if (solver->form == LAV_MATRIX) return leave(solver, LAV_ERROR_UNSUPPORTED);
-  if (n != solver->n_v) return leave(solver, LAV_ERROR_COUNT);
-  if (!out && n > 0) return leave(solver, LAV_ERROR_NULL);
-  if (n == 0) return leave(solver, LAV_OK);
-  change_of(solver, solver->impulse, out);
-  for (i = 0; i < n; i++) out[i] = solver->v_free[i] + out[i];
-  return leave(solver, LAV_OK);
-}
-
 int32_t lav_free_velocity(lav_solver *solver, double *out, int32_t n) {
   GIVE_BACK(enter(solver));
   if (!solver->ready) return leave(solver, LAV_ERROR_NO_PROBLEM);
@@ -394,5 +381,14 @@ int32_t lav_free_velocity(lav_solver *solver, double *out, int32_t n) {
   if (n != solver->n_v) return leave(solver, LAV_ERROR_COUNT);
   if (!out && n > 0) return leave(solver, LAV_ERROR_NULL);
   COPY(out, solver->v_free, n);
+  return leave(solver, LAV_OK);
+}
+
+int32_t lav_velocity(lav_solver *solver, double *out, int32_t n) {
+  int32_t i;
+  GIVE_BACK(lav_free_velocity(solver, out, n));
+  GIVE_BACK(enter(solver));
+  change_of(solver, solver->impulse, solver->compare);
+  for (i = 0; i < n; i++) out[i] += solver->compare[i];
   return leave(solver, LAV_OK);
 }

@@ -62,14 +62,25 @@ def check_state(own: State, new: State, sweeps: tuple[int, int], is_lost: bool) 
     settings = np.ones(len(own.setting), bool)
     for name, width in WRITTEN_SETTINGS.items():
         settings[SETTING[name] : SETTING[name] + width] = False
-    if own.setting[settings].tobytes() != new.setting[settings].tobytes():
-        differs = np.flatnonzero(settings & (own.setting != new.setting))
-        changed = [name for name, at in SETTING.items() if at in differs] or ["a NaN"]
-        require_intact(False, f"settings differ from the ones of this scene: {', '.join(changed)}")
+    is_same = own.setting[settings].tobytes() == new.setting[settings].tobytes()
+    require_intact(is_same, "settings differ from the ones of this scene")
     _check_head(own, new, sweeps, is_lost)
     _check_contacts(new)
-    if not is_lost:
-        _check_numbers(own, new)
+    if is_lost:
+        return
+    # Check that numbers are finite, quaternions are normalised, and inertias belong to the scene.
+    cached = int(new.head[HEAD["cached"]])
+    names = "x", "v", "joint_impulse", "inv_inertia", "cache_impulse", "cache_local", "cache_roll"
+    for name in names:
+        values = b[name][:cached] if name.startswith("cache") else b[name]
+        require_intact(np.isfinite(values).all(), f"{name} is not finite")
+    with np.errstate(over="ignore", invalid="ignore"):
+        is_unit = np.abs((b["q"] ** 2).sum(axis=1) - 1.0) <= QUATERNION_TOLERANCE
+    require_intact(is_unit.all(), "q holds a quaternion that does not have length 1")
+    require_intact(not b["v"][b["dyn"] < 0].any(), "v gives a static body a velocity")
+    even = ~b["uneven"][b["body_of"]].astype(bool)
+    is_same = b["inv_inertia"][even].tobytes() == a["inv_inertia"][even].tobytes()
+    require_intact(is_same, "inv_inertia differs from the value of this scene")
 
 
 def _check_head(own: State, new: State, sweeps: tuple[int, int], is_lost: bool) -> None:
@@ -120,22 +131,6 @@ def _check_contacts(new: State) -> None:
     pair = b["contact_pair"][:c]
     is_body = ((pair >= 0) & (pair < n)).all() and np.array_equal(b["contact_body"][:c], b["dyn"][pair])
     require_intact(c == 0 or is_body, "contact_pair names bodies that the scene does not have")
-
-
-def _check_numbers(own: State, new: State) -> None:
-    """Check that numbers are finite, quaternions are normalised, and inertias belong to the scene."""
-    b, cached = new.a, int(new.head[HEAD["cached"]])
-    names = "x", "v", "joint_impulse", "inv_inertia", "cache_impulse", "cache_local", "cache_roll"
-    for name in names:
-        values = b[name][:cached] if name.startswith("cache") else b[name]
-        require_intact(np.isfinite(values).all(), f"{name} is not finite")
-    with np.errstate(over="ignore", invalid="ignore"):
-        is_unit = np.abs((b["q"] ** 2).sum(axis=1) - 1.0) <= QUATERNION_TOLERANCE
-    require_intact(is_unit.all(), "q holds a quaternion that does not have length 1")
-    require_intact(not b["v"][b["dyn"] < 0].any(), "v gives a static body a velocity")
-    even = ~b["uneven"][b["body_of"]].astype(bool)
-    is_same = b["inv_inertia"][even].tobytes() == own.a["inv_inertia"][even].tobytes()
-    require_intact(is_same, "inv_inertia differs from the value of this scene")
 
 
 def require_intact(is_valid: Any, reason: str) -> None:

@@ -5,16 +5,11 @@ They are defined in `lavender_ext/engine/arrays.pxd`.
 
 from lavender_ext.engine import arrays
 
-
-def _enum_members_with_prefix(prefix: str) -> dict[str, int]:
-    return {
-        name.removeprefix(prefix).lower(): number
-        for name, number in vars(arrays).items()
-        if name.startswith(prefix) and isinstance(number, int)
-    }
-
-
-HEAD, SETTING, JOINT = map(_enum_members_with_prefix, ("H_", "S_", "J_"))
+_NUMBERS = {name: number for name, number in vars(arrays).items() if isinstance(number, int)}
+HEAD, SETTING, JOINT = (
+    {name.removeprefix(prefix).lower(): x for name, x in _NUMBERS.items() if name.startswith(prefix)}
+    for prefix in ("H_", "S_", "J_")
+)
 SIZE = {
     "bodies": arrays.N_BODY, "dynamic": arrays.N_DYNAMIC, "joints": arrays.N_JOINT, "joint_rows": arrays.N_JOINT_ROW,
     "excluded": arrays.N_EXCLUDED, "buckets": arrays.N_BUCKET, "frames": arrays.N_FRAME,

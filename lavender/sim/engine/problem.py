@@ -34,8 +34,10 @@ def build_problem(state: State, bodies: Sequence[str], joints: Sequence[str], na
     normal = a["normal"][:c].copy()
     tangent = a["tangent"][:c].copy() if len(a["tangent"]) else np.zeros((c, 3))
     # Contacts without friction have no tangent; `Rows` needs a unit vector orthogonal to the normal.
-    frictionless = np.flatnonzero(a["mu"][kj:k] == 0.0)
-    tangent[frictionless] = _choose_first_tangents(normal[frictionless])
+    for i in np.flatnonzero(a["mu"][kj:k] == 0.0):
+        side = np.cross(normal[i], np.eye(3)[np.argmin(np.abs(normal[i]))])
+        size = compute_norm(side)
+        tangent[i] = side / size if size > 0.0 else 0.0  # For a zero normal, `Rows` raises the error.
     rows = Rows(
         inv_mass=a["inv_mass"].copy(),
         inv_inertia=a["inv_inertia"].copy(),
@@ -88,17 +90,6 @@ def _number_contact_points(key: np.ndarray) -> list[int]:
     number = np.empty(len(key), np.int64)
     number[order] = 1 + position - first
     return list(number.tolist())
-
-
-def _choose_first_tangents(normal: FloatArray) -> FloatArray:
-    """Return a unit vector orthogonal to each normal (c, 3)."""
-    out = np.zeros_like(normal)
-    for i, n in enumerate(normal):
-        t = np.cross(n, np.eye(3)[np.argmin(np.abs(n))])
-        size = compute_norm(t)
-        if size > 0.0:  # For a zero normal, `Rows` raises the error.
-            out[i] = t / size
-    return out
 
 
 def summarise_residual(problem: Problem, impulse: FloatArray) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,6 @@ from lavender.sim.engine.stepping import (
     invalidate_pair_list,
     run_exclusively,
 )
-from lavender.sim.scene import Scene
 from lavender_ext.engine.arrays import NEED_CAPACITY, compute_buffer_lengths
 
 
@@ -262,13 +262,8 @@ class Simulation(Stepping):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copy or pickle as a new simulation that continues from the same state."""
-        return _restore_simulation, (self.scene, self.report_residual, self.report_motion, self.snapshot())
+        make = partial(Simulation, report_residual=self.report_residual, report_motion=self.report_motion)
+        return make, (self.scene,), self.snapshot()
 
-
-def _restore_simulation(
-    scene: Scene, report_residual: bool, report_motion: bool, snapshot: Snapshot
-) -> Simulation:
-    """Build a simulation of the scene and restore the snapshot."""
-    sim = Simulation(scene, report_residual=report_residual, report_motion=report_motion)
-    sim.restore(snapshot)
-    return sim
+    def __setstate__(self, snapshot: Snapshot) -> None:
+        self.restore(snapshot)

@@ -8,21 +8,20 @@ everything before it. Nothing in it is executed when it is read.
 from __future__ import annotations
 
 import hashlib
+import json
 from dataclasses import dataclass, field
-from os import PathLike, fsync
-from pathlib import Path
+from os import PathLike
 from typing import Any
 
 import numpy as np
 
 from lavender.base.errors import InputError
-from lavender.io.stored import pack_header, read_bytes, unpack_header, write_atomically
+from lavender.io.stored import read_bytes, write_bytes
 from lavender.sim.engine.check import check_snapshot_fields
 from lavender_ext.engine.arrays import compute_buffer_lengths
 
 MAGIC = b"LAVENDER-SNAPSHOT\n"
 VERSION = 1
-MAX_SNAPSHOT_HEADER_BYTES = 2**20
 HEADER_FIELDS = ("fingerprint", "steps", "failed", "lost")
 ARRAYS = (("size", "<i4"), ("real", "<f8"), ("index", "<i4"), ("keys", "<u8"))
 
@@ -59,13 +58,12 @@ class Snapshot:
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the snapshot to a file with version and checksum; an existing file is replaced atomically."""
-        check_snapshot_fields(self)
         arrays = [np.ascontiguousarray(getattr(self, name), code).tobytes() for name, code in ARRAYS]
         header = {name: getattr(self, name) for name in HEADER_FIELDS}
         lengths_of = [len(getattr(self, name)) for name, _ in ARRAYS]
-        body = pack_header(MAGIC, {"version": VERSION, **header, "lengths": lengths_of}) + b"".join(arrays)
-        checksum = hashlib.sha256(body).digest()
-        write_atomically(path, lambda part: _write_and_flush(part, body + checksum))
+        head = json.dumps({"version": VERSION, **header, "lengths": lengths_of}).encode()
+        body = b"".join([MAGIC, len(head).to_bytes(8, "little"), head, *arrays])
+        write_bytes(path, body + hashlib.sha256(body).digest())
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Snapshot:
@@ -87,7 +85,7 @@ class Snapshot:
                 f"the snapshot {str(path)!r} is damaged: its checksum does not match its content. Save or copy it again"
             )
         try:
-            snapshot = cls._parse(body)
+            return cls._parse(body)
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             if isinstance(error, InputError):
                 raise InputError(f"the snapshot {str(path)!r} cannot be read: {error}") from None
@@ -95,12 +93,13 @@ class Snapshot:
                 f"the snapshot {str(path)!r} is damaged, because its data do not match its header: save or "
                 "copy it again"
             ) from None
-        return snapshot
 
     @classmethod
     def _parse(cls, body: bytes) -> Snapshot:
         """Build a snapshot from the bytes before the checksum; raise an error if they are inconsistent."""
-        header, end = unpack_header(body, MAGIC, MAX_SNAPSHOT_HEADER_BYTES)
+        start = len(MAGIC) + 8
+        end = start + int.from_bytes(body[len(MAGIC) : start], "little")
+        header = json.loads(body[start:end])
         if header["version"] != VERSION:
             raise InputError(
                 f"the snapshot has version {str(header['version'])[:40]}, and this lavender reads version "
@@ -119,11 +118,3 @@ class Snapshot:
         if end != len(body) or [max(n, 1) for n in used] != [max(n, 1) for n in header["lengths"][1:]]:
             raise ValueError("lengths")
         return snapshot
-
-
-def _write_and_flush(part: Path, data: bytes) -> None:
-    """Write bytes and flush them to the disk."""
-    with open(part, "wb") as stream:
-        stream.write(data)
-        stream.flush()
-        fsync(stream.fileno())

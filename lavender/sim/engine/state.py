@@ -216,7 +216,14 @@ def _put_bodies(a: dict[str, Any], bodies: Sequence[Body], uneven: Sequence[bool
             a["inv_inertia_body"][i] = a["inv_inertia"][dynamic] = inverse
             a["uneven"][i] = uneven[i]
             dynamic += 1
-        a["kind_of_shape"][i], a["shape"][i] = _encode_shape(b.shape)
+        if isinstance(b.shape, Plane):
+            a["kind_of_shape"][i], a["shape"][i] = PLANE, [*b.shape.normal, b.shape.offset]
+        elif isinstance(b.shape, Sphere):
+            a["kind_of_shape"][i], a["shape"][i, :3] = SPHERE, b.shape.radius
+        elif isinstance(b.shape, Box):
+            a["kind_of_shape"][i], a["shape"][i, :3] = BOX, 0.5 * np.array(b.shape.size)
+        else:
+            a["kind_of_shape"][i] = NO_SHAPE
 
 
 def _put_joints(a: dict[str, Any], joints: Sequence[Joint]) -> None:
@@ -236,14 +243,3 @@ def _put_joints(a: dict[str, Any], joints: Sequence[Joint]) -> None:
         a["joint_body"][i] = [a["dyn"][k] if k >= 0 else -1 for k in (j.a, j.b)]
         row += j.n_rows
         a["ptr"][i + 1] = row
-
-
-def _encode_shape(shape: Any) -> tuple[int, list[float]]:
-    """Return the kind of a shape and its four numbers in the engine's arrays."""
-    if isinstance(shape, Plane):
-        return PLANE, [*shape.normal, shape.offset]
-    if isinstance(shape, Sphere):
-        return SPHERE, [shape.radius, shape.radius, shape.radius, 0.0]
-    if isinstance(shape, Box):
-        return BOX, [*(0.5 * np.array(shape.size)), 0.0]
-    return NO_SHAPE, [0.0, 0.0, 0.0, 0.0]

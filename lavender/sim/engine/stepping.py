@@ -177,7 +177,15 @@ class Stepping:
             The simulation has terminated: reset it or restore a snapshot.
         """
         self._check_can_step()
-        i = self._find_body_number(body)
+        if isinstance(body, str):
+            if body not in self._names:
+                raise UnknownName("body", body, self._names)
+            if self._names.count(body) > 1:
+                raise InputError(
+                    f"{self._names.count(body)} bodies are named {body!r}; give the number of one"
+                )
+            body = self._names.index(body)
+        i = check_int("body", body, 0, len(self._names) - 1)
         name = self._names[i]
         if self.state.a["dyn"][i] < 0:
             raise InputError(f"{name} is static, so its velocity cannot be set: choose a dynamic body")
@@ -189,16 +197,6 @@ class Stepping:
         ]
         for first, x in values:
             self.state.a["v"][i, first : first + 3] = x
-
-    def _find_body_number(self, body: int | str) -> int:
-        """Return the number of a body given by number or unique name."""
-        if not isinstance(body, str):
-            return check_int("body", body, 0, len(self._names) - 1)
-        if body not in self._names:
-            raise UnknownName("body", body, self._names)
-        if self._names.count(body) > 1:
-            raise InputError(f"{self._names.count(body)} bodies are named {body!r}; give the number of one")
-        return self._names.index(body)
 
     @run_exclusively
     def reset(self, seed: int | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -290,9 +288,15 @@ class Stepping:
                 self._state_before_step = State(first.size)
             self._state_before_step.copy_from(first)
         try:
-            if self._own_sweeps:
-                self._sweep_substeps()
-            else:
+            left = substeps if self._own_sweeps else 0  # Substeps of the compiled sweeps.
+            while left > 0:
+                status, done = self.state.kernel.run_substeps(min(left, SUBSTEPS_PER_CALL))
+                left -= done
+                if status == NEED_CAPACITY:
+                    self.state = self.state.with_larger_buffers()
+                elif status != OK:
+                    break
+            if not self._own_sweeps:
                 self._solve_substeps()
         except BaseException as error:
             done = (self.state.head.item(HEAD["step"]) - first_substep) % (LAST_STEP + 1)
@@ -319,17 +323,6 @@ class Stepping:
         self._end_reason = f"the state of {self._names[lost]!r} is not finite"
         return self._names[lost]
 
-    def _sweep_substeps(self) -> None:
-        """Do the substeps with the compiled sweeps; enlarge the buffers if they are too small."""
-        remaining = self._parameters.substeps
-        while True:
-            status, done = self.state.kernel.run_substeps(min(remaining, SUBSTEPS_PER_CALL))
-            remaining -= done
-            if status == NEED_CAPACITY:
-                self.state = self.state.with_larger_buffers()
-            elif remaining == 0 or status != OK:
-                return
-
     def prepare_substep(self) -> None:
         """Detect collisions and build the rows of the next substep in `state`."""
         while self.state.kernel.prepare_substep() == NEED_CAPACITY:
@@ -344,7 +337,14 @@ class Stepping:
             kernel, a = self.state.kernel, self.state.a
             kernel.solve(False)
             rows = self.state.size.item(SIZE["joint_rows"]) + self.state.head.item(HEAD["contact_rows"])
-            if rows and not (warm and self._run_newton_on_engine_arrays()):
+            if rows and warm:
+                # Run the first phase of `newton` on the engine's arrays. The impulses are bit for bit the result of
+                # lavender.solve(problem, "newton"), without building the problem.
+                start = perf_counter()
+                *counts, _ = self.state.warm_start_phase.solve(self._warm_tol)
+                if counts[0]:
+                    self._last = partial(self._build_solution, counts, perf_counter() - start)
+            if rows and self._last is None:
                 try:
                     problem = self._build_problem(self.state)
                 except InputError:  # The numbers of the problem are not finite.
@@ -357,17 +357,6 @@ class Stepping:
                 kernel.apply_impulses()
             if kernel.finish_substep() != OK:
                 return
-
-    def _run_newton_on_engine_arrays(self) -> bool:
-        """Run the first phase of `newton` on the engine's arrays; return whether it solved the problem.
-
-        The impulses are bit for bit the result of lavender.solve(problem, "newton"), without building the problem.
-        """
-        start = perf_counter()
-        *counts, _ = self.state.warm_start_phase.solve(self._warm_tol)
-        if counts[0]:
-            self._last = partial(self._build_solution, counts, perf_counter() - start)
-        return bool(counts[0])
 
     def _build_solution(self, counts: list[int], solve_time: float) -> Solution:
         """Build the solution of the last substep. Its arrays do not change until the next substep."""
@@ -412,26 +401,22 @@ class Stepping:
         observation: dict[str, Any] = {name: copy_array() for name, copy_array in views.arrays.items()}
         contacts = {name: copy_array() for name, copy_array in views.contacts.items()}
         contacts["depth"] = 0.0 - views.gap
-        impulses = (
-            views.impulses() if views.impulses is not None else self._collect_contact_impulses(c, views.per)
-        )
-        contacts["impulses"] = impulses
         observation["contacts"] = contacts
-        return observation
-
-    def _collect_contact_impulses(self, c: int, per: int) -> FloatArray:
-        """Return the impulses (c, per) of contacts with different numbers of rows; missing rows are zero."""
-        a, kj = self.state.a, int(self.state.size[SIZE["joints"]])
-        out = np.zeros((c, per))
+        if views.impulses is not None:
+            contacts["impulses"] = views.impulses()
+            return observation
+        # Contacts have different numbers of rows; missing rows are zero.
+        a, kj = s.a, int(s.size[SIZE["joints"]])
+        contacts["impulses"] = out = np.zeros((c, views.per))
         first, end = a["ptr"][kj : kj + c], a["ptr"][kj + 1 : kj + c + 1]
-        for row in range(per):
+        for row in range(views.per):
             has = first + row < end
             out[has, row] = a["impulse"][first[has] + row]
-        if per == 6:
+        if views.per == 6:
             # The rolling rows are the last two rows of a contact, with or without a torsion row before them.
             no_torsion = end - first == 5
             out[no_torsion, 3:] = np.roll(out[no_torsion, 3:], 1, axis=1)
-        return out
+        return observation
 
     def _make_step_info(self, lost: str = "") -> dict[str, Any]:
         """Return the `info` of a step."""

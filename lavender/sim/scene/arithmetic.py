@@ -60,24 +60,13 @@ def rotate_vector(r: FloatArray, x: FloatArray) -> FloatArray:
     return (a + b) + c
 
 
-def rotate_vector_back(r: FloatArray, x: FloatArray) -> FloatArray:
-    """Return R^T x for a matrix (3, 3) and a vector (3,)."""
-    return rotate_vector(r.T, x)
-
-
-def invert_definite_3x3(x: FloatArray) -> FloatArray | None:
-    """Return the inverse (3, 3) of a symmetric positive definite X = L D L^T, or None if a pivot is not positive."""
+def invert_definite_3x3(x: FloatArray) -> FloatArray:
+    """Return the inverse (3, 3) of a symmetric positive definite X = L D L^T."""
     (a, _, _), (b, d, _), (c, e, f) = x.tolist()
-    if not a > 0.0:
-        return None
     l10, l20 = b / a, c / a
     pivot, reduced = d - l10 * b, e - l20 * b
-    if not pivot > 0.0:
-        return None
     l21 = reduced / pivot
     last = (f - l20 * c) - l21 * reduced
-    if not last > 0.0:
-        return None
     # Entries of L^-1 below its unit diagonal.
     m10, m20, m21 = -l10, l10 * l21 - l20, -l21
     i22 = 1.0 / last

@@ -14,7 +14,7 @@ from lavender.base.errors import InputError, check_name
 from lavender.problem.friction import SHAPES
 from lavender.problem.ordering import ENGINE_ORDERS
 from lavender.sim.scene.parts import check_numbers
-from lavender.solvers.registry import SolverSpec, get
+from lavender.solvers.registry import get
 
 # "alternating" reverses the order of contacts in every substep.
 SCENE_ORDERS = (*ENGINE_ORDERS, "alternating")
@@ -120,12 +120,30 @@ class Parameters:
             raise InputError(f"solver_options is {self.solver_options!r}; a mapping is needed")
         put(self, "solver_options", dict(self.solver_options))
         own = self.solver == "sequential_impulses"
-        put(self, "solver_iterations", self._check_sweeps(get(self.solver)))
+        spec, sweeps = get(self.solver), self.solver_iterations
+        if own and self.solver_options:
+            raise InputError(
+                f"solver_options are {sorted(self.solver_options)}, but the solver is sequential_impulses, "
+                "which has no options: give order= and seed= of the scene, or another solver="
+            )
+        if sweeps is None:
+            sweeps = 16 if own else spec.max_iter
+        sweeps = check_int("solver_iterations", sweeps, *((MIN_SWEEPS, MAX_SWEEPS) if own else (1,)))
+        put(self, "solver_iterations", sweeps)
         max_substep: Any = self.max_substep
         if max_substep is None:
             max_substep = DEFAULT_MAX_SUBSTEP if own else self.dt
         put(self, "max_substep", check_float("max_substep", max_substep, above=0.0))
-        put(self, "substeps", self._choose_substeps())
+        substeps: Any = self.substeps
+        if substeps is None:  # Choose the smallest number that respects `max_substep`.
+            ratio = self.dt / self.max_substep - 1e-9  # Rounding of an integer ratio must not add a substep.
+            if ratio > MAX_DEFAULT_SUBSTEPS:
+                raise InputError(
+                    f"dt is {self.dt:g} s, more than {MAX_DEFAULT_SUBSTEPS} substeps of max_substep = "
+                    f"{self.max_substep:g} s; give a shorter dt, a longer max_substep, or substeps="
+                )
+            substeps = max(1, math.ceil(ratio))
+        put(self, "substeps", check_int("substeps", substeps, 1))
         put(self, "warm_start", check_bool("warm_start", self.warm_start))
         order: Any = self.order
         put(self, "order", ("alternating" if own else "given") if order is None else order)
@@ -139,31 +157,6 @@ class Parameters:
         put(self, "position_iterations", check_int("position_iterations", self.position_iterations, 0, 1000))
         put(self, "seed", check_int("seed", self.seed))
         check_name("on_failure", self.on_failure, ON_FAILURE)
-
-    def _check_sweeps(self, spec: SolverSpec) -> int:
-        """Return the checked `solver_iterations`, or their default."""
-        sweeps = self.solver_iterations
-        if self.solver != "sequential_impulses":
-            return check_int("solver_iterations", spec.max_iter if sweeps is None else sweeps, 1)
-        if self.solver_options:
-            raise InputError(
-                f"solver_options are {sorted(self.solver_options)}, but the solver is sequential_impulses, "
-                "which has no options: give order= and seed= of the scene, or another solver="
-            )
-        return 16 if sweeps is None else check_int("solver_iterations", sweeps, MIN_SWEEPS, MAX_SWEEPS)
-
-    def _choose_substeps(self) -> int:
-        """Return the checked number of substeps, or the smallest number that respects `max_substep`."""
-        substeps: Any = self.substeps
-        if substeps is None:
-            ratio = self.dt / self.max_substep - 1e-9  # Rounding of an integer ratio must not add a substep.
-            if ratio > MAX_DEFAULT_SUBSTEPS:
-                raise InputError(
-                    f"dt is {self.dt:g} s, more than {MAX_DEFAULT_SUBSTEPS} substeps of max_substep = "
-                    f"{self.max_substep:g} s; give a shorter dt, a longer max_substep, or substeps="
-                )
-            substeps = max(1, math.ceil(ratio))
-        return check_int("substeps", substeps, 1)
 
 
 COMMON_PARAMETERS = tuple(f.name for f in fields(Parameters))

@@ -9,7 +9,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, as_array, check_float, get_shape
 from lavender.base.errors import InputError
-from lavender.sim.scene.arithmetic import compute_norm, compute_sine_and_cosine, rotate_vector_back
+from lavender.sim.scene.arithmetic import compute_norm, compute_sine_and_cosine, rotate_vector
 from lavender_ext.core.checks import MAX_MAGNITUDE, MIN_MAGNITUDE
 
 # The largest principal moment of inertia may exceed the sum of the other two by this fraction, which is the rounding
@@ -121,13 +121,9 @@ class Body:
         """Whether the body never moves."""
         return self.mass == 0.0
 
-    def to_local(self, point: FloatArray) -> FloatArray:
-        """Return a world point (3,) [m] in the body's frame."""
-        return rotate_vector_back(convert_to_rotation_matrix(self.quaternion), point - self.position)
-
     def direction_to_local(self, direction: FloatArray) -> FloatArray:
         """Return a world direction (3,) in the body's frame."""
-        return rotate_vector_back(convert_to_rotation_matrix(self.quaternion), direction)
+        return rotate_vector(convert_to_rotation_matrix(self.quaternion).T, direction)
 
 
 DISTANCE, BALL, HINGE = "distance", "ball", "hinge"

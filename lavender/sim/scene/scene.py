@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, check_bool, check_float, check_nonnegative_magnitudes
+from lavender.base.arrays import FloatArray, check_bool, check_float, check_int, check_nonnegative_magnitudes
 from lavender.base.errors import InputError, UnknownName, check_name
 from lavender.sim.scene import arithmetic
 from lavender.sim.scene.parameters import COMMON_PARAMETERS, Parameters
@@ -315,13 +315,22 @@ class Scene:
         """
         check_name("joint", kind, (DISTANCE, BALL, HINGE))
         label = name or f"{kind} {len(self.joints)}"
-        a, b = self._check_joined_bodies(label, a, b)
-        ends = (anchor, anchor_a, anchor_b, length)
-        pa, pb, length = (
-            self._check_distance_ends(label, (a, b), *ends, axis)
-            if kind == DISTANCE
-            else _check_common_point(label, *ends)
-        )
+        a, b = (check_int(f"body of {label} (-1: the world)", body, -1, self.n_bodies - 1) for body in (a, b))
+        if a == b or all(i < 0 or self.bodies[i].is_static for i in (a, b)):
+            raise InputError(
+                f"{label} joins {a} and {b}; two bodies, at least one of them dynamic, are needed"
+            )
+        if kind == DISTANCE:
+            ends = anchor, anchor_a, anchor_b, length, axis
+            pa, pb, length = self._check_distance_ends(label, (a, b), *ends)
+        elif anchor is None or anchor_a is not None or anchor_b is not None or length is not None:
+            raise InputError(
+                f"{label} connects the bodies at one point; anchor= is needed, a point (3,) in world "
+                "coordinates [m], and anchor_a, anchor_b and length must be left out"
+            )
+        else:
+            pa = pb = check_numbers(f"anchor of {label} [m]", anchor, 3)
+            length = 0.0
         if (axis is None) == (kind == HINGE):
             raise InputError(f"{label}: axis= is needed for a hinge, and only for a hinge")
         world_axis = (
@@ -352,27 +361,22 @@ class Scene:
         self.joints.append(joint)
         return len(self.joints) - 1
 
-    def _check_joined_bodies(self, label: str, a: Any, b: Any) -> tuple[int, int]:
-        """Return the checked numbers of the two bodies of a joint."""
-        for body in (a, b):
-            is_integer = isinstance(body, (int, np.integer)) and not isinstance(body, bool)
-            if not is_integer or not -1 <= body < self.n_bodies:
-                raise InputError(
-                    f"{label} names body {body!r}; there are bodies 0 to {self.n_bodies - 1}, and -1 is the world"
-                )
-        if a == b or all(i < 0 or self.bodies[i].is_static for i in (a, b)):
-            raise InputError(
-                f"{label} joins {a} and {b}; two bodies, at least one of them dynamic, are needed"
-            )
-        return int(a), int(b)
-
     def _check_distance_ends(
         self, label: str, bodies: tuple[int, int], anchor: Any, a: Any, b: Any, length: Any, axis: Any
     ) -> tuple[FloatArray, FloatArray, float]:
         """Return the anchors (3,) [m] and the length [m] of a distance joint."""
         if anchor is not None or axis is not None:
             raise InputError(f"{label} takes anchor_a and anchor_b; leave anchor and axis out")
-        pa, pb = (self._check_anchor(label, *end) for end in zip("ab", bodies, (a, b), strict=True))
+        ends = []
+        for side, body, point in zip("ab", bodies, (a, b), strict=True):
+            if point is None and body < 0:
+                raise InputError(
+                    f"{label}: anchor_{side} is missing, and body {side} is the world, which has no centre; give "
+                    f"anchor_{side} in world coordinates [m]"
+                )
+            centre = self.bodies[body].position if point is None else point
+            ends.append(check_numbers(f"anchor_{side} of {label} [m]", centre, 3))
+        pa, pb = ends
         with np.errstate(over="ignore"):
             distance = arithmetic.compute_norm(pb - pa)
         length = check_float(f"length of {label} [m]", distance if length is None else length, low=0.0)
@@ -383,25 +387,14 @@ class Scene:
             )
         return pa, pb, length
 
-    def _check_anchor(self, label: str, side: str, body: int, point: Any) -> FloatArray:
-        """Return the anchor (3,) [m] in the world, by default the body's centre."""
-        if point is not None:
-            return check_numbers(f"anchor_{side} of {label} [m]", point, 3)
-        if body < 0:
-            raise InputError(
-                f"{label}: anchor_{side} is missing, and body {side} is the world, which has no centre; give "
-                f"anchor_{side} in world coordinates [m]"
-            )
-        return self.bodies[body].position
-
     def _convert_to_local(self, label: str, body: int, point: FloatArray) -> FloatArray:
         """Return a world point (3,) [m] in the frame of the body."""
         if body < 0:
             return point
+        own = self.bodies[body]
         with np.errstate(over="ignore", invalid="ignore"):
-            return check_numbers(
-                f"anchor of {label}, seen from its body [m]", self.bodies[body].to_local(point), 3
-            )
+            local = own.direction_to_local(point - own.position)
+            return check_numbers(f"anchor of {label}, seen from its body [m]", local, 3)
 
     # -- identity -------------------------------------------------------------------------------
 
@@ -426,16 +419,3 @@ class Scene:
 
 def _check_optional_number(label: str, value: Any, **allowed: float) -> float | None:
     return None if value is None else check_float(label, value, **allowed)
-
-
-def _check_common_point(
-    label: str, anchor: Any, a: Any, b: Any, length: Any
-) -> tuple[FloatArray, FloatArray, float]:
-    """Return (anchor, anchor, 0.0) for the common world point (3,) [m] of a ball or hinge joint."""
-    if anchor is None or a is not None or b is not None or length is not None:
-        raise InputError(
-            f"{label} connects the bodies at one point; anchor= is needed, a point (3,) in world "
-            "coordinates [m], and anchor_a, anchor_b and length must be left out"
-        )
-    point = check_numbers(f"anchor of {label} [m]", anchor, 3)
-    return point, point, 0.0

@@ -7,6 +7,10 @@ from pathlib import Path
 import click
 
 
+def _print_message(text: str) -> None:
+    click.echo(text, err=True)
+
+
 @click.group(invoke_without_command=True)
 @click.pass_context
 def web(context: click.Context) -> None:
@@ -14,16 +18,9 @@ def web(context: click.Context) -> None:
 
     The kernels are compiled to WebAssembly. The commands build the module and the page.
     """
-    if context.invoked_subcommand is None:
-        _serve_page()
-
-
-def _print_message(text: str) -> None:
-    click.echo(text, err=True)
-
-
-def _serve_page() -> None:
-    """Write the page to a temporary folder and serve it until Ctrl-C."""
+    if context.invoked_subcommand is not None:
+        return
+    # Write the page to a temporary folder and serve it until Ctrl-C.
     import webbrowser
     from tempfile import TemporaryDirectory
 

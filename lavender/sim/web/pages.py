@@ -60,12 +60,14 @@ def write_page(folder: Path, say: Callable[[str], Any] = lambda text: None) -> P
     make_folder(check_writable(folder, folder=True))
     modules = {name: get_or_build_module(say, name) for name in wasm.PARTS}
     try:
-        shutil.copytree(HERE / "page", folder, copy_function=_copy_file, dirs_exist_ok=True)
+        for source in filter(Path.is_file, (HERE / "page").rglob("*")):
+            target = folder / source.relative_to(HERE / "page")
+            write_bytes(make_folder(target.parent) / target.name, source.read_bytes())
         for name, data in modules.items():
             write_bytes(folder / f"{name}.wasm", data)
         text = json.dumps(collect_page_data(), allow_nan=False, separators=(",", ":"))
         write_text(folder / "scenes.json", text)
-    except (OSError, shutil.Error) as error:
+    except OSError as error:
         raise InputError(f"cannot write the page into {folder}: {error}") from None
     return folder / "index.html"
 
@@ -88,10 +90,6 @@ def compare_with_native_kernels(say: Callable[[str], Any] = lambda text: None) -
         command = [node, str(script), str(Path(folder, "lavender.wasm"))]
         env = {**os.environ, "PYTHON": sys.executable}
         return subprocess.run(command, env=env, check=False).returncode == 0
-
-
-def _copy_file(source: str, target: str) -> None:
-    write_bytes(target, Path(source).read_bytes())
 
 
 class _Handler(SimpleHTTPRequestHandler):

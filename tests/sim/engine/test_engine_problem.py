@@ -1,6 +1,7 @@
 """The problem inside a step: the same bits as the step, the judge's values, snapshots, other solvers."""
 
 import hashlib
+import json
 import re
 from dataclasses import replace
 
@@ -10,7 +11,6 @@ from test_engine_bits import SCENES
 from worked import after
 
 import lavender as lv
-from lavender.io.stored import pack_header, unpack_header
 from lavender.sim.engine.layout import HEAD
 from lavender.sim.engine.snapshot import MAGIC
 from lavender.sim.scene.parameters import SCENE_ORDERS
@@ -101,8 +101,9 @@ def test_restore_of_a_foreign_or_damaged_snapshot_raises(tmp_path):
         with pytest.raises(lv.InputError, match=r"does not begin as a snapshot|damaged"):
             sim.load(path)
     # What is cut or lengthened inside a file whose checksum is right.
-    header, end = unpack_header(data, MAGIC, 2**20)
-    said, arrays = header["lengths"], data[end:-32]
+    end = len(MAGIC) + 8 + int.from_bytes(data[len(MAGIC) : len(MAGIC) + 8], "little")
+    header, arrays = json.loads(data[len(MAGIC) + 8 : end]), data[end:-32]
+    said = header["lengths"]
     for lengths, rest in (
         (said, arrays[:-8]),
         (said, arrays + bytes(8)),
@@ -112,7 +113,8 @@ def test_restore_of_a_foreign_or_damaged_snapshot_raises(tmp_path):
         ([10**30, *said[1:]], arrays),
         ([*said[:3], float(said[3])], arrays),
     ):
-        body = pack_header(MAGIC, {**header, "lengths": lengths}) + rest
+        head = json.dumps({**header, "lengths": lengths}).encode()
+        body = MAGIC + len(head).to_bytes(8, "little") + head + rest
         path.write_bytes(body + hashlib.sha256(body).digest())
         with pytest.raises(lv.InputError, match=r"do not match its header|size has 9 entries"):
             sim.load(path)
