@@ -349,7 +349,10 @@ def residual_many(
         residuals.store_residual(i, residual(problem, impulse, precisions[i], threshold))
 
     residuals._process_worlds(
-        lambda hand: int(hand.judge_worlds(TOL, is_single_precision)), judge_single, threads, errors
+        lambda hand: int(hand.process_worlds(TOL, judges=True, narrow=is_single_precision)),
+        judge_single,
+        threads,
+        errors,
     )
     above_floor = residuals._get_column("above_floor")
     for i, precision in enumerate(precisions):  # For a list of problems, the compiled loop assumes float64.

@@ -219,7 +219,7 @@ class Solutions(WorldResults, Sequence[Solution]):
         problem = self.problems[i]
         judgement = judge_impulse(problem, impulse).refine(self.tol)
         is_start = self._worlds.code[i] in (CODE["late"], CODE["started"])
-        counts = None if is_start else self._get_counts(problem, i)
+        counts = None if is_start else tuple(self._worlds.counts[i].tolist())
         fields = compute_postponed_fields(problem, self._spec, judgement, counts, self.get_start(i), status)
         solved_relative = float(self._worlds.numbers[NUMBER["relative"], i])
         # If the data have not changed since the solve, both residuals are bit-identical.
@@ -230,11 +230,6 @@ class Solutions(WorldResults, Sequence[Solution]):
                 f"{judgement.relative:.2e}): the arrays of world {i} were written over after the solve"
             )
         return fields
-
-    def _get_counts(self, problem: Problem, i: int) -> tuple[int, ...]:
-        """Return the counts of the compiled loop for world i."""
-        counts = tuple(self._worlds.counts[i].tolist())
-        return counts if problem.generalized is None else counts[:4]
 
     def __repr__(self) -> str:
         return f"<Solutions of {len(self)} worlds by {self._spec.name}, {int(self._is_solved.sum())} to {self.tol:g}>"
@@ -316,16 +311,16 @@ def solve_many(
         spec.builtin and not options and max_iter is None and isinstance(tol, float) and 0.0 < tol < np.inf
     )
     small = spec.small if uses_loop else None
-    limits = (small.limits, small.rules) if small is not None else (None, None)
+    call = None if small is None else small.call
 
     def process_until_deferred(hand: Worker) -> int:
-        return int(hand.solve_worlds(tol, *limits, deadline))
+        return int(hand.process_worlds(tol, call, deadline))
 
     def solve_single(i: int) -> None:
         problem, start = worlds[i], solutions.get_start(i)
         if solutions._worlds.code[i] == CODE["tried"]:
             own = Deadline(deadline.get_remaining_seconds(MIN_TIME_LIMIT)) if deadline.is_set else None
-            counts = solutions._get_counts(problem, i)
+            counts = tuple(solutions._worlds.counts[i].tolist())
             arguments = check_arguments(spec, start, tol, max_iter, own, failed_call=counts)
             solution = Prepared(problem, spec, named, False)._solve(arguments, problem)
         else:

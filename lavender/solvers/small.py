@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.base.deadline import Deadline
 from lavender.judge.residuals import get_zero_impulse_reference, judge_impulse
 from lavender.judge.solution import Claim, SolverStage, Status, format_work_count, sum_work_counts
 from lavender.problem import Problem
@@ -25,9 +24,8 @@ from lavender.solvers.costs import RATES
 from lavender.solvers.decisions import DECISIONS, SMALL_ROWS
 from lavender.solvers.islands import find_islands
 from lavender.solvers.newton_systems import general
-from lavender_ext.batch.many import Limits, solve_new_generalized_problem
+from lavender_ext.batch.many import Call, Small
 from lavender_ext.newton.solve import MAX_ROWS_ALWAYS_DENSE
-from lavender_ext.small.call import Rules, Small
 
 # Key in `Derived.cache` of the problem's compiled call, a `Small`; its value is False if there is none.
 COMPILED_CALL_KEY = "lavender.solvers.small: compiled call"
@@ -48,7 +46,7 @@ NEWTON_MAX_STEPS, AUTO_MAX_STEPS = 1500.0, 1e6
 
 def make_limits(
     sweeps: float, max_cost: float = DECISIONS.call_cost, steps: float = NEWTON_MAX_STEPS, lanes: bool = False
-) -> Limits:
+) -> FloatArray:
     """Return the limits of compiled calls over generalised velocities: number of sweeps, cost [ns], Newton steps.
 
     `lanes`: contacts of the kind that lanes of vectors solve are solved by their method.
@@ -58,7 +56,7 @@ def make_limits(
     row_rates = RATES["velocity row"], RATES["velocity contact row"]
     rows = SMALL_ROWS, MAX_ROWS_ALWAYS_DENSE, DENSE_ROWS_PER_VELOCITY, VELOCITIES_OF_TWO_BODIES
     numbers = [*step, *row_rates, *sweep, general.MAX_MATRIX_ENTRIES, max_cost, *rows, steps, lanes]
-    return Limits(np.array(numbers))
+    return np.array(numbers)
 
 
 def get_small_call(problem: Problem) -> Any:
@@ -100,9 +98,9 @@ def describe_small_call(problem: Problem) -> str:
     """Describe the solver of the compiled call of `auto`; return an empty text if the call is not made."""
     if problem.generalized is not None:
         kernel = general.prepare_islands(problem)
-        if kernel is None or AUTO.limits is None:
+        if kernel is None:
             return ""
-        cost, max_cost = AUTO.limits.cost(problem.metric, kernel.work, kernel.islands)
+        cost, max_cost = AUTO.call.cost(problem.metric, kernel.work, kernel.islands)
         return f"newton on J and M, counted to take {1e-3 * cost:.3g} us" if cost <= max_cost else ""
     small = get_small_call(problem)
     if small is None:
@@ -118,46 +116,26 @@ class SmallCall:
     """The compiled call of a solver for small problems (`SolverSpec.small`)."""
 
     name: str  # Name of the solver.
-    limits: Limits | None  # Limits of the cost over generalised velocities; None if it does not accept them.
+    limits: (
+        FloatArray | None
+    )  # Limits of the cost over generalised velocities; None if it does not accept them.
     pivots: bool  # Whether the call accepts bounded rows.
     # Whether the call also accepts friction. It then returns a start that is already a solution, and replaces a start
     # that is worse than the zero impulse.
     hands_over: bool = False
-    rules: Rules = field(init=False)  # Options of the compiled call.
+    call: Call = field(init=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "rules", Rules(DECISIONS, self.pivots, self.hands_over))
+        call = Call(self.limits, DECISIONS, self.pivots, self.hands_over, get_small_call)
+        object.__setattr__(self, "call", call)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the name only, because `rules` and `limits` cannot be pickled; a copy is the call of that name."""
+        """Pickle the name only, because `call` cannot be pickled; a copy is the call of that name."""
         return _named_call, (self.name,)
 
     def cost_limit(self, problem: Problem, kernel: Any) -> float:
         """Return the largest accepted cost [ns] of the call over J and M; 0 if the call is never made."""
-        return 0.0 if self.limits is None else float(self.limits.cost(problem.metric, 0.0, kernel.islands)[1])
-
-    def solve_and_judge(
-        self, problem: Problem, impulse: FloatArray | None, tol: float, deadline: Deadline | None = None
-    ) -> tuple[Any, Any]:
-        """Solve from an impulse (m,) [N s] or from the zero impulse; at `deadline`, end with the iterate so far.
-
-        Return (judged result, work counts). The result is None if the call did not converge; the counts are () if no
-        call was made.
-        """
-        view = problem.derived.view
-        if not tol > 0.0 or not (view.n_rows if view is not None else len(problem.b)):
-            return None, ()
-        result: tuple[Any, Any]
-        if view is not None:
-            result = solve_new_generalized_problem(view, impulse, tol, self.limits, deadline)
-            return result
-        small = problem.derived.cache.get(COMPILED_CALL_KEY)
-        if small is None and (problem.m <= SMALL_ROWS or self.hands_over):
-            small = get_small_call(problem)
-        if not small:
-            return None, ()
-        result = small.run(impulse, tol, self.rules, deadline)
-        return result
+        return 0.0 if self.limits is None else float(self.call.cost(problem.metric, 0.0, kernel.islands)[1])
 
     def list_claims_of_failed_call(
         self, problem: Problem, counts: tuple[int, ...] | None
@@ -265,9 +243,7 @@ NEWTON = SmallCall("newton", make_limits(inf), False)
 
 def estimate_velocity_newton_cost(problem: Problem, work: float) -> float:
     """Estimate the cost [ns] of Newton's method over velocities, with `work` multiply-adds to factorise all islands."""
-    limits = NEWTON.limits
-    assert limits is not None
-    return float(limits.cost(problem.metric, work, 1)[0])
+    return float(NEWTON.call.cost(problem.metric, work, 1)[0])
 
 
 def _named_call(name: str) -> SmallCall:

@@ -126,7 +126,7 @@ class Auto(Solver):
         if may_call and (first is not None or fits_in_time(problem, deadline)):
             # The impulse of sweeps is returned if the call does not end.
             own = deadline if first is not None else choose_call_deadline(problem, deadline)
-            result, counts = AUTO.solve_and_judge(problem, impulse, tol, own)
+            result, counts = AUTO.call.solve(problem, impulse, tol, own)
             if result is not None and result.relative <= tol:
                 claim = AUTO.make_claim(problem, counts, impulse, result.relative)
                 if claim.iterations <= max_iter:

@@ -16,8 +16,7 @@ from lavender.solvers.decisions import DECISIONS, SMALL_ROWS
 from lavender.solvers.registry import SolverSpec, get
 from lavender.solving.finish import FinishedRun, make_fields
 from lavender.solving.loop import select_best_impulse
-from lavender_ext.batch.many import solve_new_generalized_problem
-from lavender_ext.small.call import bind_types, solve_compiled
+from lavender_ext.batch.many import bind_types, solve_compiled
 
 NO_STAGE_MESSAGE = "the time limit was over before its turn: the start"
 
@@ -97,6 +96,6 @@ def compute_postponed_fields(
 bind_types(
     (
         Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, get_zero_impulse_reference,
-        solve_new_generalized_problem, name_start,
+        name_start,
     )
 )  # fmt: skip

@@ -1,6 +1,6 @@
 """`solve`: check the arguments, try the compiled call for small problems, else prepare a solver and run it.
 
-The last line replaces `solve` by a compiled function of `lavender_ext/small/call.pyx`, which tries the compiled call
+The last line replaces `solve` by a compiled function of `lavender_ext/batch/many.pyx`, which tries the compiled call
 for plain arguments itself, and calls the function below for all others.
 """
 
@@ -23,7 +23,7 @@ from lavender.solving.limits import check_time_limit, make_deadline
 from lavender.solving.loop import Callback
 from lavender.solving.prepared import Prepared, check_arguments
 from lavender.solving.velocity import accept_velocity, relative_tolerance
-from lavender_ext.small.call import make_solve
+from lavender_ext.batch.many import make_solve
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

@@ -1,8 +1,8 @@
-"""Python interface to batches: problems by J and M, by A or by bodies, converted, solved and judged by `task.pxd`.
+"""Python interface to compiled calls: one problem, or a batch of problems by J and M, by A or by bodies, by `task.pxd`.
 
-A world is one problem of a batch. `Worlds` holds the worlds and their results. Each `Worker` belongs to one thread and takes
-the next world, without the interpreter. A worker leaves some worlds to the caller, for the general solvers:
-these are called deferred.
+`Call` solves one problem for `lavender.solve`. A world is one problem of a batch. `Worlds` holds the worlds and their results.
+Each `Worker` belongs to one thread and takes the next world, without the interpreter. A worker leaves some worlds to the
+caller, for the general solvers: these are called deferred.
 """
 from cpython.exc cimport PyErr_CheckSignals
 from libc.stdint cimport int32_t, int64_t
@@ -14,16 +14,19 @@ cimport cython
 
 import numpy as np
 
-from lavender_ext.core.arrays cimport as_double_pointer, as_int_pointer, make_read_only, ndarray
+from lavender_ext.core.arrays cimport (C_CONTIGUOUS, DOUBLE, as_double_pointer, as_int_pointer, has_element_type, make_read_only,
+                                       ndarray)
 from lavender_ext.core.blocks cimport Blocks
-from lavender_ext.core.deadline cimport deadline_t, get_pointer, has_passed, reading_interval
+from lavender_ext.core.checks cimport make_instance
+from lavender_ext.core.deadline cimport deadline_t, get_pointer, has_passed, read_clock, reading_interval
 from lavender_ext.core.method cimport workspace_t
 from lavender_ext.core.problem cimport Data, bind_body_arrays, derived_t
 from lavender_ext.core.problem import LAWS
-from lavender_ext.small.call cimport N_COUNTS, Rules, small_rules_t, small_problem_t, judge_small_impulse
-from lavender_ext.batch.task cimport (copy_small_judgement, compute_missing_derived_numbers, judge_task, judge_zero_impulse_of_task,
-                                      judge_task_workspace_size, prepare_task_for_small_call,
-                                     solve_small_task, solve_task, task_t, task_workspaces_t)
+from lavender_ext.core.validate cimport all_finite
+from lavender_ext.small.call cimport derive_small_problem, judge_task, solve_small
+from lavender_ext.small.task cimport (N_CALL_WORKSPACES, N_COUNTS, RESULT_FAILED, RESULT_IS_START, WORK, count_task_scratch,
+                                      small_rules_t, task_t)
+from lavender_ext.batch.task cimport prepare_task, solve_generalized_task, solve_task
 from lavender_ext.small.limits cimport estimate_newton_cost_terms, limits_t, max_newton_cost, newton_cost_t
 from lavender_ext.host cimport grow_workspace_to, free_workspace
 from lavender_ext.batch.lanes cimport (LANE_IS_PLAIN, LANE_RHS, LANE_START_ENERGY, LANE_START_SPEED, LANE_STEPS,
@@ -34,7 +37,7 @@ from lavender_ext.batch.lanes cimport (LANE_IS_PLAIN, LANE_RHS, LANE_START_ENERG
 from lavender_ext.batch.world cimport (BAD, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, LATE, LEFT, MASS, MU, N_ARRAYS, PLACES, READY,
                                        AT_ROW, ROWS, SOFT, STARTED, TARGET, TRIED, VELOCITIES, VELOCITY, worker_scratch_t,
                                        convert_generalized_world, worlds_t)
-from lavender_ext.judge.measure cimport (count_judge_scratch, make_judged, relative_floor_of_score, relative_residual_of_score,
+from lavender_ext.judge.measure cimport (Judged, make_judged, relative_floor_of_score, relative_residual_of_score,
                                          residual_above_floor, set_zero_impulse)
 from lavender_ext.judge.rounding cimport float32_floor_of_score, compute_squared_float32_rounding
 from lavender_ext.judge.tally cimport compute_rhs_energy_norm
@@ -70,9 +73,15 @@ cdef ndarray new(Py_ssize_t n):
 
 
 cdef enum:
-    MAX_KEPT_NUMBERS = 1 << 16      # A workspace with more numbers is freed at the end of a call.
+    MAX_KEPT_NUMBERS = 1 << 16      # Workspaces are freed at the end of a call if one has more numbers.
     INTERRUPT_CHECK_WORLDS = 256    # worlds between two checks for Ctrl-C
     MAX_LANE_PAUSE = 31             # groups of worlds without lanes, where lanes cover none
+
+cdef enum:                      # workspaces of a worker, after those of a call
+    SLACK_ERROR = N_CALL_WORKSPACES
+    BY_ISLAND = N_CALL_WORKSPACES + 1
+    LANES = N_CALL_WORKSPACES + 2
+    N_WORKSPACES = N_CALL_WORKSPACES + 3
 
 
 cdef int set_task_from_problem(task_t* j, problem) except -1:
@@ -80,15 +89,19 @@ cdef int set_task_from_problem(task_t* j, problem) except -1:
     cdef Blocks blocks = problem.cones._blocks
     cdef Py_ssize_t m = blocks.at.n_rows
     rows, matrix = problem.rows, problem.matrix
-    j.p, j.has_derived, j.zero_residual[0], j.factored = blocks.at, False, -1.0, rows is not None
-    j.p.law, j.p.b = LAWS[problem.friction], as_double_pointer(problem.b, m)
-    if j.factored:
-        bind_body_arrays(&j.r, &j.p, (
+    memset(j, 0, sizeof(task_t))
+    j.zero_residual[0], j.v.p = -1.0, blocks.at
+    j.v.p.law, j.v.p.b = LAWS[problem.friction], as_double_pointer(problem.b, m)
+    if rows is not None:
+        j.v.r = &j.r
+        bind_body_arrays(&j.r, &j.v.p, (
             rows.jac, rows.joint_body, rows.normal, rows.tangent, rows.arm_a, rows.arm_b, rows.contact_body, rows.inv_mass,
             rows.inv_inertia, problem.compliance,
         ))
-    elif isinstance(matrix, ndarray):
-        j.dense, j.row = as_double_pointer(matrix, m * m), m
+        return 0
+    j.v.a = &j.a
+    if isinstance(matrix, ndarray):
+        j.dense = as_double_pointer(matrix, m * m)
     else:
         indptr, indices, data = problem._compressed
         j.a.indptr, j.a.indices = as_int_pointer(indptr, m + 1), as_int_pointer(indices, len(indices))
@@ -96,66 +109,100 @@ cdef int set_task_from_problem(task_t* j, problem) except -1:
     return 0
 
 
-cdef int set_task_from_data(task_t* j, Data p, start, double* lam, double* slack_error) except -1:
-    """Set up a task from the data `p`. It starts from `start` (m,) [N s], or from the zero impulse if `start` is None."""
-    j.p, j.g, j.a, j.r, j.general, j.factored = p.blocks, p.general, p.csr, p.rows, p.is_general, p.factored
-    j.has_derived = p.ready
-    j.made = p.derived
-    if not p.is_general:
+cdef void set_task_from_data(task_t* j, Data p):
+    """Set up a task from the data `p`, which must live as long as the task."""
+    memset(j, 0, sizeof(task_t))
+    j.v, j.g, j.made, j.has_derived = p.get_pointers(), p.general, p.derived, p.ready
+    if p.is_general:
+        j.v.g = &j.g
+    else:
         j.made.n_empty = <int32_t>len(p.empty)
     j.zero_residual[0], j.zero_residual[1], j.zero_residual[2] = p.reference_energy, p.reference_velocity, p.relative_at_zero
-    return set_task_start(j, start, lam, slack_error)
 
 
-cdef int set_task_start(task_t* j, start, double* lam, double* slack_error) except -1:
-    """Set the start of a task, (m,) [N s] or None for the zero impulse, and its output arrays; reset its result."""
-    cdef const double[::1] values
-    j.lam, j.slack_error = lam, slack_error
-    j.solved, j.is_late, j.cold, j.deadline, j.by_island = False, False, start is None, NULL, NULL
-    j.failed_in_lanes = False
+cdef int set_task_start(task_t* j, start, double* lam) except -1:
+    """Set the start of a task, (m,) [N s] or None for the zero impulse, in the array lam of its result."""
+    j.lam, j.cold = lam, start is None
     if not j.cold:
-        values = start
-        if values.shape[0] != j.p.n_rows:
-            raise ValueError(f"{values.shape[0]} numbers for {j.p.n_rows} rows")
-        if j.p.n_rows:
-            memcpy(lam, &values[0], j.p.n_rows * sizeof(double))
+        memcpy(lam, as_double_pointer(start, j.v.p.n_rows), j.v.p.n_rows * sizeof(double))
     return 0
-
-
-cdef make_task_result(task_t* j, Data p, impulse, both):
-    """Return (judged result or None, counters as of `Newton.run`)."""
-    judged = None
-    if j.solved or j.is_late:
-        judged = make_judged(p, impulse, both, &j.score, j.relative, j.floor, j.float64_relative)
-    return judged, (j.counts[0], j.counts[1], j.counts[2], j.counts[3])
 
 
 cdef void store_zero_residual(task_t* j, Data p):
     """Store the residual of the zero impulse that the task has computed in `p`, unless `p` has one."""
     if p.reference_energy < 0.0 and j.zero_residual[0] >= 0.0:
-        p.store_reference(j.p.islands, j.zero_residual)
+        p.store_reference(j.v.p.islands, j.zero_residual)
 
 
-cdef struct call_workspaces_t:      # of one call
-    workspace_t solve
-    workspace_t islands
+cdef void free_workspaces(workspace_t* workspaces, int32_t n) noexcept nogil:
+    cdef int32_t i
+    for i in range(n):
+        free_workspace(&workspaces[i])
 
 
-cdef void free_call_workspaces(call_workspaces_t* r) noexcept nogil:
-    free_workspace(&r.solve)
-    free_workspace(&r.islands)
+cdef class Small:
+    """Problem with few rows over A or bodies, or with small islands. A call only reads it.
 
+    Parameters
+    ----------
+    data : Data
+        Problem for the judge. It must hold the residual of the zero impulse.
+    over : Data
+        Problem to solve; for bounded rows A in compressed rows.
+    by_island : bool
+        Whether to solve the islands one by one, which the judge has labelled; there are several, with friction.
+    """
 
-cdef class Limits:
-    """Cost limits, from the fields of a `limits_t` as an array (18,), and the workspaces of calls that have ended."""
-    cdef limits_t at
-    cdef call_workspaces_t kept
+    cdef Data data, over
+    cdef task_t at
+    cdef workspace_t workspace
 
-    def __init__(self, const double[::1] numbers):
-        self.at = (<const limits_t*>&numbers[0])[0]
+    def __init__(self, Data data, Data over, bint by_island=False):
+        self.data, self.over = data, over
+        set_task_from_data(&self.at, data)
+        self.at.over, self.at.solves_islands = over.get_pointers(), by_island
+        if not derive_small_problem(&self.at, &self.workspace):
+            raise MemoryError(f"{data.blocks.n_rows} rows")
 
     def __dealloc__(self):
-        free_call_workspaces(&self.kept)
+        free_workspace(&self.workspace)
+
+
+cdef struct call_workspaces_t:
+    workspace_t at[N_CALL_WORKSPACES]
+
+
+cdef class Call:
+    """Compiled call of a solver: its settings, and the workspaces of calls that have ended.
+
+    Parameters
+    ----------
+    limits : (18,) or None
+        Fields of a `limits_t` for problems of J and M; None if it does not accept them.
+    decisions
+        `DECISIONS` of lavender/solvers/decisions.py.
+    pivots, follows : bool
+        As in `small_rules_t`.
+    get_small_call : callable
+        Returns the `Small` of a problem of A or bodies, or None.
+    """
+
+    cdef limits_t limits
+    cdef small_rules_t rules
+    cdef readonly bint has_limits
+    cdef object get_small_call
+    cdef call_workspaces_t kept
+
+    def __init__(self, limits, decisions, bint pivots, bint follows, get_small_call):
+        self.has_limits, self.get_small_call = limits is not None, get_small_call
+        if self.has_limits:
+            self.limits = (<limits_t*>as_double_pointer(limits, sizeof(limits_t) // sizeof(double)))[0]
+        self.rules = small_rules_t(decisions.small_rows, decisions.call_sweeps, decisions.call_island_rows,
+                                   decisions.call_factorisations, decisions.call_extrapolation, decisions.warm_residual, pivots,
+                                   follows)
+
+    def __dealloc__(self):
+        free_workspaces(self.kept.at, N_CALL_WORKSPACES)
 
     cdef void exchange_kept_workspaces(self, call_workspaces_t* r) noexcept:
         """Exchange workspaces with the kept ones, so that no two calls of different threads use the same."""
@@ -165,40 +212,165 @@ cdef class Limits:
     def cost(self, Data p, double work, int islands):
         """Return the estimated and permitted cost [ns] of Newton's method; `work`: multiply-adds to factorise every island."""
         cdef bint soft = needs_no_proximal_terms(&p.blocks, &p.general)
-        cdef newton_cost_t cost = estimate_newton_cost_terms(&p.blocks, &p.general, &self.at)
+        cdef newton_cost_t cost = estimate_newton_cost_terms(&p.blocks, &p.general, &self.limits)
         return (cost.fixed + cost.per_work * work,
-                max_newton_cost(&p.blocks, &p.general, &self.at, islands, soft))
+                max_newton_cost(&p.blocks, &p.general, &self.limits, islands, soft))
+
+    def solve(self, problem, start, double tol, deadline=None):
+        """Solve and judge a problem from `start` (m,) [N s], or from the zero impulse if it is None.
+
+        Returns (judged result, counters). The result is None if it is above tol, if an empty row violates its target, or if the
+        estimated cost exceeds the limits; at the deadline it is the present iterate. The counters are () if no call was made,
+        None if `start` is the solution, and zero if nothing was run. Over J and M, d, Y and the residual of the zero impulse
+        are stored in the problem's data.
+        """
+        cdef task_t j
+        cdef call_workspaces_t r
+        cdef Small small = None
+        cdef Data p = problem.derived.view
+        cdef Py_ssize_t i, m = p.blocks.n_rows if p is not None else len(problem.b)
+        cdef bint had_derived
+        cdef int32_t code = RESULT_FAILED
+        cdef ndarray impulse, results
+        if not tol > 0.0 or not m:
+            return None, ()
+        if p is not None:
+            set_task_from_data(&j, p)
+        else:
+            small = self.get_small_call(problem)
+            if small is None:
+                return None, ()
+            p, j = small.data, small.at
+        impulse, results, had_derived = make_read_only(new(m)), new(2 * m + 1), p.ready
+        set_task_start(&j, start, <double*>impulse.data)
+        j.slack_error, j.tol, j.deadline = <double*>results.data, tol, get_pointer(deadline)
+        memset(&r, 0, sizeof(r))
+        self.exchange_kept_workspaces(&r)
+        try:
+            with nogil:
+                if j.v.g == NULL:
+                    code = solve_small(&j, &self.rules, r.at)
+                elif prepare_task(&j, r.at):
+                    code = solve_generalized_task(&j, r.at, &self.limits)
+            if p.is_general:
+                if not had_derived and j.has_derived:
+                    p.adopt_derived(&j.made)
+                elif not had_derived:
+                    free(j.made.marks)
+                    free(j.made.numbers)
+                store_zero_residual(&j, p)                 # The workspaces hold its islands.
+        finally:
+            for i in range(N_CALL_WORKSPACES):
+                if max(r.at[i].n_index, r.at[i].n_real) > MAX_KEPT_NUMBERS:
+                    break
+            else:
+                self.exchange_kept_workspaces(&r)
+            free_workspaces(r.at, N_CALL_WORKSPACES)
+        judged = None
+        if code != RESULT_FAILED:
+            judged = make_judged(p, impulse, results, &j.score, j.relative, j.floor, j.float64_relative)
+        if code == RESULT_IS_START:
+            return judged, None
+        return judged, (j.counts[0], j.counts[1], j.counts[2], j.counts[3], j.counts[4], j.counts[5], j.counts[6], j.counts[7])
 
 
-def solve_new_generalized_problem(Data p, start, double tol, Limits limits, deadline=None):
-    """Set up, solve and judge a problem of J and M with at least one row and without derived data, in one call.
+# [s] A limit of at least this does not end the call of few rows, which `solve_general` may repeat if the call fails.
+cdef double MIN_LONG_LIMIT = 0.1
+cdef tuple NO_CALL = (None, None, None, None), LAWS_OF_ROWS = ("linear", "lcp")
+cdef object Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, get_zero_impulse_reference
+cdef object name_start
 
-    Returns (judged result, counters). None is returned if it is above tol, if an empty row violates its target, or if the
-    estimated cost exceeds the limits. The counters are zero if nothing was run. At the deadline the present iterate is
-    returned. d, Y and the residual of the zero impulse are stored in the data.
+
+def bind_types(types):
+    """Set the classes and functions that `solve_compiled` needs; this package does not import them."""
+    global Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, get_zero_impulse_reference
+    global name_start
+    (Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, get_zero_impulse_reference, name_start) = types
+
+
+cdef bint is_plain_start(impulse, Py_ssize_t m) noexcept:
+    """Return whether a start is a contiguous array (m,) of finite numbers, which needs no conversion."""
+    if type(impulse) is not ndarray:
+        return False
+    cdef ndarray x = <ndarray>impulse
+    return (x.nd == 1 and x.dimensions[0] == m and x.flags & C_CONTIGUOUS and has_element_type(x, DOUBLE)
+            and all_finite(<const double*>x.data, m))
+
+
+def solve_compiled(problem, spec, impulse, tol, deadline=None):
+    """Solve and judge a problem by the compiled call of a solver, unless the call does not accept the problem.
+
+    Parameters
+    ----------
+    problem : Problem
+    spec : SolverSpec
+    impulse : (m,) N s, or None
+    tol : float, -
+    deadline : Deadline, optional
+        Time at which the call ends with the iterate so far.
+
+    Returns
+    -------
+    tuple
+        Solution, or None if there is no result within tol; judged result or None; work counts, None if no call was made or
+        the start is the result; start (m,) of the call or None.
     """
-    cdef task_t j
-    cdef call_workspaces_t r
-    cdef Py_ssize_t m = p.blocks.n_rows
-    cdef bint had_derived = p.ready
-    impulse, results = make_read_only(new(m)), new(2 * m + 1)
-    set_task_from_data(&j, p, start, <double*>(<ndarray>impulse).data, <double*>(<ndarray>results).data)
-    j.deadline = get_pointer(deadline)
-    memset(&r, 0, sizeof(r))
-    limits.exchange_kept_workspaces(&r)
-    with nogil:
-        r.solve.is_bound = r.solve.tries = 0
-        solve_task(&j, &r.solve, &r.islands, &limits.at, tol)
-    if not had_derived and j.has_derived:
-        p.adopt_derived(&j.made)
-    elif not had_derived:
-        free(j.made.marks)
-        free(j.made.numbers)
-    store_zero_residual(&j, p)
-    if max(r.solve.n_real, r.solve.n_index, r.islands.n_real, r.islands.n_index) <= MAX_KEPT_NUMBERS:
-        limits.exchange_kept_workspaces(&r)
-    free_call_workspaces(&r)
-    return make_task_result(&j, p, impulse, results)
+    cdef Call call
+    solution, view = None, problem.derived.view
+    if spec.small is None or not spec.builtin or not isinstance(tol, float) or not 0.0 < <double>tol < INFINITY:
+        return NO_CALL
+    call = spec.small.call
+    if view is not None:
+        if not call.has_limits or (<Data>view).has_ellipse:
+            return NO_CALL
+    elif (not (call.rules.pivots if problem.law in LAWS_OF_ROWS else call.rules.follows) or problem.has_singular_program
+            or len(problem.b) > call.rules.small_rows or (<Blocks>problem.cones._blocks).has_ellipse):
+        # Islands of larger problems may take long, so `Prepared` solves them between checks of the clock.
+        return NO_CALL
+    began, first = read_clock(), impulse
+    if impulse is None:
+        first = problem.guess
+    elif not is_plain_start(impulse, len(problem.b)):
+        first = problem.make_start(impulse)
+    judged, counts = call.solve(problem, first, tol, deadline)
+    if judged is None and counts and view is not None and (<Data>view).reference_energy < 0.0:
+        get_zero_impulse_reference(problem)             # The reference of a row needs v*.
+        judged, counts = call.solve(problem, first, tol, deadline)
+    if judged is not None and (<Judged>judged).relative <= <double>tol and (<Judged>judged).roundoff_floor <= <double>tol:
+        kept = first if first is None or impulse is None else first.copy()      # The caller may change the array later.
+        fields = {
+            "impulse": (<Judged>judged).impulse, "status": CONVERGED, "tol": tol, "setup_time": 0.0,
+            "solve_time": read_clock() - began, "_late_residual": (make_residual, (problem, judged)),
+            "_rest": (compute_postponed_fields, (problem, spec, judged, counts, kept, CONVERGED)),
+        }
+        if first is not None:
+            fields["start"] = name_start(problem.guess, impulse)
+        solution = make_instance(Solution, fields)
+    return solution, judged, counts, first
+
+
+def make_solve(solve_general, solve_after_call, dict registered):
+    """Return `lavender.solve`: the compiled call if all arguments have their defaults, otherwise `solve_general`.
+
+    `solve_after_call` solves a problem that the call did not solve.
+    """
+    def solve(problem, solver="auto", *surplus, impulse=None, tol=1e-6, velocity_tol=None, max_iter=None, time_limit=None,
+              history=False, callback=None, **options):
+        if (velocity_tol is None and max_iter is None and callback is None and history is False and not options
+                and not surplus and type(problem) is Problem and type(tol) is float and type(solver) is str):
+            spec = registered.get(solver)
+            if time_limit is None and spec is not None:
+                solution, _, counts, _ = solve_compiled(problem, spec, impulse, tol)
+                return solution if solution is not None else solve_after_call(problem, spec, impulse, tol, counts)
+            if spec is not None and type(time_limit) is float and time_limit >= MIN_LONG_LIMIT and spec.small is not None \
+                    and len(problem.b) <= (<Call>spec.small.call).rules.small_rows:
+                solution = solve_compiled(problem, spec, impulse, tol)[0]
+                if solution is not None:
+                    return solution
+        return solve_general(problem, solver, *surplus, impulse=impulse, tol=tol, velocity_tol=velocity_tol, max_iter=max_iter,
+                             time_limit=time_limit, history=history, callback=callback, **options)
+
+    return solve
 
 
 cdef enum:                      # rows of `Worlds.numbers`: results of each world
@@ -260,13 +432,9 @@ def list_problem_data(list problems, kind):
 
 
 cdef struct worker_t:             # memory of one thread
-    workspace_t workspace
-    workspace_t slack_error
+    workspace_t at[N_WORKSPACES]
     derived_t made
     worker_scratch_t scratch
-    task_workspaces_t small
-    workspace_t by_island
-    workspace_t lanes
     int64_t begin, next, end        # taken places of the order; those from `next` on are not processed
     int64_t group[MAX_LANES]        # worlds at these places; -1: none
     int32_t failed                  # bit k: lanes have not solved world k of the group
@@ -382,11 +550,13 @@ cdef class Worlds:
         self.references += [problems, data]
         for i in range(self.w.n):
             p, j = data[i], &self.tasks[i]
+            if p is None:
+                continue
             if p is True:
                 set_task_from_problem(j, problems[i])
-                set_task_start(j, starts[i], self.lam + self.w.at[i * PLACES + AT_ROW], NULL)
-            elif p is not None:
-                set_task_from_data(j, p, starts[i], self.lam + self.w.at[i * PLACES + AT_ROW], NULL)
+            else:
+                set_task_from_data(j, p)
+            set_task_start(j, starts[i], self.lam + self.w.at[i * PLACES + AT_ROW])
 
     def store_zero_residuals(self, data):
         """Store the residuals of the zero impulse in the data of solved problems."""
@@ -395,30 +565,28 @@ cdef class Worlds:
             if self.code_at[i] == READY and data[i] is not True:
                 store_zero_residual(&self.tasks[i], data[i])
 
-    cdef bint is_general(self, int64_t i) noexcept nogil:
-        return self.tasks == NULL or self.tasks[i].general
-
-    cdef int32_t convert_world(self, int64_t i, worker_scratch_t* scratch, workspace_t* slack_error, const derived_t* made,
-                               task_t* j) noexcept nogil:
+    cdef int32_t convert_world(self, int64_t i, worker_t* h, task_t* j) noexcept nogil:
         """Convert world i for a solve or for the judge; return READY, BAD or LEFT."""
-        cdef const int64_t* at = self.w.at + i * PLACES
         cdef int32_t code = READY
         if self.tasks != NULL:
             j[0] = self.tasks[i]
-            if j.p.n_rows == 0:
+            if j.v.p.n_rows == 0:
                 return LEFT
+            if j.v.g != NULL:
+                j.v.g = &j.g
+            elif not j.has_derived and j.v.a != NULL:
+                j.v.a = &j.a
+            elif not j.has_derived:
+                j.v.r = &j.r
         else:
-            j.general, j.factored = True, False
-            code = convert_generalized_world(&self.w, i, scratch, &j.p, &j.g)
-            j.zero_residual[0] = -1.0
-            j.by_island = NULL
-            j.solved, j.is_late, j.cold, j.has_derived, j.lam = False, False, self.cold, False, self.lam + at[AT_ROW]
-        if not j.has_derived and j.general:
-            j.made = made[0]
-        j.deadline = NULL
-        if not grow_workspace_to(slack_error, 0, 2 * at[ROWS] + 1):
+            memset(j, 0, sizeof(task_t))
+            code = convert_generalized_world(&self.w, i, &h.scratch, &j.v.p, &j.g)
+            j.v.g, j.zero_residual[0], j.cold, j.lam = &j.g, -1.0, self.cold, self.lam + self.w.at[i * PLACES + AT_ROW]
+        if not j.has_derived and j.v.g != NULL:
+            j.made = h.made
+        if not grow_workspace_to(&h.at[SLACK_ERROR], 0, 2 * <int64_t>j.v.p.n_rows + 1):
             return LEFT
-        j.slack_error = slack_error.real
+        j.slack_error = h.at[SLACK_ERROR].real
         return code
 
     cdef void store_result(self, int64_t i, const task_t* j, const worker_scratch_t* scratch) noexcept nogil:
@@ -426,7 +594,7 @@ cdef class Worlds:
         cdef const int64_t* at = self.w.at + i * PLACES
         cdef double* v
         cdef int32_t k
-        self.store_judgement(i, j, j.slack_error[j.p.n_rows + j.score.worst] if j.score.worst >= 0 else 0.0)
+        self.store_judgement(i, j, j.slack_error[j.v.p.n_rows + j.score.worst] if j.score.worst >= 0 else 0.0)
         if self.tasks == NULL:
             v = self.v + at[VELOCITY]
             for k in range(at[VELOCITIES]):
@@ -447,7 +615,7 @@ cdef class Worlds:
 
     cdef int32_t process_in_lanes(self, const int64_t* worlds, int32_t n_worlds, worker_t* h, double tol,
                                   bint judges) noexcept nogil:
-        """Judge or solve worlds (n_worlds) in lanes as `judge_world` and `solve_world` do; return their number, -1 without lanes.
+        """Judge or solve worlds (n_worlds) in lanes as `process_world` does; return their number, -1 without lanes.
 
         The code of worlds that no lane covers or solves stays LEFT. Half a group takes as long alone as in lanes.
         """
@@ -468,9 +636,9 @@ cdef class Worlds:
         at = self.w.at + worlds[0] * PLACES
         x.m, x.n, x.law, x.k = <int32_t>at[ROWS], <int32_t>at[VELOCITIES], self.w.blocks.law, <int32_t>at[BLOCKS]
         x.asymmetry = self.w.asymmetry if self.w.mass_ptr == NULL else -1.0
-        if not grow_workspace_to(&h.lanes, 0, bind_lanes(&x, width, NULL)):
+        if not grow_workspace_to(&h.at[LANES], 0, bind_lanes(&x, width, NULL)):
             return -1
-        bind_lanes(&x, width, h.lanes.real)
+        bind_lanes(&x, width, h.at[LANES].real)
         list_lane_blocks(&self.w.blocks, <int32_t>at[BLOCK], &x, ptr, kind)
         load_lanes(&x, &self.w, self.lam, worlds, n_worlds, width)
         prepare_lanes(&x, width)
@@ -509,92 +677,61 @@ cdef class Worlds:
             done += 1
         return done
 
-    cdef int32_t store_empty_world(self, int64_t i, const worker_scratch_t* scratch) noexcept nogil:
-        """Store the velocity v+ after the step of a world without rows, which is v*."""
-        memcpy(self.v + self.w.at[i * PLACES + VELOCITY], scratch.free,
-               self.w.at[i * PLACES + VELOCITIES] * sizeof(double))
-        return READY
+    cdef int32_t process_world(self, int64_t i, worker_t* h, double tol, const limits_t* limits, const small_rules_t* rules,
+                               deadline_t* deadline, bint judges, bint narrow) noexcept nogil:
+        """Solve world i, or judge its start, store its result and return its status. Only a solve accepts empty rows.
 
-    cdef int32_t solve_world(self, int64_t i, worker_t* h, const limits_t* limits, const small_rules_t* rules, double tol,
-                             deadline_t* deadline) noexcept nogil:
-        """Solve world i, store its result and return its status."""
+        narrow: judge with the round-off floor of float32.
+        """
         cdef task_t j
-        cdef int32_t k, code = LEFT
+        cdef int32_t k, code
         cdef bint had_derived
-        if limits == NULL if self.is_general(i) else rules == NULL:
+        if not judges and (limits == NULL if self.tasks == NULL or self.tasks[i].v.g != NULL else rules == NULL):
             return LEFT
-        code = self.convert_world(i, &h.scratch, &h.slack_error, &h.made, &j)
+        code = self.convert_world(i, h, &j)
         if code != READY:
             return code
-        if j.p.n_rows == 0:
-            return self.store_empty_world(i, &h.scratch)
+        if j.v.p.n_rows == 0:                           # v+ = v*
+            memcpy(self.v + self.w.at[i * PLACES + VELOCITY], h.scratch.free, self.w.at[i * PLACES + VELOCITIES] * sizeof(double))
+            return READY
         had_derived, j.deadline = j.has_derived, deadline
-        j.failed_in_lanes = h.failed >> (h.next - 1 - h.begin) & 1
-        if j.general:
-            solve_task(&j, &h.workspace, &h.small.islands, limits, tol)
-            if not had_derived:
-                h.made = j.made                         # The next world reuses the memory of `made`.
-            # Without a reference no solver has run; the single call computes it.
-            code = READY if j.solved else TRIED if j.zero_residual[0] >= 0.0 else LEFT
-        else:
-            code = solve_small_task(&j, &h.small, rules, tol)
+        j.tol, j.failed_in_lanes = tol, h.failed >> (h.next - 1 - h.begin) & 1
+        code = self.judge_start(i, h, &j, narrow) if judges else solve_task(&j, h.at, limits, rules)
+        if j.v.g != NULL and not had_derived:
+            h.made = j.made                             # The next world reuses the memory of `made`.
         if code == READY or code == STARTED:
             self.store_result(i, &j, &h.scratch)
+        if judges:
+            return code
         if code != LEFT:
             memcpy(&self.count[N_COUNTS * i], j.counts, sizeof(j.counts))
-        if self.tasks != NULL and j.p.islands == NULL:   # the next world reuses the memory of islands
+        if self.tasks != NULL and j.v.p.islands == NULL:    # The next world reuses the memory of islands.
             for k in range(3):
                 self.tasks[i].zero_residual[k] = j.zero_residual[k]
         return code
 
-    cdef int32_t judge_world(self, int64_t i, worker_t* h, double tol, bint narrow) noexcept nogil:
-        """Judge world i without solving, refined for `tol`, and return its status; worlds with empty rows are deferred.
-
-        narrow: with the round-off floor of float32.
-        """
-        cdef task_t j
-        cdef small_problem_t s
-        cdef int32_t k, code = self.convert_world(i, &h.scratch, &h.slack_error, &h.made, &j), m = j.p.n_rows
-        cdef bint had_derived = j.has_derived
+    cdef int32_t judge_start(self, int64_t i, worker_t* h, task_t* j, bint narrow) noexcept nogil:
+        """Judge the start of world i, refined for tol; return READY or LEFT."""
+        cdef int32_t k, m = j.v.p.n_rows
         cdef double* x
-        if code != READY:
-            return code
-        if m == 0:
-            return self.store_empty_world(i, &h.scratch)
-        code = LEFT
-        if not j.general:
-            if narrow or not prepare_task_for_small_call(&j, &s, &h.small):
-                return LEFT
-            if not grow_workspace_to(&h.small.call.work, 0, count_judge_scratch(&s.v)):
-                return LEFT
-            if j.cold:
-                set_zero_impulse(&j.p, j.lam, j.slack_error)
-            code = READY
-            judge_small_impulse(&s, j.lam, j.slack_error, h.small.call.work.real)
-            copy_small_judgement(&j, &s)
-            j.push = h.small.call.work.real
-        elif (compute_missing_derived_numbers(&j) and j.made.n_empty == 0
-              and grow_workspace_to(&h.workspace, 0, max(judge_task_workspace_size(&j), 4 * <int64_t>m + 5 * j.g.n))
-              and grow_workspace_to(&h.by_island, 0, 2 * <int64_t>j.p.n_blocks)
-              and judge_zero_impulse_of_task(&j, &h.small.islands, h.workspace.real)):
-            code, x = READY, h.workspace.real
-            if j.cold:
-                set_zero_impulse(&j.p, j.lam, j.slack_error)
-            j.by_island = h.by_island.real
-            judge_task(&j, tol, x)
-            if narrow:
-                x += j.g.n                              # after M^-1 J^T lam
-                compute_squared_float32_rounding(&j.p, &j.g, &h.scratch.mass, h.scratch.free, j.lam, x, x + m, x + 2 * m, x + 3 * m)
-                for k in range(m):
-                    x[k] = x[k] + x[m + k] + x[2 * m + k]
-                j.floor = float32_floor_of_score(&j.p, x, &j.score, j.relative, j.zero_residual[0], j.zero_residual[1],
-                                                 &j.above_floor)
-        if code == READY:
-            self.store_result(i, &j, &h.scratch)
-            self.number[RHS_ENERGY * (self.w.n + 1) + i] = compute_rhs_energy_norm(&j.p)
-        if j.general and not had_derived:
-            h.made = j.made
-        return code
+        if (narrow and j.v.g == NULL or not prepare_task(j, h.at) or j.made.n_empty
+                or not grow_workspace_to(&h.at[WORK], 0, max(count_task_scratch(j), 4 * <int64_t>m + 5 * j.g.n))
+                or not grow_workspace_to(&h.at[BY_ISLAND], 0, 2 * <int64_t>j.v.p.n_blocks)):
+            return LEFT
+        x = h.at[WORK].real
+        if j.cold:
+            set_zero_impulse(&j.v.p, j.lam, j.slack_error)
+        j.by_island = h.at[BY_ISLAND].real
+        judge_task(j, x)
+        if narrow:
+            x += j.g.n                                  # after M^-1 J^T lam
+            compute_squared_float32_rounding(&j.v.p, &j.g, &h.scratch.mass, h.scratch.free, j.lam, x, x + m, x + 2 * m, x + 3 * m)
+            for k in range(m):
+                x[k] = x[k] + x[m + k] + x[2 * m + k]
+            j.floor = float32_floor_of_score(&j.v.p, x, &j.score, j.relative, j.zero_residual[0], j.zero_residual[1],
+                                             &j.above_floor)
+        self.number[RHS_ENERGY * (self.w.n + 1) + i] = compute_rhs_energy_norm(&j.v.p)
+        return READY
 
     def __dealloc__(self):
         free(self.tasks)
@@ -615,52 +752,33 @@ cdef class Worker:
         self.worlds, self.stop, self.h.scratch.n_tree = worlds, stop, -1
 
     def __dealloc__(self):
-        free_workspace(&self.h.workspace)
-        free_workspace(&self.h.slack_error)
+        free_workspaces(self.h.at, N_WORKSPACES)
         free_workspace(&self.h.scratch.workspace)
         free_workspace(&self.h.scratch.tree)
-        free_workspace(&self.h.by_island)
-        free_workspace(&self.h.lanes)
-        free_workspace(&self.h.small.islands)
-        free_workspace(&self.h.small.made)
-        free_workspace(&self.h.small.formed)
-        free_workspace(&self.h.small.bound)
-        free_workspace(&self.h.small.call.work)
-        free_workspace(&self.h.small.call.more)
         free(self.h.made.marks)
         free(self.h.made.numbers)
 
-    def solve_worlds(self, double tol, Limits limits, Rules rules, deadline=None):
-        """Solve worlds until one is deferred and return its index, or DONE_ALL if there are no more.
+    cpdef int64_t process_worlds(self, double tol, Call call=None, deadline=None, bint judges=False, bint narrow=False) except? -3:
+        """Solve worlds, or judge their impulses, until one is deferred; return its index, or DONE_ALL if there are no more.
 
-        Without limits all worlds of J and M are deferred, without rules all others. At the deadline the present iterate of a
-        world is its result, and the starts of the worlds after it are judged.
+        Without a call all worlds are deferred, and without its limits all worlds of J and M. At the deadline the present
+        iterate of a world is its result, and the starts of the worlds after it are judged. narrow: judge with the round-off
+        floor of float32.
         """
-        return self.process_worlds(tol, limits, rules, deadline, False, False)
-
-    def judge_worlds(self, double tol, bint narrow):
-        """Judge the impulses of worlds until one is deferred, and return its index, or DONE_ALL if there are no more.
-
-        narrow: use the round-off floor of float32.
-        """
-        return self.process_worlds(tol, None, None, None, True, narrow)
-
-    cdef int64_t process_worlds(self, double tol, Limits limits, Rules rules, deadline, bint judges, bint narrow) except? -3:
-        """Solve worlds, or judge them, until one is deferred."""
         cdef Worlds w = self.worlds
-        cdef const limits_t* at = &limits.at if limits is not None else NULL
-        cdef const small_rules_t* small_rules = &rules.at if rules is not None else NULL
+        cdef const limits_t* limits = &call.limits if call is not None and call.has_limits else NULL
+        cdef const small_rules_t* rules = &call.rules if call is not None else NULL
         cdef const int64_t* order = NULL
         cdef int64_t i, n = w.w.n
         cdef int32_t code, n_group, n_done = 0
-        cdef bint uses_lanes = not narrow
+        cdef bint is_late, uses_lanes = not narrow
         cdef deadline_t own                             # Other threads read the clock for themselves.
         cdef deadline_t* until = get_pointer(deadline)
         if until != NULL:
             own = until[0]
             until = &own
         if not judges:
-            uses_lanes = at != NULL and at.lanes != 0.0 and w.cold
+            uses_lanes = limits != NULL and limits.lanes != 0.0 and w.cold
         if uses_lanes and w.width > 1 and until == NULL:        # With a limit of time, worlds are solved in their own order.
             order, n = w.order_at, len(w.order)
         with nogil:
@@ -688,14 +806,11 @@ cdef class Worker:
                     continue
                 if w.code_at[i] == READY:               # A lane has processed this world.
                     code = READY
-                elif has_passed(until, reading_interval()):
-                    code = w.judge_world(i, &self.h, tol, narrow)
-                    if code == READY:
-                        code = LATE
-                elif judges:
-                    code = w.judge_world(i, &self.h, tol, narrow)
                 else:
-                    code = w.solve_world(i, &self.h, at, small_rules, tol, until)
+                    is_late = has_passed(until, reading_interval())
+                    code = w.process_world(i, &self.h, tol, limits, rules, until, judges or is_late, narrow)
+                    if is_late and code == READY:
+                        code = LATE
                 w.code_at[i] = <signed char>code
                 if code == LEFT or code == TRIED:
                     return i

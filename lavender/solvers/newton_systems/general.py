@@ -63,6 +63,6 @@ def run_newton_steps(
 
 def make_claim(status: Status, counts: Any) -> Claim:
     """Return the claim for counts of (steps, factorisations, Coulomb rounds, line evaluations)."""
-    done, *parts = counts
+    done, *parts = counts[:4]
     work = {kind: n for kind, n in zip(_WORK_KINDS, parts, strict=True) if n or kind == _WORK_KINDS[0]}
     return Claim(status, done, work, form=FORM)

@@ -43,14 +43,14 @@ def test_ctrl_c_during_solve_many_starts_no_more_problems(solver, monkeypatch):
         def __init__(self, worlds, stop):
             self.hand, self.stop = hand(worlds, stop), stop
 
-        def solve_worlds(self, *args):
+        def process_worlds(self, *args):
             if solver == "pgs":
-                return self.hand.solve_worlds(*args)
+                return self.hand.process_worlds(*args)
             interrupt()
             end = time.monotonic() + 60.0  # A signal that was lost fails the test instead of stopping all tests.
             while not self.stop[0] and time.monotonic() < end:
                 time.sleep(1e-3)
-            return self.hand.solve_worlds(*args)
+            return self.hand.process_worlds(*args)
 
     monkeypatch.setattr(many, "solve", slow)
     monkeypatch.setattr(loop, "Worker", SlowWorker)
