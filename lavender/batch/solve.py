@@ -300,7 +300,7 @@ def solve_many(
         velocity_tol = check_velocity_tolerance(velocity_tol, tol)
         tol = _compute_tolerance_for_velocity_error(worlds, velocity_tol)
     deadline = NEVER if limit == np.inf else Deadline(limit)
-    check_arguments(spec, None, tol, max_iter)
+    check_arguments(spec, tol, max_iter)
     starts, invalid_starts = _convert_starts(worlds, impulse, impulses, errors)
     named = cast("dict[str, Any]", options)
     solutions = Solutions(worlds, starts, tol, spec, like)
@@ -321,8 +321,8 @@ def solve_many(
         if solutions._worlds.code[i] == CODE["tried"]:
             own = Deadline(deadline.get_remaining_seconds(MIN_TIME_LIMIT)) if deadline.is_set else None
             counts = tuple(solutions._worlds.counts[i].tolist())
-            arguments = check_arguments(spec, start, tol, max_iter, own, failed_call=counts)
-            solution = Prepared(problem, spec, named, False)._solve(arguments, problem)
+            prepared, checked = Prepared(problem, spec, named, False), check_arguments(spec, tol, max_iter)
+            solution = prepared._solve(problem, start, *checked, own, failed_call=counts)
         else:
             left = deadline.get_remaining_seconds(MIN_TIME_LIMIT)
             solution = solve(problem, solver, impulse=start, time_limit=left, **more)

@@ -20,7 +20,7 @@ from lavender.external.forms import Form, build_form, choose_program_form, get_p
 from lavender.external.isolated import run_isolated, start_process
 from lavender.external.running import BackendResult, call_backend_until_accepted
 from lavender.judge.certificates import check_certificate
-from lavender.judge.residuals import compute_stopping_residual
+from lavender.judge.residuals import judge_impulse
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.problem.program import QuadraticProgram
@@ -160,10 +160,9 @@ class ContactJudge:
         impulse = self.form.recover_impulse(x, lam)
         if not np.isfinite(impulse).all():
             return
-        w, e = np.empty(len(impulse)), np.empty(len(impulse))
-        relative, above = compute_stopping_residual(self.form.problem, impulse, w, e, floor=True)
-        if relative < self.relative or self.dual is None:
-            self.relative, self.above, self.impulse[:] = relative, above, impulse
+        judged = judge_impulse(self.form.problem, impulse)
+        if judged.relative < self.relative or self.dual is None:
+            self.relative, self.above, self.impulse[:] = judged.relative, judged.above_floor, impulse
             self.dual = self.form.recover_bound_multiplier(x, lam, impulse)
 
 
@@ -256,8 +255,7 @@ class QPSolver(Solver):
             return Claim(Status.CONVERGED, 0, no_work, "every impulse is determined by its bounds", form.name)
         if max_iter == 0:
             return Claim(Status.MAX_ITERATIONS, 0, no_work, "", form.name)
-        w, e = np.empty(len(impulse)), np.empty(len(impulse))
-        if tol > 0.0 and compute_stopping_residual(form.problem, impulse, w, e)[0] == 0.0:
+        if tol > 0.0 and judge_impulse(form.problem, impulse).relative == 0.0:
             return Claim(Status.CONVERGED, 0, no_work, "the start is a solution", form.name)
         start = form.make_start(impulse) if self.backend.starts and impulse.any() else None
         deadline = Deadline(time_limit)
@@ -265,14 +263,12 @@ class QPSolver(Solver):
             judge, result = self.solve_program(form.problem.qp, tol, max_iter, deadline, start)
             if judge.x is not None and judge.lam is not None:
                 impulse[:] = form.recover_impulse(judge.x, judge.lam)
-            relative, above = compute_stopping_residual(form.problem, impulse, w, e, floor=True)
-            error = judge.error
+            above, error = judge_impulse(form.problem, impulse).above_floor, judge.error
             dual: FloatArray | None = form.recover_bound_multiplier(impulse, impulse, impulse)
         else:
             contact = ContactJudge(form, impulse, tol)
             result = self._call(form.program, contact, max_iter, tol, deadline, start)
-            relative, above, dual = contact.relative, contact.above, contact.dual
-            error = relative
+            above, dual, error = contact.above, contact.dual, contact.relative
         status, certificate = result.status, None
         is_false = status is Status.CONVERGED and error > get_false_claim_error(tol)
         if (status is Status.INFEASIBLE or is_false) and result.point is not None:

@@ -419,18 +419,6 @@ def find_relative_at_zero(problem: Problem, impulse: FloatArray) -> float | None
     return relative if relative >= 0.0 and measure.are_bit_identical(problem._start, impulse) else None
 
 
-def compute_stopping_residual(
-    problem: Problem, impulse: FloatArray, w: FloatArray, e: FloatArray, floor: bool = False
-) -> tuple[float, float]:
-    """Compute (relative, above_floor) of `Residual` for a solver's stopping test; w and e (m,) are workspace.
-
-    If `floor` is false, the floor is not computed, and above_floor is the relative residual.
-    """
-    get_zero_impulse_reference(problem)
-    _, _, relative, above = measure.judge_impulse(problem.metric, impulse, w, e, floor)
-    return relative, above
-
-
 def residual(
     problem: Problem,
     impulse: ArrayLike,

@@ -20,7 +20,7 @@ from lavender.base.arrays import (
 from lavender.base.errors import InputError, check_name
 from lavender.base.lazy_import import issparse
 from lavender.problem.cones import Cones
-from lavender.problem.contact_rows import make_contacts, make_contacts_of_rows, make_joints
+from lavender.problem.contact_rows import make_contacts, make_contacts_of_rows
 from lavender.problem.data import check_matrix, check_rhs
 from lavender.problem.findex import convert_from_findex, convert_to_findex, order_findex_rows
 from lavender.problem.friction import SHAPES
@@ -308,7 +308,9 @@ class Builders(Operators):
             tangents = 2 * (mu > 0.0).astype(np.int32)
         tangents = as_array("tangents", tangents, mu.shape, dtype=np.int32)
         contacts = make_contacts(mu, tangents, patch_radius, rolling, check_name("shape", shape, SHAPES))
-        joints = make_joints(rows, lower, upper)
+        named, zeros = (("lower", lower), ("upper", upper)), np.zeros(rows.n_joints)
+        bounds = (as_array(name, x, (len(rows.jac),), finite=False, unit="N s") for name, x in named)
+        joints = Cones(rows.joint_ptr, zeros, *bounds, mu=zeros, patch_radius=zeros)
         cones = joints + contacts if rows.n_joints else contacts
         m = cones.n_rows
         target = as_array("target", target, (m,), unit="m/s")

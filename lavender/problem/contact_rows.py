@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import (
-    ArrayLike,
     FloatArray,
     IntArray,
     as_array,
@@ -17,15 +16,6 @@ from lavender.base.arrays import (
 )
 from lavender.base.errors import InputError
 from lavender.problem.cones import Cones, get_block_kinds
-from lavender.problem.rows import Rows
-
-
-def make_joints(rows: Rows, lower: ArrayLike, upper: ArrayLike) -> Cones:
-    """Build the joints' blocks with bounds of their rows (mj,) [N s]."""
-    named = (("lower", lower), ("upper", upper))
-    low, high = (as_array(name, x, (len(rows.jac),), finite=False, unit="N s") for name, x in named)
-    zeros = np.zeros(rows.n_joints)
-    return Cones(rows.joint_ptr, zeros.astype(np.int32), low, high, mu=zeros, patch_radius=zeros)
 
 
 def make_contacts_of_rows(

@@ -226,7 +226,7 @@ def cross_check(
         `tol` or a limit is invalid.
     """
     check_problem(problem)
-    check_arguments(specs()["auto"], None, tol, max_iter)
+    check_arguments(specs()["auto"], tol, max_iter)
     check_time_limit(time_limit)
     if problem.guess is not None:  # All solvers start from the zero impulse.
         problem = replace(problem, guess=None, copy=False)

@@ -45,7 +45,6 @@ from lavender.base.arrays import FloatArray, check_choice
 from lavender.base.deadline import UNLIMITED, Deadline, TooLate, limit_forming
 from lavender.base.errors import CapabilityError, InputError
 from lavender.judge.residuals import (
-    compute_stopping_residual,
     get_zero_impulse_reference,
     judge_impulse,
 )
@@ -310,16 +309,14 @@ class Newton(Solver):
             return replace(claim, status=Status.TIME_LIMIT)
         if continuation is None:
             return claim
-        w, e = np.empty(problem.m), np.empty(problem.m)
-        best, above = compute_stopping_residual(problem, impulse, w, e, True)
-        if above <= tol:
+        first = judge_impulse(problem, impulse.copy())
+        if first.above_floor <= tol:
             return claim
-        before = impulse.copy()
-        if not best <= WARM_START_MAX_RESIDUAL:
+        if not first.relative <= WARM_START_MAX_RESIDUAL:
             impulse[:] = problem.start()
         second = self._run_system(problem, continuation.system, impulse, remaining, tol, deadline)
-        if not compute_stopping_residual(problem, impulse, w, e)[0] <= best:
-            impulse[:] = before
+        if not judge_impulse(problem, impulse).relative <= first.relative:
+            impulse[:] = first.impulse
         work = sum_work_counts((claim.work, second.work))
         form = f"{claim.form}, then {second.form or 'impulse'}"
         total = claim.iterations + second.iterations

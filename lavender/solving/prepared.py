@@ -109,18 +109,6 @@ def prepare(problem: Problem, solver: str = "auto", **options: Unpack[SolverOpti
     return prepared
 
 
-class SolveArguments(NamedTuple):
-    """Checked arguments of one solve (`check_arguments`)."""
-
-    impulse: Any  # None, or the argument of `Problem.make_start`.
-    tol: float
-    max_iter: int
-    deadline: Deadline | None = None
-    history: bool = False
-    callback: Callback | None = None
-    failed_call: tuple[int, ...] | None = None  # Work counts of a compiled call that has failed.
-
-
 class SetUp:
     """State of `Prepared` with a solver that is set up for its problem."""
 
@@ -236,8 +224,9 @@ class Prepared:
         original = self.problem if problem is None else problem
         if b is not None or v_free is not None:
             original = self._update_problem(problem, b, v_free)
-        if velocity_tol is not None:
+        if type(original) is not Problem:
             check_problem(original)
+        if velocity_tol is not None:
             tol = relative_tolerance(original, velocity_tol, tol)
         if not self._lock.acquire(False):
             raise InUse(f"this prepared {self.spec.name!r} is already solving: make one for each thread")
@@ -245,7 +234,7 @@ class Prepared:
             solution: Solution | None = None
             failed_call: tuple[int, ...] | None = None
             is_default = max_iter is None and callback is None and history is False
-            if is_default and self.spec.delegates and not self.options and type(original) is Problem:
+            if is_default and self.spec.delegates and not self.options:
                 own = None if limit == math.inf else Deadline(limit, begun)
                 solution, failed_call = solve_small(original, self.spec, impulse, tol, own)
             if solution is not None:
@@ -255,8 +244,10 @@ class Prepared:
                     self.problem, self._setup = original, NotSetUp()
             else:
                 deadline = None if limit == math.inf else make_deadline(self.spec, limit, begun)
-                arguments = (impulse, tol, max_iter, deadline, history, callback, failed_call)
-                solution = self._solve(check_arguments(self.spec, *arguments), original)
+                tol, max_iter = check_arguments(self.spec, tol, max_iter, history, callback)
+                solution = self._solve(
+                    original, impulse, tol, max_iter, deadline, history, callback, failed_call
+                )
         finally:
             self._lock.release()
         return solution if velocity_tol is None else accept_velocity(solution, velocity_tol)
@@ -284,13 +275,15 @@ class Prepared:
             self._target = updated, target
         return updated
 
-    def _solve(self, arguments: SolveArguments, original: Problem) -> Solution:
-        """Prepare, step and finish, without the compiled call for small problems; solvers get `original.disk`."""
-        if type(original) is not Problem:
-            check_problem(original)
-        deadline, start, callback = arguments.deadline, None, arguments.callback
-        if arguments.impulse is not None:
-            start = original.make_start(arguments.impulse)
+    def _solve(
+        self, original: Problem, impulse: Any, tol: float, max_iter: int, deadline: Deadline | None = None,
+        history: bool = False, callback: Callback | None = None, failed_call: tuple[int, ...] | None = None,
+    ) -> Solution:  # fmt: skip
+        """Prepare, step and finish, without the compiled call for small problems; solvers get `original.disk`.
+
+        The arguments are checked, `failed_call` has the work counts of a compiled call that has failed.
+        """
+        start = None if impulse is None else original.make_start(impulse)
         setup = self._setup
         if isinstance(setup, NotSetUp) or setup.is_used or original is not self.problem:
             setup = self._set_up(original, deadline)
@@ -302,8 +295,8 @@ class Prepared:
             start = original.on_disk(start)
             callback = None if callback is None else partial(_call_in_original_tangents, original, callback)
         loop = Loop(
-            problem=problem, solver=None, state=None, impulse=start, tol=arguments.tol, deadline=deadline,
-            callback=callback, records=[] if arguments.history else None,
+            problem=problem, solver=None, state=None, impulse=start, tol=tol, deadline=deadline, callback=callback,
+            records=[] if history else None,
         )  # fmt: skip
         if isinstance(setup, SetUp):
             setup.is_used = True
@@ -313,16 +306,16 @@ class Prepared:
                 if self.spec.builtin and not self.spec.external:
                     reserve_time_of_judge(problem, deadline)
             if self.spec.delegates:
-                setup.state.failed_call = arguments.failed_call
-                setup.state.loop = loop if arguments.history else None
-        solution = self._run(loop, setup, arguments.max_iter, has_default_start)
+                setup.state.failed_call = failed_call
+                setup.state.loop = loop if history else None
+        solution = self._run(loop, setup, max_iter, has_default_start)
         if problem is not original:
-            impulse, proof = mark_read_only(original.cones.stretch * solution.impulse), solution.certificate
+            result, proof = mark_read_only(original.cones.stretch * solution.impulse), solution.certificate
             # The impulse is judged again, because multiplying it by the scale of the ellipses rounds it.
-            judged = residual(original, impulse, "float64", tol=arguments.tol)
+            judged = residual(original, result, "float64", tol=tol)
             proof = None if proof is None else mark_read_only(original.cones.stretch * proof)
-            solution = replace(solution, impulse=impulse, residual=judged, certificate=proof)
-        name = name_start(original.guess, arguments.impulse)
+            solution = replace(solution, impulse=result, residual=judged, certificate=proof)
+        name = name_start(original.guess, impulse)
         return solution.with_fields(start=name) if name else solution
 
     # -- set-up ----------------------------------------------------------------------------------
@@ -497,24 +490,15 @@ class Prepared:
 
 def check_accepted(problem: Problem, spec: SolverSpec) -> None:
     """Raise an error if the argument is not a problem or the solver refuses it."""
-    if type(problem) is not Problem:
-        check_problem(problem)
     reason = spec.refuses(problem)
     if reason:
         raise CapabilityError(f"solver {spec.name!r} {reason}")
 
 
 def check_arguments(
-    spec: SolverSpec,
-    impulse: Any,
-    tol: float,
-    max_iter: int | None,
-    deadline: Deadline | None = None,
-    history: bool = False,
-    callback: Callback | None = None,
-    failed_call: tuple[int, ...] | None = None,
-) -> SolveArguments:
-    """Check the arguments of a solve; a `max_iter` of None becomes the default of the spec."""
+    spec: SolverSpec, tol: float, max_iter: int | None, history: Any = False, callback: Any = None
+) -> tuple[float, int]:
+    """Check arguments of a solve; return tol and max_iter, which is the default of the spec if it is None."""
     if type(tol) is not float or not 0.0 <= tol <= 1.0:
         tol = check_float("tol", tol, low=0.0)
     if max_iter is None:
@@ -534,7 +518,7 @@ def check_arguments(
         raise CapabilityError(
             f"solver {spec.name!r} runs in one call; a solver of lavender.available(history=True) is needed"
         )
-    return SolveArguments(impulse, tol, max_iter, deadline, bool(history), callback, failed_call)
+    return tol, max_iter
 
 
 def _call_in_original_tangents(

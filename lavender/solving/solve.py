@@ -111,15 +111,15 @@ def solve(
     if solution is None:
         deadline = None if limit == math.inf else make_deadline(spec, limit, begun)
         prepared = Prepared(problem, spec, cast("dict[str, Any]", options), False)
-        arguments = check_arguments(spec, impulse, tol, max_iter, deadline, history, callback, failed_call)
-        solution = prepared._solve(arguments, problem)
+        tol, max_iter = check_arguments(spec, tol, max_iter, history, callback)
+        solution = prepared._solve(problem, impulse, tol, max_iter, deadline, history, callback, failed_call)
     return solution if velocity_tol is None else accept_velocity(solution, velocity_tol)
 
 
 def _solve_after_call(problem: Problem, spec: SolverSpec, impulse: Any, tol: float, counts: Any) -> Solution:
     """Solve a problem that the compiled call with these work counts did not solve."""
     prepared = Prepared(problem, spec, {}, False)
-    return prepared._solve(check_arguments(spec, impulse, tol, None, failed_call=counts), problem)
+    return prepared._solve(problem, impulse, *check_arguments(spec, tol, None), failed_call=counts)
 
 
 def _reject_solver(solver: Any) -> NoReturn:

@@ -166,27 +166,6 @@ def is_residual_at_floor(double relative_, double floor):
     return is_at_floor(relative_, floor)
 
 
-def judge_impulse(Data p, const double[::1] lam, double[::1] w, double[::1] e, bint floor=True):
-    """Compute slack w and error e; return (energy [sqrt J], velocity [m/s], relative residual, `residual_above_floor`).
-
-    All four numbers are inf if a slack or an error is not finite. Without a floor the last number is the relative residual.
-    """
-    cdef score_t s = make_empty_score()
-    cdef double now, above
-    cdef view_t v = p.get_pointers()
-    cdef double[::1] scratch
-    if p.blocks.n_rows == 0:
-        return 0.0, 0.0, 0.0, 0.0
-    scratch = np.empty(count_judge_scratch(&v) + 1)
-    with nogil:
-        judge_view(&v, &lam[0], &w[0], &e[0], &scratch[0], floor, &s)
-    if not s.finite or not is_finite(&w[0], p.blocks.n_rows):
-        return np.inf, np.inf, np.inf, np.inf
-    now = relative_residual_of_score(&s, &w[0], p.blocks.n_rows, p.reference_energy, p.reference_velocity)
-    above = residual_above_floor(&s, now, relative_floor_of_score(&s, p.reference_energy, p.reference_velocity)) if floor else now
-    return s.energy, s.velocity, now, above
-
-
 cdef Judged make_judged(Data p, impulse, both, const score_t* s, double relative_, double floor, double float64_relative=NAN):
     """Create the result of a pass over `impulse`, with w and e in `both` (2 m + 1)."""
     cdef Judged judged = Judged.__new__(Judged)
