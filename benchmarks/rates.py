@@ -195,10 +195,14 @@ def measure_setups(name: str) -> Iterator[tuple[str, Callable[[], float], float]
     for name_of_solver in SETUP_SOLVERS:
         spec = get(name_of_solver)
         solver = spec.load()()
-        if spec.refuses(problem) or not 0.0 < solver.cost(ready()).setup < 1e9:
+        if spec.refuses(problem) or not 0.0 < solver.estimate_setup_cost(ready()) < 1e9:
             continue
         untouched = ready()
-        yield name_of_solver, lambda s=solver, p=untouched: s.cost(p).setup, least(ready, solver.prepare)  # type: ignore[misc]
+        yield (
+            name_of_solver,
+            lambda s=solver, p=untouched: s.estimate_setup_cost(p),
+            least(ready, solver.prepare),
+        )  # type: ignore[misc]
 
 
 def estimate_with(estimate: Callable[[], float], rates: Fit) -> float:

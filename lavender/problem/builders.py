@@ -309,8 +309,8 @@ class Builders(Operators):
         tangents = as_array("tangents", tangents, mu.shape, dtype=np.int32)
         contacts = make_contacts(mu, tangents, patch_radius, rolling, check_name("shape", shape, SHAPES))
         named, zeros = (("lower", lower), ("upper", upper)), np.zeros(rows.n_joints)
-        bounds = (as_array(name, x, (len(rows.jac),), finite=False, unit="N s") for name, x in named)
-        joints = Cones(rows.joint_ptr, zeros, *bounds, mu=zeros, patch_radius=zeros)
+        low, high = (as_array(name, x, (len(rows.jac),), finite=False, unit="N s") for name, x in named)
+        joints = Cones(rows.joint_ptr, zeros, low, high, mu=zeros, patch_radius=zeros)
         cones = joints + contacts if rows.n_joints else contacts
         m = cones.n_rows
         target = as_array("target", target, (m,), unit="m/s")

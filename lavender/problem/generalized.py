@@ -96,7 +96,6 @@ class Generalized:
         jac: Compressed,
         mass: Compressed,
         v_free: Any,
-        names: Sequence[str] | None = None,
         like: kernels.Operator | None = None,
     ) -> Generalized:
         """Build the object from compressed rows of J and of the lower triangle of M, without copies.
@@ -110,7 +109,6 @@ class Generalized:
         mass : (indptr, indices, data)
             Lower triangle of M with its diagonal, in the same form.
         v_free : (nv,) m/s, rad/s
-        names : sequence of str (nv,), optional
         like : Operator, optional
             Operator of an earlier problem. The pattern of its factor is reused if the pattern of M is the same.
         """
@@ -122,7 +120,7 @@ class Generalized:
         free = as_plain_array(v_free, (n,), True, False)
         if free is None:
             free = as_array("v_free", v_free, (n,), unit="m/s, rad/s", copy=False)
-        new._initialize(jac, mass, free, names, like)
+        new._initialize(jac, mass, free, None, like)
         return new
 
     @classmethod

@@ -9,7 +9,7 @@ from lavender.base.errors import InputError, check_name
 from lavender.judge.solution import Claim
 from lavender.problem import Problem
 from lavender.problem.ordering import Order, compute_block_order
-from lavender.solvers.costs import Cost, estimate_sweep_cost
+from lavender.solvers.costs import estimate_sweep_cost
 from lavender.solvers.sweeping import (
     Sweeping,
     SweepState,
@@ -72,9 +72,9 @@ class Accelerated(Sweeping):
         state: AcceleratedState = super().prepare(problem)
         return state
 
-    def cost(self, problem: Problem) -> Cost:
-        """Estimate the cost of an iteration: one sweep over the data of `choose_sweep_operator`."""
-        return Cost(iteration=lambda: estimate_sweep_cost(problem, estimate_sweep_work(problem)))
+    def estimate_iteration_cost(self, problem: Problem) -> float:
+        """Estimate the cost of one sweep over the data of `choose_sweep_operator` [ns]."""
+        return estimate_sweep_cost(problem, estimate_sweep_work(problem))
 
     def _build_state(
         self, problem: Problem, order: Order, before: AcceleratedState | None

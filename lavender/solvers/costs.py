@@ -1,6 +1,6 @@
 """Estimate costs [ns]: operations, counted from the data, times the rates of `lavender.base.rates`. No clock is read.
 
-`Solver.cost(problem)` returns a `Cost`, which `auto` and `explain` read. There are two kinds of costs.
+`auto` and `explain` read them by the methods `estimate_..._cost` of solvers. There are two kinds of costs.
 
 Costs of iterations, which `auto` compares. Their rates are fitted means:
 
@@ -21,9 +21,8 @@ file were measured once: they select a factorisation. A problem has the same cos
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from math import inf, nan
+from math import inf
 
 from lavender.base.rates import RATES as RATES
 from lavender.problem import Problem
@@ -35,47 +34,6 @@ ANALYSIS_BANDWIDTH = 1500.0
 # [ns, ns per entry of a full A] If a time limit exceeds LOOSE_LIMIT + LOOSE_LIMIT_PER_ENTRY m^2, it is about a hundred
 # times the cost of the set-ups, and `auto` does not estimate these.
 LOOSE_LIMIT, LOOSE_LIMIT_PER_ENTRY = 1e7, 1e3
-
-
-class Cost:
-    """Estimated cost of a solver on a problem [ns].
-
-    A value may be given as a function without arguments, which is called when the value is read.
-
-    Parameters
-    ----------
-    setup : float, ns
-        Cost of `prepare`, of a solver that `auto` starts under a time limit only if this cost fits.
-    iteration : float, ns
-        One iteration; NaN if it is not known.
-    total : float, ns
-        All iterations to a solution, without the set-up; NaN if it is not known.
-    """
-
-    __slots__ = ("_iteration", "_setup", "_total")
-
-    def __init__(
-        self,
-        setup: float | Callable[[], float] = 0.0,
-        iteration: float | Callable[[], float] = nan,
-        total: float | Callable[[], float] = nan,
-    ) -> None:
-        self._setup, self._iteration, self._total = setup, iteration, total
-
-    @property
-    def setup(self) -> float:
-        """Cost of `prepare` [ns]."""
-        return self._setup() if callable(self._setup) else self._setup
-
-    @property
-    def iteration(self) -> float:
-        """Cost of one iteration [ns]; NaN if it is not known."""
-        return self._iteration() if callable(self._iteration) else self._iteration
-
-    @property
-    def total(self) -> float:
-        """Cost of all iterations [ns]; NaN if it is not known."""
-        return self._total() if callable(self._total) else self._total
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,6 @@ friction is converted to such rows (`polyhedral.py`); if the exchanges cycle, Le
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -35,7 +34,6 @@ from lavender.judge.residuals import MAX_EXCUSED_RESIDUAL, judge_impulse
 from lavender.judge.solution import Claim, Status, sum_work_counts
 from lavender.problem import Problem
 from lavender.solvers.costs import (
-    Cost,
     estimate_direct_cost,
     estimate_first_factor_cost,
     estimate_matrix_setup_cost,
@@ -51,13 +49,6 @@ from lavender_ext.pivot.principal import INDEFINITE, SMALL_PIVOT, SOLVED, STUCK
 # Refinement ends at this relative residual, or at the round-off floor if that is larger.
 REFINEMENT_RESIDUAL = 1e-13
 ROUNDS_PER_CHECK = 32  # Number of rounds of exchanges between two checks of the clock and the residual.
-
-
-def _estimate_setup_cost(problem: Problem) -> float:
-    """Estimate the cost of the set-up [ns], which includes the factor of a linear problem."""
-    is_linear = problem.law == "linear"
-    factor = estimate_first_factor_cost(problem.m, problem.max_entries) if is_linear else 0.0
-    return estimate_matrix_setup_cost(problem) + factor
 
 
 @dataclass
@@ -89,9 +80,15 @@ class Direct(Solver):
 
     lazy_modules = ("scipy.sparse.linalg",)
 
-    def cost(self, problem: Problem) -> Cost:
-        """Estimate the cost of `prepare` and of exchanges."""
-        return Cost(partial(_estimate_setup_cost, problem), total=partial(estimate_direct_cost, problem))
+    def estimate_setup_cost(self, problem: Problem) -> float:
+        """Estimate the cost of `prepare` [ns], which includes the factor of a linear problem."""
+        is_linear = problem.law == "linear"
+        factor = estimate_first_factor_cost(problem.m, problem.max_entries) if is_linear else 0.0
+        return estimate_matrix_setup_cost(problem) + factor
+
+    def estimate_total_cost(self, problem: Problem) -> float:
+        """Estimate the cost of exchanges [ns]."""
+        return estimate_direct_cost(problem)
 
     def prepare(self, problem: Problem, like: PivotState | None = None) -> DirectState:
         linear = problem.law == "linear"

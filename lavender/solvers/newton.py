@@ -35,7 +35,6 @@ rows.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 from math import inf
 from typing import Any
 
@@ -52,7 +51,6 @@ from lavender.judge.solution import Claim, Status, format_work_count, sum_work_c
 from lavender.problem import OPERATORS, Problem
 from lavender.problem.derived import cached_property
 from lavender.solvers.costs import (
-    Cost,
     Count,
     count_dense_work,
     estimate_analysis_cost,
@@ -139,36 +137,23 @@ class Newton(Solver):
 
     lazy_modules = ("scipy.sparse.linalg",)
 
-    def cost(self, problem: Problem) -> Cost:
-        """Estimate the costs; the total is a lower bound that needs no analysis of the matrix (`NewtonState.cost`)."""
-        total = partial(self._estimate_min_cost, problem)
-        return Cost(partial(self._estimate_setup_cost, problem), total=total)
-
-    def _estimate_setup_cost(self, problem: Problem) -> float:
-        """Estimate the cost of `prepare` [ns]."""
-        if self.form != "impulse":
-            if problem.generalized is not None:
-                rows = 0.0
-                if self.form == "auto" and problem.law == "coulomb":
-                    entries = float(problem.metric.entries_of_matrix)
-                    if not uses_dense_rows(entries, float(problem.m), False):
-                        rows = estimate_matrix_setup_cost(problem) + estimate_analysis_cost(problem)
-                return rows + estimate_elimination_cost(problem, "velocity elimination")
-            if problem.rows is not None and problem.rows.n_bodies > 0:
-                return estimate_elimination_cost(problem, "body elimination")
+    def estimate_setup_cost(self, problem: Problem) -> float:
+        """Estimate the cost of `prepare` with the form "auto" [ns]."""
+        if problem.generalized is not None:
+            rows, entries = 0.0, float(problem.metric.entries_of_matrix)
+            if problem.law == "coulomb" and not uses_dense_rows(entries, float(problem.m), False):
+                rows = estimate_matrix_setup_cost(problem) + estimate_analysis_cost(problem)
+            return rows + estimate_elimination_cost(problem, "velocity elimination")
+        if problem.rows is not None and problem.rows.n_bodies > 0:
+            return estimate_elimination_cost(problem, "body elimination")
         is_sparse = not uses_dense_rows(problem.max_entries, problem.m, problem.law == "cone")
         return estimate_matrix_setup_cost(problem) + (estimate_analysis_cost(problem) if is_sparse else 0.0)
 
-    def _estimate_min_cost(self, problem: Problem) -> float:
-        """Return a lower bound of the cost of all steps [ns] that needs no analysis."""
-        m = float(problem.m)
-        if problem.generalized is None:
-            return estimate_newton_cost(Count("bodies", 0.0, float(problem.metric.work), m), problem)
-        if self.form != "impulse":
+    def estimate_total_cost(self, problem: Problem) -> float:
+        """Return a lower bound of the cost of all steps with the form "auto" [ns] (`NewtonState.cost`)."""
+        if problem.generalized is not None:
             return estimate_velocity_newton_cost(problem, 0.0)
-        entries = min(float(problem.metric.entries_of_matrix), m * m)
-        work = 0.0 if entries < 0.5 * m * m else count_dense_work(problem.m)
-        count = Count("dense", work, entries, m, estimate_formation_cost(problem, False))
+        count = Count("bodies", 0.0, float(problem.metric.work), float(problem.m))
         return estimate_newton_cost(count, problem)
 
     def prepare(self, problem: Problem) -> NewtonState:

@@ -30,7 +30,6 @@ from lavender.judge.residuals import judge_impulse
 from lavender.judge.solution import Claim, Status, sum_work_counts
 from lavender.problem import Problem
 from lavender.problem.cones import project_impulse
-from lavender.solvers.costs import Cost
 from lavender.solvers.registry import Solver
 
 
@@ -151,10 +150,6 @@ class BoundedRowSolver(Solver):
 
     def __init__(self, solver: Solver) -> None:
         self.solver = solver
-
-    def cost(self, problem: Problem) -> Cost:
-        """Return the costs of the inner solver."""
-        return self.solver.cost(problem)
 
     def start_workers(self, converted: Any, time_limit: float) -> None:
         """Start the worker processes of the inner solver."""

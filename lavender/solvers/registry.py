@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from functools import cache
+from math import nan
 from typing import TYPE_CHECKING, Any, Literal, Protocol, TypedDict
 
 from lavender.base.arrays import FloatArray, check_bool, check_int
@@ -22,14 +23,13 @@ from lavender.base.lazy_import import import_lock, import_module_under_lock
 from lavender.judge.solution import Claim
 from lavender.problem import LAWS, OPERATORS, Problem, check_problem
 from lavender.problem.derived import cached_property
-from lavender.solvers.costs import Cost
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
     from lavender.solvers.small import SmallCall
 
-__all__ = ["Cost", "Solver", "SolverOptions", "SolverSpec", "State", "available", "get", "known", "register"]
+__all__ = ["Solver", "SolverOptions", "SolverSpec", "State", "available", "get", "known", "register"]
 
 
 # Modules with the SPECS that are registered first. They are named by strings because they import this module.
@@ -108,12 +108,17 @@ class Solver:
     # Whether a failed run returns its last iterate under Coulomb's law (`lavender_ext/judge/best.pxd`).
     keeps_last = False
 
-    def cost(self, problem: Problem) -> Cost:
-        """Estimate the costs [ns] from the size of the problem.
+    def estimate_setup_cost(self, problem: Problem) -> float:
+        """Estimate the cost of `prepare` [ns]; under a time limit, `auto` starts a solver only if this cost fits."""
+        return 0.0
 
-        `auto` compares the costs of its solvers.
-        """
-        return Cost()
+    def estimate_iteration_cost(self, problem: Problem) -> float:
+        """Estimate the cost of one iteration [ns]; NaN if it is not known."""
+        return nan
+
+    def estimate_total_cost(self, problem: Problem) -> float:
+        """Estimate the cost of all iterations to a solution [ns], without the set-up; NaN if it is not known."""
+        return nan
 
     def start_workers(self, state: Any, time_limit: float) -> None:
         """Start worker processes for a solve with a limit [s], before its clock starts."""

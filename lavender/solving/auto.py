@@ -1,4 +1,4 @@
-"""Select and combine other solvers by their estimated costs (`Solver.cost`).
+"""Select and combine other solvers by their estimated costs (`solvers/costs.py`).
 
     start            if the start is a solution, nothing runs
     compiled call    one call for small problems, for small islands with friction, and for J and M if Newton's method
@@ -60,7 +60,7 @@ from lavender.solving.log import Recorder, SolveLog
 from lavender.solving.loop import EMPTY_CLAIM, Loop
 from lavender.solving.singular_programs import program_backends, run_program_backends
 from lavender.solving.stages import DecisionTree
-from lavender.solving.steps import Iterations, Sweeps, estimate_cost, make_solver, prepare_sweeps
+from lavender.solving.steps import Iterations, Sweeps, make_solver, prepare_sweeps
 from lavender_ext.judge.measure import residuals_by_island
 
 assert __doc__ is not None
@@ -166,13 +166,13 @@ class FirstSweeps:
 
     def __init__(self, problem: Problem, deadline: Deadline) -> None:
         self.problem, self.deadline = problem, deadline
-        self.newton_cost = get("newton").load()().cost(problem)
-        self.min_newton_cost = self.newton_cost.total  # [ns]
+        self.newton = get("newton").load()()
+        self.min_newton_cost = self.newton.estimate_total_cost(problem)  # [ns]
 
     def newton_fits(self, margin: float) -> bool:
         """Return whether this multiple of the least cost of Newton's method fits in the remaining time."""
         fits, cost = self.deadline.fits, margin * self.min_newton_cost
-        return fits(cost) and fits(cost + margin * self.newton_cost.setup)
+        return fits(cost) and fits(cost + margin * self.newton.estimate_setup_cost(self.problem))
 
     @np.errstate(all="ignore")  # Results that overflow are judged.
     def run(self, impulse: FloatArray, tol: float, max_iter: int) -> Claim | None:
@@ -188,7 +188,8 @@ class FirstSweeps:
         share, left = 1.0, deadline.get_remaining_nanoseconds()
         margin = DECISIONS.assumed_pace if problem.law == "coulomb" else DECISIONS.newton_time
         if self.newton_fits(margin):
-            rest = 1.0 - margin * (self.min_newton_cost + self.newton_cost.setup) / left
+            newton_cost = self.min_newton_cost + self.newton.estimate_setup_cost(problem)
+            rest = 1.0 - margin * newton_cost / left
             share = min(max(rest, DECISIONS.min_share), DECISIONS.time_share)
         loop.deadline = deadline if share == 1.0 else Deadline(1e-9 * share * left)
         # Check the first sweep only if its start is not judged, since the zero impulse may replace the start.
@@ -202,7 +203,7 @@ class FirstSweeps:
         if claim.status is Status.MAX_ITERATIONS:
             claim = loop.run_chunks(max_iter)
         if share < 1.0 and claim.status is Status.TIME_LIMIT:
-            counted = loop.done * estimate_cost(self.name, problem).iteration
+            counted = loop.done * solver.estimate_iteration_cost(problem)
             pace = DECISIONS.pace_margin * (left - deadline.get_remaining_nanoseconds()) / max(counted, 1.0)
             if not self.newton_fits(max(pace, 1.0)):
                 share, loop.deadline = 1.0, deadline
@@ -293,7 +294,7 @@ def sweep_until_deadline(log: SolveLog, tree: DecisionTree) -> None:
     for k, name in enumerate((*shared, "anderson")):
         step = tree.get_step(name)
         assert isinstance(step, Iterations)
-        setup = 0.0 if step.state is not None else estimate_cost(name, log.problem).setup
+        setup = 0.0 if step.state is not None else step.solver.estimate_setup_cost(log.problem)
         has_time = fits(DECISIONS.admm_sweeps * tree.pace * tree.sweep) and fits(setup)
         if not step.over and (name == "anderson" or has_time):
             step.least, step.time_fraction = inf, DECISIONS.time_share if k < len(shared) else 1.0

@@ -28,7 +28,9 @@ def fits_in_time(problem: Problem, deadline: Deadline, loosely: bool = False) ->
     """
     if not deadline.is_set or len(problem.b) <= SMALL_ROWS or deadline.fits(get_loose_limit(problem)):
         return True
-    return not loosely and deadline.fits(DECISIONS.call_time * get("newton").load()().cost(problem).total)
+    return not loosely and deadline.fits(
+        DECISIONS.call_time * get("newton").load()().estimate_total_cost(problem)
+    )
 
 
 def choose_call_deadline(problem: Problem, deadline: Deadline) -> Deadline:

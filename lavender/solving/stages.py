@@ -20,7 +20,7 @@ from lavender.solvers.newton import NewtonState
 from lavender.solvers.newton_systems.systems import find_bodies
 from lavender.solvers.registry import get
 from lavender.solving.log import get_relaxation
-from lavender.solving.steps import STEP_CLASSES, Iterations, Step, estimate_cost
+from lavender.solving.steps import STEP_CLASSES, Iterations, Step, make_solver
 
 
 @dataclass(frozen=True)
@@ -54,10 +54,12 @@ class DecisionTree:
     ) -> None:
         self.problem, self.law, self.deadline, self.log = problem, problem.law, deadline, log
         self.first_stage, self.steps = first_stage, dict[str, Step]()
-        self.sweep = estimate_cost("anderson", problem).iteration  # [ns] Cost of one sweep.
+        self.sweep = make_solver("anderson", problem).estimate_iteration_cost(
+            problem
+        )  # [ns] Cost of one sweep.
         self.first = DECISIONS.first_sweeps * self.sweep  # [ns] Cost of the first sweeps.
         # [ns] Lower bound of the cost of Newton's method, without its analysis.
-        self.min_newton_cost = estimate_cost("newton", problem).total
+        self.min_newton_cost = make_solver("newton", problem).estimate_total_cost(problem)
 
     @property
     def best(self) -> float:
@@ -86,7 +88,8 @@ class DecisionTree:
     @cached_property
     def relaxed_sweep(self) -> float:
         """Cost of one sweep over the convex relaxation [ns]."""
-        return estimate_cost("anderson", get_relaxation(self.problem)).iteration
+        relaxation = get_relaxation(self.problem)
+        return float(make_solver("anderson", relaxation).estimate_iteration_cost(relaxation))
 
     @cached_property
     def newton_state(self) -> NewtonState | None:
@@ -135,7 +138,7 @@ class DecisionTree:
         is_cheap = formation <= (self.first if self.law == "lcp" else self.min_newton_cost)
         if not is_cheap or not self.deadline.fits(formation / DECISIONS.time_share):
             return inf
-        return formation + estimate_cost("direct", self.problem).total
+        return formation + float(make_solver("direct", self.problem).estimate_total_cost(self.problem))
 
     @property
     def newton(self) -> float:
@@ -153,7 +156,9 @@ class DecisionTree:
         if name == "newton" and "newton_state" in vars(self):
             return fits(needed)
         loose = get_loose_limit(self.problem)
-        return fits(loose + needed) or fits(estimate_cost(name, self.problem).setup + needed)
+        if fits(loose + needed):
+            return True
+        return fits(make_solver(name, self.problem).estimate_setup_cost(self.problem) + needed)
 
     def leaves_time(self, stage: Stage, step: Step) -> bool:
         """Return whether a stage can end before the deadline, and sweeps leave time for a solver that factors."""
@@ -173,7 +178,8 @@ class DecisionTree:
             return self.has_time("direct", self.direct if self.direct < inf else stage.cost)
         if step.state is not None:
             return True
-        return self.deadline.fits(estimate_cost(stage.solver, self.problem).setup / DECISIONS.time_share)
+        setup = make_solver(stage.solver, self.problem).estimate_setup_cost(self.problem)
+        return self.deadline.fits(setup / DECISIONS.time_share)
 
     @cached_property
     def factorises_first(self) -> bool:

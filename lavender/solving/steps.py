@@ -15,7 +15,7 @@ from lavender.base.errors import BREAKDOWN, format_error
 from lavender.judge.solution import Claim, Status, sum_work_counts
 from lavender.problem import Problem
 from lavender.solvers._accelerated import build_state_in_given_form
-from lavender.solvers.costs import Cost, estimate_formation_cost, get_loose_limit
+from lavender.solvers.costs import estimate_formation_cost, get_loose_limit
 from lavender.solvers.decisions import DECISIONS
 from lavender.solvers.direct import SufficientDirect
 from lavender.solvers.newton import WARM_START_MAX_RESIDUAL
@@ -35,12 +35,6 @@ def make_solver(name: str, problem: Problem) -> Any:
     # Solve blocks exactly under the cone law, and for a matrix: rows of a contact may differ in unit.
     exact = problem.law == "cone" or (problem.law == "coulomb" and problem.matrix is not None)
     return spec.load()(**({"sweep": "blocks"} if exact and "sweep" in spec.options else {}))
-
-
-def estimate_cost(name: str, problem: Problem) -> Cost:
-    """Estimate the costs of the solver of a step."""
-    cost: Cost = make_solver(name, problem).cost(problem)
-    return cost
 
 
 def prepare_sweeps(solver: Any, problem: Problem, deadline: Deadline) -> Any:

@@ -11,7 +11,7 @@ from lavender import registry, suite
 from lavender.solvers.sweeping import SweepSolver
 from lavender.solving.loop import Loop
 from lavender.solving.stages import DecisionTree
-from lavender.solving.steps import Newton, Step, estimate_cost
+from lavender.solving.steps import Newton, Step
 
 LIMITS = [1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3]  # s
 
@@ -51,7 +51,7 @@ def play(monkeypatch, clock, pace, problem):
         return played
 
     def prepared(self, of):
-        clock.now += 0.0 if quiet else 1e-9 * pace * estimate_cost("newton", of).setup
+        clock.now += 0.0 if quiet else 1e-9 * pace * self.estimate_setup_cost(of)
         return prepare(self, of)
 
     # A chunk takes 1 ms of the counted time, and not of the machine's.
