@@ -6,14 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import (
-    FloatArray,
-    IntArray,
-    as_array,
-    check_int,
-    check_unmasked,
-    get_shape,
-)
+from lavender.base.arrays import FloatArray, IntArray, as_array, check_int, check_unmasked, get_shape
 from lavender.base.errors import InputError
 from lavender.problem.cones import Cones, get_block_kinds
 

@@ -92,11 +92,7 @@ class Generalized:
 
     @classmethod
     def from_compressed_rows(
-        cls,
-        jac: Compressed,
-        mass: Compressed,
-        v_free: Any,
-        like: kernels.Operator | None = None,
+        cls, jac: Compressed, mass: Compressed, v_free: Any, like: kernels.Operator | None = None
     ) -> Generalized:
         """Build the object from compressed rows of J and of the lower triangle of M, without copies.
 

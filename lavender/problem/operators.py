@@ -138,13 +138,25 @@ class Operators(ProblemData):
     @cached_property
     def is_semidefinite(self) -> bool:
         """Whether A is symmetric and x.A x >= 0 for every x, up to rounding; always True with J and M."""
-        if self.matrix is None:
+        if self.matrix is None or not self.csr.nnz:
             return True
         if not self.is_symmetric:
             return False
         with np.errstate(all="ignore"):  # Overflow raises no warning.
             scale = sp.diags_array(1.0 / np.sqrt(self.d))
-            return has_shifted_cholesky(scale @ self.csr @ scale)
+            a = scale @ self.csr @ scale
+            a = sp.csr_array(
+                0.5 * (a + a.T)
+            )  # Make the pattern, and entries that differ by rounding, symmetric.
+        a.sort_indices()
+        try:
+            system = LinearSystem((a.indptr.astype(np.int32), a.indices.astype(np.int32)))
+            system.analyse()
+        except OverflowError as error:
+            raise TooLarge(
+                f"A cannot be factored: {error}. Use a sweep solver, which needs no factor"
+            ) from None
+        return bool(system.factor(a.data, None, SEMIDEFINITE_SHIFT) == 0)
 
     @computed_once
     def data(self) -> Data:
@@ -152,20 +164,9 @@ class Operators(ProblemData):
         if self.rows is None:
             return self.csr_data
         r = self.rows
-        data = self._make_data(
-            rows=(
-                r.jac,
-                r.joint_body,
-                r.normal,
-                r.tangent,
-                r.arm_a,
-                r.arm_b,
-                r.contact_body,
-                r.inv_mass,
-                r.inv_inertia,
-                self.compliance,
-            )
-        )
+        arms, masses = (r.arm_a, r.arm_b), (r.inv_mass, r.inv_inertia)
+        rows = r.jac, r.joint_body, r.normal, r.tangent, *arms, r.contact_body, *masses, self.compliance
+        data = self._make_data(rows=rows)
         self._check_diagonal(data)
         return data
 
@@ -398,25 +399,3 @@ def _mark_matrix_read_only(matrix: sp.csr_array) -> sp.csr_array:
     for array in (matrix.data, matrix.indices, matrix.indptr):
         mark_read_only(array)
     return matrix
-
-
-def has_shifted_cholesky(a: Any) -> bool:
-    """Return whether A + SEMIDEFINITE_SHIFT I has a Cholesky factor, for a sparse symmetric A of unit diagonal.
-
-    TooLarge: the factor would have 2^31 entries or more.
-    """
-    n = a.shape[0]
-    if n <= 400:
-        try:
-            np.linalg.cholesky((a + SEMIDEFINITE_SHIFT * sp.eye_array(n)).toarray())
-        except np.linalg.LinAlgError:
-            return False
-        return True
-    a = sp.csr_array(0.5 * (a + a.T))  # Make the pattern, and entries that differ by rounding, symmetric.
-    a.sort_indices()
-    try:
-        system = LinearSystem((a.indptr.astype(np.int32), a.indices.astype(np.int32)))
-        system.analyse()
-    except OverflowError as error:
-        raise TooLarge(f"A cannot be factored: {error}. Use a sweep solver, which needs no factor") from None
-    return bool(system.factor(a.data, None, SEMIDEFINITE_SHIFT) == 0)

@@ -9,7 +9,7 @@ from lavender.base.errors import InputError, check_name
 from lavender.judge.solution import Claim
 from lavender.problem import Problem
 from lavender.problem.ordering import Order, compute_block_order
-from lavender.solvers.costs import estimate_sweep_cost
+from lavender.solvers.costs import RATES, get_sweep_rate_name
 from lavender.solvers.sweeping import (
     Sweeping,
     SweepState,
@@ -73,8 +73,9 @@ class Accelerated(Sweeping):
         return state
 
     def estimate_iteration_cost(self, problem: Problem) -> float:
-        """Estimate the cost of one sweep over the data of `choose_sweep_operator` [ns]."""
-        return estimate_sweep_cost(problem, estimate_sweep_work(problem))
+        """Estimate the cost of one sweep over the data of `choose_sweep_operator` [ns] by (2) of `costs.py`."""
+        rate = RATES[get_sweep_rate_name(problem)]
+        return float(RATES["sweep row"] * problem.m + rate * estimate_sweep_work(problem))
 
     def _build_state(
         self, problem: Problem, order: Order, before: AcceleratedState | None

@@ -18,13 +18,7 @@ from dataclasses import dataclass, replace
 from lavender.judge.solution import Claim
 from lavender.problem import Problem
 from lavender.problem.ordering import Order
-from lavender.solvers.sweeping import (
-    SWEEPS,
-    Sweeping,
-    SweepState,
-    choose_sweep_data,
-    form_name,
-)
+from lavender.solvers.sweeping import SWEEPS, Sweeping, SweepState, choose_sweep_data, form_name
 
 
 @dataclass(frozen=True)

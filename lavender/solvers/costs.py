@@ -65,20 +65,6 @@ def estimate_newton_cost(count: Count, problem: Problem) -> float:
     return float(r["start"] + count.set_up + estimate_factorisation_count(problem) * step_cost)
 
 
-def estimate_direct_cost(problem: Problem) -> float:
-    """Estimate the cost of `direct` on bounded rows of a matrix [ns], (3)."""
-    m = float(problem.m)
-    work = m * (1.0 + problem.max_bandwidth) ** 2
-    if work < m**3 and not problem.is_symmetric:  # The check of symmetry reads all entries, so it comes last.
-        work = m**3
-    return estimate_factorisation_count(problem) * (RATES["pivot row"] * m + RATES["pivot work"] * work)
-
-
-def estimate_sweep_cost(problem: Problem, work: float) -> float:
-    """Estimate the cost of one sweep of `work` multiply-adds [ns], (2)."""
-    return float(RATES["sweep row"] * problem.m + RATES[get_sweep_rate_name(problem)] * work)
-
-
 def get_sweep_rate_name(problem: Problem) -> str:
     """Return the name of the rate of a sweep's multiply-adds."""
     if problem.matrix is not None:

@@ -34,7 +34,8 @@ from lavender.judge.residuals import MAX_EXCUSED_RESIDUAL, judge_impulse
 from lavender.judge.solution import Claim, Status, sum_work_counts
 from lavender.problem import Problem
 from lavender.solvers.costs import (
-    estimate_direct_cost,
+    RATES,
+    estimate_factorisation_count,
     estimate_first_factor_cost,
     estimate_matrix_setup_cost,
 )
@@ -87,8 +88,14 @@ class Direct(Solver):
         return estimate_matrix_setup_cost(problem) + factor
 
     def estimate_total_cost(self, problem: Problem) -> float:
-        """Estimate the cost of exchanges [ns]."""
-        return estimate_direct_cost(problem)
+        """Estimate the cost of exchanges [ns] by (3) of `costs.py`."""
+        m = float(problem.m)
+        work = m * (1.0 + problem.max_bandwidth) ** 2
+        if (
+            work < m**3 and not problem.is_symmetric
+        ):  # The check of symmetry reads all entries, so it comes last.
+            work = m**3
+        return estimate_factorisation_count(problem) * (RATES["pivot row"] * m + RATES["pivot work"] * work)
 
     def prepare(self, problem: Problem, like: PivotState | None = None) -> DirectState:
         linear = problem.law == "linear"

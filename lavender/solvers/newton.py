@@ -43,10 +43,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray, check_choice
 from lavender.base.deadline import UNLIMITED, Deadline, TooLate, limit_forming
 from lavender.base.errors import CapabilityError, InputError
-from lavender.judge.residuals import (
-    get_zero_impulse_reference,
-    judge_impulse,
-)
+from lavender.judge.residuals import get_zero_impulse_reference, judge_impulse
 from lavender.judge.solution import Claim, Status, format_work_count, sum_work_counts
 from lavender.problem import OPERATORS, Problem
 from lavender.problem.derived import cached_property
@@ -246,13 +243,12 @@ class Newton(Solver):
         In generalised coordinates, only the method over velocities runs, without a continuation over rows.
         """
         is_continued, state.begun = state.begun, True
+        deadline = Deadline(time_limit)
         if state.general is None:
             most = min(remaining or SPEC.max_iter, SPEC.max_iter)
-            deadline = Deadline(time_limit)
             return self._run_system(
                 state.problem, state.system, impulse, n, tol, deadline, is_continued, most
             )
-        deadline = Deadline(time_limit)
         claim = general.run_newton_steps(
             state.problem, state.general, impulse, n, tol, deadline, is_continued
         )

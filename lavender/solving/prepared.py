@@ -134,11 +134,7 @@ class Prepared:
     """
 
     def __init__(
-        self,
-        problem: Problem,
-        spec: SolverSpec,
-        options: dict[str, Any],
-        begin: bool = True,
+        self, problem: Problem, spec: SolverSpec, options: dict[str, Any], begin: bool = True
     ) -> None:
         # The time of checks counts as set-up: they may form A and convert ellipses to disks.
         start = perf_counter()
