@@ -14,13 +14,14 @@ from lavender.base.arrays import FloatArray
 from lavender.base.errors import CapabilityError, UnknownName
 from lavender.contract.problems import EMPTY, INFEASIBLE, change_numbers, make_large_problems, make_problems
 from lavender.judge.certificates import check_certificate
-from lavender.judge.solution import MATRIX_PASS_COUNTERS, OTHER_WORK_COUNTERS, Solution, Status
+from lavender.judge.solution import Solution, Status
 from lavender.problem import Problem
 from lavender.solvers.registry import SolverSpec
 from lavender.solving.prepared import prepare
 from lavender.solving.solve import solve
 
-WORK_COUNTERS = MATRIX_PASS_COUNTERS | OTHER_WORK_COUNTERS
+# Kinds of `work`, of which a solver has to count one.
+WORK_COUNTERS = {"sweeps", "products", "matvecs", "factorisations", "solves", "pivots", "backend_calls"}
 MIN_BUDGET = 5_000  # Iterations that a resumable solver may use on a problem.
 Requirement = Callable[[SolverSpec, Problem], str]  # Returns the sentence of a failure, or an empty string.
 

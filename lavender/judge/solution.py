@@ -448,13 +448,6 @@ def format_work_count(n: int, kind: str) -> str:
     return f"{n} {kind.removesuffix('s') if n == 1 else kind}"
 
 
-#: Counters of `work` that count passes over the entries of A: sweeps over all blocks, or products with A ("matvecs" in
-#: earlier records).
-MATRIX_PASS_COUNTERS = frozenset({"sweeps", "products", "matvecs"})
-#: Counters of work that cannot be expressed in passes; reports by work leave out solvers with such work.
-OTHER_WORK_COUNTERS = frozenset({"factorisations", "solves", "pivots", "backend_calls"})
-
-
 def sum_work_counts(works: Iterable[Mapping[str, int]]) -> dict[str, int]:
     """Add the work of several claims or stages, kind by kind."""
     out: dict[str, int] = {}

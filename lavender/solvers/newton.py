@@ -3,7 +3,8 @@
     z = D^1/2 lambda,   H = D^-1/2 A D^-1/2,   s = H z - g complementary to z on every block
 
 0. A warm start over bodies is judged first. If it does not meet tol, up to 64 sweeps (counted in `work`) continue from
-   it, or one banded factorisation if all rows belong to joints (`warm_start.py`).
+   it, or one banded factorisation if all rows belong to joints (`lavender_ext/newton/warm_start.pxd`). It suffices for
+   most steps of a simulation at rest and for chains of joints. Otherwise 1 to 4 continue from the original start.
 1. Bounded rows: active-set exchanges (Newton's method on the natural map) from the warm start and from the solution of
    H z = g.
 2. Bounded rows and cones: a cold-started Mehrotra interior point. When the active rows are identified, the solution on
@@ -61,9 +62,9 @@ from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import System, find_bodies, make_system, run_newton_method
 from lavender.solvers.registry import Solver, SolverSpec
 from lavender.solvers.small import NEWTON, estimate_velocity_newton_cost
-from lavender.solvers.warm_start import make_warm_start_claim, warm_start
 from lavender_ext.core.method import OUTCOMES
 from lavender_ext.newton.solve import COUNTED, uses_dense_rows
+from lavender_ext.newton.warm_start import JUDGED, SOLVED, SWEPT, UNDECIDED, solve_from_guess
 
 FORMS = ("auto", "velocity", "impulse")
 # The row form is used if the velocity form is estimated to cost more than this multiple of the row form.
@@ -74,6 +75,10 @@ SPARSE_WORK_RATIO = 4.0  # Time of a multiply-add of a sparse factor as a multip
 INTERRUPT_CHECK_INTERVAL = 0.05  # Longest estimated time [s] between two checks for Ctrl-C.
 # Texts of each count of the kernel: "1 exchange" and " exchanges".
 COUNT_TEXTS = tuple((format_work_count(1, kind), format_work_count(2, kind)[1:]) for kind in COUNTED)
+#: Message for each code of the first phase; None if it did not solve the problem.
+WARM_START_MESSAGES = {
+    UNDECIDED: None, JUDGED: "as it came", SWEPT: "warm sweeps", SOLVED: "joints solved directly"
+}  # fmt: skip
 # The row form starts from the result of the velocity form if its relative residual does not exceed this,
 # otherwise from the default start.
 WARM_START_MAX_RESIDUAL = 1e-3
@@ -321,9 +326,11 @@ class Newton(Solver):
             impulse[:] = system.solve.view_arrays().fixed
             return Claim(Status.STALLED, 0, {"factorisations": 0}, "no row can move")
         sweeps = warm_factorisations = 0
-        if self.form == "auto" and problem.rows is not None and not is_continued:
-            code, sweeps, warm_factorisations = warm_start(problem, impulse, tol, max_iter, deadline)
-            claim = make_warm_start_claim(code, sweeps, warm_factorisations)
+        over_bodies = self.form == "auto" and problem.rows is not None and problem.friction == "coulomb"
+        if over_bodies and not is_continued and tol > 0.0 and max_iter > 0:
+            counts = solve_from_guess(problem.data, impulse, tol, deadline)
+            _, sweeps, warm_factorisations = counts
+            claim = make_warm_start_claim(*counts)
             if claim is not None:
                 judged = judge_impulse(problem, impulse.copy())
                 if judged.relative <= tol:
@@ -342,6 +349,16 @@ class Newton(Solver):
         )
         work = {"factorisations": factorisations} | ({"sweeps": sweeps} if sweeps else {})
         return Claim(run.status, factorisations, work, message, form=system.form, certificate=run.certificate)
+
+
+def make_warm_start_claim(code: int, sweeps: int, factorisations: int) -> Claim | None:
+    """Return the claim for the code and counts of the first phase; None if the phase decided nothing."""
+    message = WARM_START_MESSAGES[code]
+    if message is None:
+        return None
+    work = {"factorisations": factorisations} | ({"sweeps": sweeps} if sweeps else {})
+    form = "impulse" if code == SOLVED else "velocity"
+    return Claim(Status.CONVERGED, factorisations, work, message, form=form)
 
 
 def _is_sparse_matrix_faster(problem: Problem, work: float) -> bool:

@@ -264,7 +264,8 @@ def solve(log: SolveLog, tree: DecisionTree) -> None:
         newton.run(min(get("newton").max_iter, rest / (tree.newton_state.cost / tree.newton_state.steps)))
     if log.timed_out and not log.done():
         sweep_until_deadline(log, tree)
-    can_continue = log.remaining_iterations > 0 or log.last_stage_failed
+    last_failed = bool(log.stages) and log.best >= log.stages[-1].before
+    can_continue = log.remaining_iterations > 0 or last_failed
     if log.best > log.tol and log.certificate is None and can_continue and not log.deadline.has_passed():
         certify.certify_infeasibility(log)
 

@@ -178,11 +178,6 @@ class SolveLog:
         """Time until the deadline [s], for a solver's `time_limit`; None if there is no limit."""
         return self.deadline.get_remaining_seconds(1e-5)
 
-    @property
-    def last_stage_failed(self) -> bool:
-        """Whether the last stage did not reduce the residual."""
-        return bool(self.stages) and self.best >= self.stages[-1].before
-
     def done(self) -> bool:
         """Return whether the problem is solved or proved infeasible, or no time or iterations remain."""
         return self.status not in (Status.STALLED, Status.NUMERICAL_ERROR)

@@ -117,7 +117,12 @@ def case(text: str) -> Case:
     name, values = parse_case_name(text)
     if name not in FAMILIES:
         raise UnknownName("case", name, [*FAMILIES, *SETS])
-    return FAMILIES[name].build_case(**values)
+    family = FAMILIES[name]
+    known = [parameter for parameter in family.signature.parameters if parameter not in family.preset]
+    for parameter in values:
+        if parameter not in known:
+            raise UnknownName(f"parameter of {name}", parameter, known)
+    return family.make(**family.preset, **values)
 
 
 def cases(text: str) -> Iterator[Case]:

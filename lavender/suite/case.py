@@ -15,7 +15,7 @@ from typing import Any, ParamSpec
 import numpy as np
 
 from lavender.base.arrays import FloatArray, check_float
-from lavender.base.errors import InputError, UnknownName
+from lavender.base.errors import InputError
 from lavender.problem import Problem
 from lavender.problem.derived import cached_property
 
@@ -123,14 +123,6 @@ class Family:
     signature: inspect.Signature  # Signature of the family function.
     preset: Mapping[str, Any]  # Parameters that the name fixes, e.g. friction="coulomb".
     summary: str  # First line of the function's docstring.
-
-    def build_case(self, **parameters: Any) -> Case:
-        """Build the case of these parameters; parameters that are not given have their defaults."""
-        known = [name for name in self.signature.parameters if name not in self.preset]
-        for name in parameters:
-            if name not in known:
-                raise UnknownName(f"parameter of {self.name}", name, known)
-        return self.make(**self.preset, **parameters)
 
 
 FAMILIES: dict[str, Family] = {}

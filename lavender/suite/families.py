@@ -355,11 +355,11 @@ def two_particles(m1: float = 1.0, m2: float = 2.0, drift: float = 0.01) -> Draf
     jac = np.concatenate([-n, np.zeros(3), n, np.zeros(3)])[None]
     problem = build_joint_problem(bodies, [[0, 1]], jac, 1, target=-drift / 0.01, names=["rod"])
     closing = -drift / 0.01 - n @ (bodies.v_free[1, :3] - bodies.v_free[0, :3])
-
-    def closed_form() -> Reference:
-        return Reference(np.array([closing / (1.0 / m1 + 1.0 / m2)]), "closed form: b / (1/m1 + 1/m2)")
-
-    return Draft(problem, "one row, one number: everything can be computed by hand", closed_form)
+    return Draft(
+        problem,
+        "one row, one number: everything can be computed by hand",
+        lambda: Reference(np.array([closing / (1.0 / m1 + 1.0 / m2)]), "closed form: b / (1/m1 + 1/m2)"),
+    )
 
 
 # -- small problems -------------------------------------------------------------------------------

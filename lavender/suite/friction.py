@@ -107,12 +107,10 @@ def anisotropic(ratio: float = 10.0, speed: float = 3.0) -> Draft:
     check_positive(ratio=ratio)
     b = np.array([1.0, speed, speed * ratio**0.5])
     problem = Problem.contact(np.diag([1.0, 1.0, ratio]), b, [0.5])
-
-    def secular() -> Reference:
-        return Reference(_solve_secular_equation(b, ratio), "secular equation")
-
     return Draft(
-        problem, "tangents of unequal mass, for which common disk projections are wrong or cycle", secular
+        problem,
+        "tangents of unequal mass, for which common disk projections are wrong or cycle",
+        lambda: Reference(_solve_secular_equation(b, ratio), "secular equation"),
     )
 
 

@@ -105,11 +105,11 @@ def duplicated(k: int = 8) -> Draft:
     bodies = Bodies([[0.0, 0.0, 0.5]], 1.0, SPHERE)
     contacts = Contacts(np.tile([-1, 0], (k, 1)), np.zeros((k, 3)), [0.0, 0.0, 1.0])
     problem = build_contact_problem(bodies, contacts)
-
-    def closed_form() -> Reference:
-        return Reference(np.full(k, FALL_SPEED / k), "closed form: the weight, shared", "slack")
-
-    return Draft(problem, "the same row many times: Jacobi diverges unless damped, A has rank 1", closed_form)
+    return Draft(
+        problem,
+        "the same row many times: Jacobi diverges unless damped, A has rank 1",
+        lambda: Reference(np.full(k, FALL_SPEED / k), "closed form: the weight, shared", "slack"),
+    )
 
 
 @register_family(slabF={"friction": "coulomb"})
@@ -183,12 +183,11 @@ def near_parallel(angle: float = 1e-4) -> Draft:
     problem = _build_mass_on_two_planes(math.sin(angle), math.cos(angle))
     # 1 - c^2 = 4 angle^2 amplifies the rounding of the normals.
     unique = "impulse" if angle > 1e-3 else "slack"
-
-    def closed_form() -> Reference:
-        return Reference(np.full(2, 0.5 * FALL_SPEED / math.cos(angle)), "closed form: symmetric", unique)
-
+    load = np.full(2, 0.5 * FALL_SPEED / math.cos(angle))
     return Draft(
-        problem, "two contacts that are almost one: A is singular to float64 below 1e-8", closed_form
+        problem,
+        "two contacts that are almost one: A is singular to float64 below 1e-8",
+        lambda: Reference(load, "closed form: symmetric", unique),
     )
 
 

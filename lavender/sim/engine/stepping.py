@@ -23,8 +23,8 @@ from lavender.sim.engine.state import State
 from lavender.sim.scene import Scene
 from lavender.sim.scene.parameters import MAX_SWEEPS, MIN_SWEEPS, Parameters
 from lavender.solvers.newton import SPEC as NEWTON_SPEC
+from lavender.solvers.newton import make_warm_start_claim
 from lavender.solvers.registry import get
-from lavender.solvers.warm_start import make_warm_start_claim
 from lavender.solving.finish import FinishedRun, finish
 from lavender.solving.solve import solve
 from lavender_ext.engine.arrays import NEED_CAPACITY, OK
