@@ -1,22 +1,24 @@
-"""The requirements on every solver, one function for each."""
+"""The requirements on every solver, one function for each, and the function that tests a solver."""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+import traceback
+import warnings
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.base.errors import CapabilityError, UnknownName
+from lavender.base.errors import CapabilityError, UnknownName, format_error
 from lavender.contract.problems import EMPTY, INFEASIBLE, change_numbers, make_large_problems, make_problems
 from lavender.judge.certificates import check_certificate
 from lavender.judge.solution import Solution, Status
 from lavender.problem import Problem
-from lavender.solvers.registry import SolverSpec
+from lavender.solvers.registry import SolverSpec, get
 from lavender.solving.prepared import prepare
 from lavender.solving.solve import solve
 
@@ -39,6 +41,21 @@ class ContractError(AssertionError):
     def __init__(self, message: str, problem: str = "") -> None:
         super().__init__(message)
         self.problem = problem
+
+
+class Failure(NamedTuple):
+    """Result of a check.
+
+    Parameters
+    ----------
+    text : str
+        Sentence of the failure; empty if the requirement is met.
+    problem : str
+        Name of the problem of the failure in `make_problems`, or empty.
+    """
+
+    text: str
+    problem: str = ""
 
 
 @dataclass(frozen=True)
@@ -111,6 +128,32 @@ def check(
 def list_checks(spec: SolverSpec) -> list[Check]:
     """Return the checks that a solver has to pass."""
     return [check for check in CHECKS.values() if check.applies(spec)]
+
+
+def check_solver(name: str) -> Iterator[tuple[Check, Failure]]:
+    """Yield each check that applies to a solver, and its result.
+
+    An unknown name raises UnknownName, a missing package SolverUnavailable.
+    """
+    spec = get(name)
+    for check in list_checks(spec):
+        yield check, find_failure(spec, check)
+
+
+def find_failure(spec: SolverSpec, check: Check) -> Failure:
+    """Run a check, and return its result."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            check.run(spec)
+    except ContractError as error:
+        return Failure(str(error), error.problem)
+    except Exception as error:
+        frame = traceback.extract_tb(error.__traceback__)[-1]
+        return Failure(
+            f"{format_error(error)} was raised in {frame.filename}, line {frame.lineno} ({frame.name})"
+        )
+    return Failure("")
 
 
 def solve_to_tolerance(spec: SolverSpec, problem: Problem, **options: Any) -> Solution:

@@ -11,8 +11,7 @@ import numpy.typing as npt
 from lavender.base.arrays import FloatArray, as_array, as_csr
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.lazy_import import issparse
-from lavender.gradient.chains import CoefficientRows
-from lavender.gradient.result import COEFFICIENT_INPUTS, INPUTS, MATRICES, Gradient
+from lavender.gradient.result import COEFFICIENT_INPUTS, INPUTS, MATRICES, CoefficientRows, Gradient
 from lavender.gradient.system import MAX_KERNEL_ROWS, System, factor_dense
 from lavender.judge.residuals import residual
 from lavender.judge.states import States, compute_states, judge_and_linearise_impulse

@@ -10,7 +10,7 @@ from lavender.base.arrays import FloatArray
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.lazy_import import issparse
 from lavender.base.lazy_import import sparse as sp
-from lavender.problem import OPERATORS
+from lavender.problem import OPERATORS, Problem
 from lavender.problem.derived import cached_property
 
 MATRICES = ("A", "J", "M")
@@ -28,6 +28,51 @@ COEFFICIENT_INPUTS = ("mu", "patch_radius", "rolling")
 # Data of single rows. If linearly dependent rows share a load, no derivative by the data of one of them exists,
 # because a change would contradict the other rows.
 ROW_INPUTS = ("b", "target", "compliance", "A", "J")
+
+
+class CoefficientRows:
+    """Rows to which the coefficients of contacts apply, for the chain rule; -1 if a contact has no such row.
+
+    Attributes
+    ----------
+    first : (k,)
+        First tangent.
+    second : (k,)
+        Spin row, or second tangent of a box or ellipse.
+    rolling : (k,)
+        First rolling row.
+    has_pair : (k,) bool
+        Whether the two tangents have separate coefficients.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        c = problem.cones
+        self.mu, self.radius = c.mu, c.patch_radius
+        self.first = np.where(c.n_tangents > 0, c.ptr[:-1] + 1, -1)
+        self.ellipse = c.is_ellipse
+        self.second = np.where(self.ellipse, c.ptr[:-1] + 2, c.separate_rows)
+        self.has_pair = self.ellipse | c.is_box
+        self.rolling = c.rolling_rows
+        self.m = c.n_rows
+
+    def select_rows_or_zero(self, x: FloatArray, rows: Any) -> FloatArray:
+        """Return x (m,) at the rows (k,), 0 for row -1."""
+        return np.where(rows >= 0, x[np.maximum(rows, 0)], 0.0) if len(x) else np.zeros(len(rows))
+
+    def compute_row_coefficient_changes(
+        self, mu: FloatArray | None, radius: FloatArray | None, rolling: FloatArray | None
+    ) -> FloatArray:
+        """Compute the change de (m,) of the rows' coefficients caused by changes of the contacts' coefficients."""
+        de = np.zeros(self.m)
+        for rows, change in (
+            (self.first, None if mu is None else mu if mu.ndim == 1 else mu[:, 0]),
+            (self.second, None if mu is None else self.radius * mu if mu.ndim == 1 else mu[:, 1]),
+            (self.second, None if radius is None else self.mu * radius),
+            (self.rolling, rolling),
+        ):
+            if change is not None:
+                de[rows[rows >= 0]] += change[rows >= 0]
+        return de
 
 
 class GradientArrays:

@@ -355,8 +355,7 @@ def get_zero_impulse_reference(problem: Problem) -> tuple[float, float]:
         elif general is not None:
             free = general.v_free if general.order is None else general.v_free[general.order]
         start = measure.store_zero_impulse_residual(data, free)
-        if problem.derived.start is None:
-            problem.derived.start = start
+        problem.__dict__.setdefault("_start", start)
         if problem.generalized is not None and "csr_data" in problem.__dict__:
             problem.csr_data.share_reference(data)
     return data.reference_energy, data.reference_velocity

@@ -14,7 +14,7 @@ from lavender.base.arrays import FloatArray, check_choice, check_int, format_htm
 from lavender.base.errors import SolveFailed, require_packages
 from lavender.base.lazy_import import import_module_lazily
 from lavender.judge.residuals import Residual
-from lavender.problem.derived import late_field
+from lavender.problem.derived import cached_property, late_field
 from lavender_ext.core.checks import make_instance
 
 if TYPE_CHECKING:
@@ -315,16 +315,12 @@ class Solution:
         """w = A lambda - b (m,) [m/s], recomputed by the judge."""
         return self.residual.slack
 
-    @property
+    @cached_property
     def states(self) -> States:
         """State of each block (open, sticks, slides, at a bound or free), and its distance to another state."""
-        attributes = self.__dict__
-        if "_states" not in attributes:
-            from lavender.judge.states import compute_states
+        from lavender.judge.states import compute_states
 
-            attributes["_states"] = compute_states(self.residual._problem, self.impulse)
-        states: States = attributes["_states"]
-        return states
+        return compute_states(self.residual._problem, self.impulse)
 
     def state(self, i: int) -> State:
         """Return the state of block i (see `states`).

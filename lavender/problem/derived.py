@@ -8,7 +8,6 @@ from threading import RLock
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
 
 if TYPE_CHECKING:
-    from lavender.base.arrays import FloatArray
     from lavender_ext.core.problem import Data
 
 T = TypeVar("T")
@@ -24,19 +23,16 @@ class Derived:
     ----------
     view : Data or None
         Arrays that kernels read in generalised coordinates; set when the problem is created.
-    start : (m,) or None, N s
-        The zero impulse clipped to the bounds.
     cache : dict
         Values of other modules; each key begins with the name of its module. The key of the lock, which is held while
         a `computed_once` property is computed, is the number of the process: threads that hold the locks of another
         process do not exist in a forked one.
     """
 
-    __slots__ = ("cache", "start", "view")
+    __slots__ = ("cache", "view")
 
     def __init__(self, view: Data | None = None) -> None:
         self.view = view
-        self.start: FloatArray | None = None
         self.cache: dict[Any, Any] = {}
 
 

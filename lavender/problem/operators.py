@@ -385,12 +385,10 @@ class Operators(ProblemData):
         """Return Pi(0) (m,) [N s], the zero impulse clipped to the bounds, as a new array."""
         return self._start.copy()
 
-    @property
+    @cached_property
     def _start(self) -> FloatArray:
-        """Pi(0) (m,) [N s], a cached array that callers must not change."""
-        start = self.derived.start
-        if start is None:
-            start = self.derived.start = clip_zero_to_bounds(self.cones.lower, self.cones.upper)
+        """Pi(0) (m,) [N s], an array that callers must not change."""
+        start: FloatArray = clip_zero_to_bounds(self.cones.lower, self.cones.upper)
         return start
 
 

@@ -123,8 +123,7 @@ RULES = (
 def finish(run: FinishedRun) -> Solution:
     """Build the solution: the judge's residual, the status that it supports, and the check of the claim."""
     problem, claim, impulse, tol = run.problem, run.claim, run.impulse, run.tol
-    if not all_finite(impulse):
-        claim = name_lost_row(problem, impulse, claim)
+    claim = name_lost_row(problem, impulse, claim)
     if claim.status is INFEASIBLE:
         # Project the impulse on its bounds, so that an engine that applies it does not pull at a contact.
         impulse = project_impulse(problem.cones, impulse)

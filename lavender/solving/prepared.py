@@ -104,8 +104,18 @@ def prepare(problem: Problem, solver: str = "auto", **options: Unpack[SolverOpti
     >>> solution.success
     True
     """
-    prepared = Prepared(problem, get(solver), cast("dict[str, Any]", options))
-    prepared._complete_set_up()
+    spec = get(solver)
+    prepared = Prepared(problem, spec, cast("dict[str, Any]", options))
+    begin, setup = perf_counter(), prepared._setup
+    # Form and factor all matrices that do not depend on b.
+    if not problem.has_singular_program:
+        if spec.builtin and not spec.external and problem.m > SMALL_ROWS:
+            import_numerical_modules(*getattr(spec.load(), "lazy_modules", ()))
+        with suppress(*BREAKDOWN):  # A solve repeats it and reports the error.
+            get_zero_impulse_reference(problem.disk)
+            if isinstance(setup, SetUp):
+                setup.solver.complete(setup.state)
+    prepared.setup_time += perf_counter() - begin
     return prepared
 
 
@@ -353,18 +363,6 @@ class Prepared:
         self.problem, self._setup = original, setup
         self.setup_time += perf_counter() - begin
         return setup
-
-    def _complete_set_up(self) -> None:
-        """Form and factor all matrices that do not depend on b."""
-        begin, setup = perf_counter(), self._setup
-        if not self.problem.has_singular_program:
-            if self.spec.builtin and not self.spec.external and self.problem.m > SMALL_ROWS:
-                import_numerical_modules(*getattr(self.spec.load(), "lazy_modules", ()))
-            with suppress(*BREAKDOWN):  # A solve repeats it and reports the error.
-                get_zero_impulse_reference(self.problem.disk)
-                if isinstance(setup, SetUp):
-                    setup.solver.complete(setup.state)
-        self.setup_time += perf_counter() - begin
 
     def _start_workers(self, setup: SetUp, deadline: Deadline) -> None:
         """Start the worker processes of a solver, without counting their start as time of the solve."""

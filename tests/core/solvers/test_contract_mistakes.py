@@ -8,7 +8,7 @@ import pytest
 
 import lavender as lv
 from lavender import contract
-from lavender.contract.run import find_failure
+from lavender.contract.checks import find_failure
 from lavender.problem.cones import CONTACT_BOX, ROW
 
 
