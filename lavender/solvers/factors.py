@@ -13,12 +13,12 @@ problems with a mass ratio of 1e8.
 from __future__ import annotations
 
 import os
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray
-from lavender.base.deadline import NEVER, Deadline
+from lavender.base.deadline import NEVER
 from lavender.base.lazy_import import import_numerical_modules, lapack
 from lavender.base.lazy_import import sparse as sp
 from lavender.base.lu import factor_sparse_lu
@@ -89,21 +89,9 @@ def _compute_factorisation_choice(problem: Problem) -> tuple[str, int, IntArray 
     return "sparse", m - 1, None
 
 
-class Factor(Protocol):
-    """Interface of a factorisation of A_FF + shift D_FF for changing free sets F."""
-
-    deadline: Deadline  # Time after which `factor` returns -1.
-
-    def factor(self, place: IntArray, n_free: int, shift: float) -> int:
-        """Factor A + shift D of the rows with place >= 0, in their order; n_free may be 0.
-
-        Return the number of pivots that do not exceed PIVOT_TOLERANCE d, or -1 after the deadline.
-        """
-        ...
-
-    def solve(self, rhs: FloatArray) -> FloatArray:
-        """Solve for the free rows, (n_free,)."""
-        ...
+# The kernel of `PivotState` calls `DenseFactor`, `SparseFactor` or `LUFactor`. `factor(place, n_free, shift)` factors
+# A + shift D of the free rows, which have place >= 0, in their order. It returns the number of pivots that do not
+# exceed PIVOT_TOLERANCE d, or -1 after the deadline; n_free may be 0. `solve` solves for the free rows, (n_free,).
 
 
 class DenseFactor:

@@ -14,7 +14,6 @@ from lavender.solvers.factors import (
     MAX_COMPILED_FACTOR_ROWS,
     PIVOT_TOLERANCE,
     DenseFactor,
-    Factor,
     LUFactor,
     SparseFactor,
     choose_factorisation,
@@ -37,7 +36,7 @@ class PivotState:
         self.symmetric = problem.is_symmetric
         if problem.m > MAX_COMPILED_FACTOR_ROWS:
             import_numerical_modules()  # Factorisations and certificates use these modules.
-        factor: Factor | None = None
+        factor: DenseFactor | SparseFactor | LUFactor | None = None
         if self.symmetric:
             if (
                 like is not None
