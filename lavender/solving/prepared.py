@@ -12,7 +12,7 @@ from dataclasses import replace
 from functools import partial
 from threading import Lock
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, cast
+from typing import TYPE_CHECKING, Any, NoReturn, cast
 
 import numpy as np
 
@@ -113,27 +113,22 @@ def prepare(problem: Problem, solver: str = "auto", **options: Unpack[SolverOpti
             import_numerical_modules(*getattr(spec.load(), "lazy_modules", ()))
         with suppress(*BREAKDOWN):  # A solve repeats it and reports the error.
             get_zero_impulse_reference(problem.disk)
-            if isinstance(setup, SetUp):
+            if setup.solver is not None:
                 setup.solver.complete(setup.state)
     prepared.setup_time += perf_counter() - begin
     return prepared
 
 
 class SetUp:
-    """State of `Prepared` with a solver that is set up for its problem."""
+    """State of `Prepared`: a solver that is set up for its problem, or None, so that the next solve sets it up."""
 
-    __slots__ = ("is_used", "solver", "state")
+    __slots__ = ("failure", "is_used", "solver", "state")
 
-    def __init__(self, solver: Solver, state: Any) -> None:
+    def __init__(self, solver: Any = None, state: Any = None) -> None:
         self.solver = solver
         self.state = state  # Result of the solver's `prepare` or `update`.
         self.is_used = False  # Whether a solve has used the state, so that the next solve has to update it.
-
-
-class NotSetUp(NamedTuple):
-    """State of `Prepared` without a solver that is set up: the next solve sets it up."""
-
-    failure: str = ""  # Arithmetic error that ended the last set-up; empty if there was none.
+        self.failure = ""  # Arithmetic error that ended the set-up; empty if there was none.
 
 
 class Prepared:
@@ -164,7 +159,7 @@ class Prepared:
         self.problem = problem
         self._target: tuple[Problem, FloatArray] | None = None  # [m/s] A problem and its targets b + J v*.
         self._lock = Lock()
-        self._setup: SetUp | NotSetUp = NotSetUp()
+        self._setup = SetUp()
         self.setup_time = 0.0  # [s] Time of the preparation since the last solve.
         # `auto` has nothing to prepare before its compiled call for small problems.
         if begin and (options or not spec.delegates):
@@ -177,12 +172,12 @@ class Prepared:
     @property
     def solver(self) -> Any:
         """The solver; None if it is not set up."""
-        return getattr(self._setup, "solver", None)
+        return self._setup.solver
 
     @property
     def state(self) -> Any:
         """State that the solver has prepared; None if it is not set up."""
-        return getattr(self._setup, "state", None)
+        return self._setup.state
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copy or pickle the arguments only; the copy prepares the solver again, as two solves cannot share a state."""
@@ -247,7 +242,7 @@ class Prepared:
                 if original is not self.problem:
                     if not original.has_operator_of(self.problem):
                         check_accepted(original, self.spec)
-                    self.problem, self._setup = original, NotSetUp()
+                    self.problem, self._setup = original, SetUp()
             else:
                 deadline = None if limit == math.inf else make_deadline(self.spec, limit, begun)
                 tol, max_iter = check_arguments(self.spec, tol, max_iter, history, callback)
@@ -291,7 +286,7 @@ class Prepared:
         """
         start = None if impulse is None else original.make_start(impulse)
         setup = self._setup
-        if isinstance(setup, NotSetUp) or setup.is_used or original is not self.problem:
+        if setup.solver is None or setup.is_used or original is not self.problem:
             setup = self._set_up(original, deadline)
         problem = original.disk
         has_default_start = start is None and original.guess is None
@@ -304,7 +299,7 @@ class Prepared:
             problem=problem, solver=None, state=None, impulse=start, tol=tol, deadline=deadline, callback=callback,
             records=[] if history else None,
         )  # fmt: skip
-        if isinstance(setup, SetUp):
+        if setup.solver is not None:
             setup.is_used = True
             loop.solver, loop.state = setup.solver, setup.state
             if deadline is not None:
@@ -326,7 +321,7 @@ class Prepared:
 
     # -- set-up ----------------------------------------------------------------------------------
 
-    def _set_up(self, original: Problem, deadline: Deadline | None) -> SetUp | NotSetUp:
+    def _set_up(self, original: Problem, deadline: Deadline | None) -> SetUp:
         """Set the solver up for a problem, unless the deadline has passed; reuse its state for the same structure.
 
         The problem replaces the old one unless an error is raised.
@@ -340,14 +335,13 @@ class Prepared:
         if problem.metric.reference_energy < 0.0:
             # Compute the judge's reference before a solver gets the problem.
             get_zero_impulse_reference(problem)
-        setup: SetUp | NotSetUp
-        solver = last.solver if isinstance(last, SetUp) else _make_solver(spec, self.options)
-        if deadline is not None and deadline.has_passed():
-            setup = NotSetUp()
-        else:
+        solver, setup = last.solver, SetUp()
+        if solver is None:
+            solver = _make_solver(spec, self.options)
+        if deadline is None or not deadline.has_passed():
             try:
                 with limit_forming(deadline) if deadline is not None and deadline.is_set else UNLIMITED:
-                    if isinstance(last, SetUp) and (
+                    if last.solver is not None and (
                         not is_other or same_structure(self.problem.disk, problem)
                     ):
                         state = solver.update(last.state, problem)
@@ -357,9 +351,9 @@ class Prepared:
             except InputError:
                 raise  # The solver does not accept the problem.
             except TooLate:
-                setup = NotSetUp()
+                pass  # The solve returns TIME_LIMIT.
             except BREAKDOWN as error:
-                setup = NotSetUp(failure=format_error(error))
+                setup.failure = format_error(error)
         self.problem, self._setup = original, setup
         self.setup_time += perf_counter() - begin
         return setup
@@ -375,7 +369,7 @@ class Prepared:
 
     # -- the run ---------------------------------------------------------------------------------
 
-    def _run(self, loop: Loop, setup: SetUp | NotSetUp, max_iter: int, has_default_start: bool) -> Solution:
+    def _run(self, loop: Loop, setup: SetUp, max_iter: int, has_default_start: bool) -> Solution:
         """Run the solver unless the problem is decided without it, and build the solution."""
         spec, problem, deadline = self.spec, loop.problem, loop.deadline
         setup_time, self.setup_time = self.setup_time, 0.0
@@ -387,11 +381,9 @@ class Prepared:
             message, certificate, impossible = proof
             claim = Claim(INFEASIBLE, 0, {}, message, certificate=certificate)
             claim = self._solve_with_zero_b(loop, claim, impossible, max_iter)
-        elif isinstance(setup, NotSetUp) and setup.failure:
+        elif setup.failure:
             claim = Claim(NUMERICAL_ERROR, 0, {}, setup.failure)
-        elif isinstance(setup, NotSetUp) or (
-            deadline is not None and deadline.has_passed() and not spec.external
-        ):
+        elif setup.solver is None or (deadline is not None and deadline.has_passed() and not spec.external):
             claim = Claim(TIME_LIMIT, 0, {}, NO_TIME_MESSAGE)
             loop.keep_start()
         else:
