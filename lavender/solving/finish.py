@@ -72,17 +72,6 @@ class FinishedRun(NamedTuple):
     deadline: Deadline = NEVER  # Certificates are not polished after it.
 
 
-class Verdict(NamedTuple):
-    """Result of the comparison of a claim with the judge's residual: the fields of `Solution` that depend on it."""
-
-    status: Status
-    message: str
-    certificate: FloatArray | None = None
-    impulse_bound: float | None = None
-    claim_check: str = CONFIRMED
-    status_conflict: str = ""
-
-
 class Rule(NamedTuple):
     """One row of `RULES`: a claim in `claims` is replaced by `status` if the judge's finding `applies`."""
 
@@ -140,44 +129,41 @@ def finish(run: FinishedRun) -> Solution:
         run = run._replace(claim=claim, impulse=impulse)
     impulse.setflags(write=False)
     values = {"impulse": impulse, "tol": tol, "setup_time": run.setup_time, "solve_time": run.solve_time}
-    make_late: Callable[..., dict[str, Any]] | None = None
-    if claim.status is CONVERGED and judged.relative <= tol and (judged.roundoff_floor <= tol or tol == 0.0):
-        make_late = make_fields
-    elif claim.status is TIME_LIMIT and not min(judged.relative, judged.float64_relative) <= tol:
-        make_late = make_checked_fields if claim.certificate is None else None  # No rule changes this status.
-    if make_late is not None and not run.refutation:
+    is_met = claim.status is CONVERGED and judged.relative <= tol
+    is_met = is_met and (judged.roundoff_floor <= tol or tol == 0.0)
+    is_late = claim.status is TIME_LIMIT and not min(judged.relative, judged.float64_relative) <= tol
+    is_late = is_late and claim.certificate is None  # No rule changes this status.
+    if (is_met or is_late) and not run.refutation:
         # The other fields are computed when one of them is first read.
         late = make_residual, (problem, judged)
-        values |= {"status": claim.status, "_late_residual": late, "_rest": (make_late, (run, judged))}
+        rest = make_fields, (run, judged, is_late)
+        values |= {"status": claim.status, "_late_residual": late, "_rest": rest}
     else:
-        verdict = check_claim(run, make_residual(problem, judged))
-        values = make_fields(run, judged, verdict) | values | {"status": verdict.status}
+        values = make_fields(run, judged, True) | values
     return Solution.from_fields(values)
 
 
-def make_checked_fields(run: FinishedRun, judged: Judged) -> dict[str, Any]:
-    """Return the fields of a solution that are computed at the first access, with the check of the claim."""
-    return make_fields(run, judged, check_claim(run, make_residual(run.problem, judged)))
-
-
-def make_fields(run: FinishedRun, judged: Judged, verdict: Verdict | None = None) -> dict[str, Any]:
-    """Return the fields of a solution that are computed at the first access; by default, the claim is confirmed."""
+def make_fields(run: FinishedRun, judged: Judged, needs_check: bool = False) -> dict[str, Any]:
+    """Return the other fields of a solution, the status included if the claim needs a check; else it is confirmed."""
     spec, claim, order = run.spec, run.claim, ""
     if spec.order:
         order = get_order_name(run.options.get("order", "given"))
-    if verdict is None:
-        verdict = Verdict(claim.status, claim.message)
-    return {
-        "residual": make_residual(run.problem, judged), "iterations": claim.iterations,
-        "work": MappingProxyType(dict(claim.work)), "solver": SolverRun(spec.name, run.options, claim.form, order),
-        "message": verdict.message, "history": run.history, "dual": claim.dual, "certificate": verdict.certificate,
-        "impulse_bound": verdict.impulse_bound, "claim_check": verdict.claim_check,
-        "status_conflict": verdict.status_conflict, "sweeps_per_decade": run.sweeps_per_decade, "stages": claim.stages,
+    result = make_residual(run.problem, judged)
+    fields: dict[str, Any] = {
+        "residual": result, "iterations": claim.iterations, "work": MappingProxyType(dict(claim.work)),
+        "solver": SolverRun(spec.name, run.options, claim.form, order), "message": claim.message,
+        "history": run.history, "dual": claim.dual, "certificate": None, "impulse_bound": None,
+        "claim_check": CONFIRMED, "status_conflict": "", "sweeps_per_decade": run.sweeps_per_decade,
+        "stages": claim.stages,
     }  # fmt: skip
+    return fields | check_claim(run, result) if needs_check else fields
 
 
-def check_claim(run: FinishedRun, judged: Residual) -> Verdict:
-    """Apply `RULES` to a claim, check its certificate, and name the conflict with the judge's residual."""
+def check_claim(run: FinishedRun, judged: Residual) -> dict[str, Any]:
+    """Apply `RULES` to a claim, check its certificate, and name the conflict with the judge's residual.
+
+    Return the fields of the solution that depend on the comparison.
+    """
     problem, claim, tol, refutation = run.problem, run.claim, run.tol, run.refutation
     status, message, relative = claim.status, claim.message, judged.relative
     for rule in RULES:
@@ -220,9 +206,10 @@ def check_claim(run: FinishedRun, judged: Residual) -> Verdict:
     if tol > 0.0 and unfinished and not relative <= tol:
         message = _joined(message, describe_islands(judged, tol))
     claim_check = CONTRADICTED if status_conflict else NOT_PROVEN if unproven else CONFIRMED
-    return Verdict(
-        status, message, certificate, bound, claim_check=claim_check, status_conflict=status_conflict
-    )
+    return {
+        "status": status, "message": message, "certificate": certificate, "impulse_bound": bound,
+        "claim_check": claim_check, "status_conflict": status_conflict,
+    }  # fmt: skip
 
 
 def describe_end(problem: Problem, status: Status, iterations: int) -> str:
