@@ -47,7 +47,6 @@ class States(Sequence[State]):
     Parameters
     ----------
     problem : Problem
-    impulse : (m,), N s
     linear : Linear
         Result of `judge_and_linearise_impulse(problem, impulse)`.
 
@@ -59,8 +58,8 @@ class States(Sequence[State]):
         `State.margin` of each block.
     """
 
-    def __init__(self, problem: Problem, impulse: FloatArray, linear: Linear) -> None:
-        self._problem, self._impulse = problem, impulse
+    def __init__(self, problem: Problem, linear: Linear) -> None:
+        self._problem = problem
         self.case: Any = linear.case
         first = problem.cones.ptr[:-1]
         if len(first):
@@ -69,9 +68,6 @@ class States(Sequence[State]):
             self._code = np.maximum.reduceat(self.case, first)
         else:
             self.margin, self._code = np.zeros(0), np.zeros(0, np.int8)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return compute_states, (self._problem, self._impulse)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -106,6 +102,4 @@ def judge_and_linearise_impulse(problem: Problem, impulse: FloatArray, max_rows:
 
 def compute_states(problem: Problem, impulse: FloatArray, linear: Linear | None = None) -> States:
     """Return the states at an impulse (m,) [N s]; `linear`: the linearisation at that impulse, if known."""
-    return States(
-        problem, impulse, judge_and_linearise_impulse(problem, impulse) if linear is None else linear
-    )
+    return States(problem, judge_and_linearise_impulse(problem, impulse) if linear is None else linear)

@@ -91,7 +91,7 @@ def _compute_factorisation_choice(problem: Problem) -> tuple[str, int, IntArray 
 
 # The kernel of `PivotState` calls `DenseFactor`, `SparseFactor` or `LUFactor`. `factor(place, n_free, shift)` factors
 # A + shift D of the free rows, which have place >= 0, in their order. It returns the number of pivots that do not
-# exceed PIVOT_TOLERANCE d, or -1 after the deadline; n_free may be 0. `solve` solves for the free rows, (n_free,).
+# exceed PIVOT_TOLERANCE d, or -1 after the deadline. `solve` solves for the free rows, (n_free,).
 
 
 class DenseFactor:
@@ -104,8 +104,6 @@ class DenseFactor:
         self.d = problem.csr_data.d
 
     def factor(self, place: IntArray, n_free: int, shift: float) -> int:
-        if n_free == 0:
-            return 0
         free = np.flatnonzero(place >= 0)
         a = self.a.copy() if n_free == len(place) else self.a[np.ix_(free, free)]
         self.system = LinearSystem(n_free, USE_WIDE_LANES)
@@ -127,8 +125,6 @@ class SparseFactor:
         self.all_rows = LinearSystem(self.pattern[:2], USE_WIDE_LANES)
 
     def factor(self, place: IntArray, n_free: int, shift: float) -> int:
-        if n_free == 0:
-            return 0
         indptr, indices, data = self.pattern
         self.system, d = self.all_rows, self.d
         if n_free < self.m:
@@ -186,8 +182,8 @@ class LUFactor:
             import_numerical_modules("scipy.sparse.linalg")
 
     def factor(self, place: IntArray, n_free: int, shift: float) -> int:
-        if n_free == 0 or self.deadline.has_passed():
-            return 0 if n_free == 0 else -1
+        if self.deadline.has_passed():
+            return -1
         self.free = np.flatnonzero(place >= 0)
         if self.sparse:
             return self._factor_sparse(shift)

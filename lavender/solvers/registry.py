@@ -126,18 +126,6 @@ class Solver:
     def set_deadline(self, state: Any, deadline: Deadline) -> None:
         """Set the deadline of the next `run` of a resumable solver, whose long steps read it."""
 
-    def advance(
-        self,
-        state: Any,
-        impulse: FloatArray,
-        n: int,
-        tol: float,
-        time_limit: float | None,
-        remaining: int | None,
-    ) -> Claim:
-        """Run about `n` iterations for `auto`, up to `remaining`, continuing where the last call ended."""
-        return self.run(state, impulse, n, tol, time_limit)
-
     def fallback(self) -> Solver | None:
         """Return the solver to use after this one stalls on friction written as bounded rows (`polyhedral.py`)."""
         return None

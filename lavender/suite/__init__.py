@@ -31,19 +31,16 @@ from lavender.suite.families import (
     two_particles,
 )
 from lavender.suite.steps import (
-    LICENCES,
     engine_step,
     explain_missing_packages,
-    get_package_name_of_case,
-    get_package_versions,
     robot,
     walking,
 )
 
 __all__ = [
-    "FAMILIES", "LICENCES", "MAX_SIZE", "SETS", "Case", "Reference", "box_stack", "boxed_friction", "case", "cases",
+    "FAMILIES", "MAX_SIZE", "SETS", "Case", "Reference", "box_stack", "boxed_friction", "case", "cases",
     "chain", "default", "engine_step", "explain_missing_packages", "families", "friction", "get_case_names_of_set",
-    "get_package_name_of_case", "get_package_versions", "granular", "hang", "hard", "parse_case_name", "pyramid",
+    "granular", "hang", "hard", "parse_case_name", "pyramid",
     "random_spd", "robot", "stack", "toy_stack", "two_particles", "walking",
 ]  # fmt: skip
 __dir__ = sorted(__all__).copy  # Completion shows public names only.

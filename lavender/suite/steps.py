@@ -14,11 +14,9 @@ import numpy as np
 from lavender.base.errors import SolverUnavailable, UnknownName, check_name
 from lavender.problem import Problem
 from lavender.suite.build import GRAVITY
-from lavender.suite.case import Draft, parse_case_name, register_family
+from lavender.suite.case import Draft, register_family
 from lavender.suite.families import check_min_sizes, check_positive, multiply_in_index_order
 
-#: Licence of each package's models.
-LICENCES = {"gymnasium": "MIT", "dm_control": "Apache-2.0"}
 MODEL_FOLDERS = {"gymnasium": "envs/mujoco/assets", "dm_control": "suite"}
 MUJOCO_CONES = {"pyramidal": 0, "elliptic": 1}
 
@@ -78,7 +76,7 @@ def walking(n: int = 16, dt: float = 0.1, height: float = 0.8, foot: float = 0.1
 def robot(package: str = "gymnasium", model: str = "ant", cone: str = "pyramidal", at: int = 200) -> Draft:
     """A MuJoCo model of gymnasium or dm_control after `at` steps under controls drawn by seed 0.
 
-    The numbers depend on the versions of MuJoCo and of the package (`get_package_versions`).
+    The numbers depend on the versions of MuJoCo and of the package.
     """
     check_name("package of models", package, MODEL_FOLDERS)
     spec, message = find_spec(package), explain_missing_packages(package)
@@ -104,21 +102,7 @@ def robot(package: str = "gymnasium", model: str = "ant", cone: str = "pyramidal
     return Draft(problem, f"{model} of {package} under random controls: few rows that share many velocities")
 
 
-def get_package_name_of_case(name: str) -> str:
-    """Return the package of models that a case's name needs; empty if it needs none."""
-    if name.partition("(")[0] != "robot":
-        return ""
-    return str(parse_case_name(name)[1].get("package", "gymnasium"))
-
-
 def explain_missing_packages(package: str) -> str:
     """Return a message about packages that must be installed for the models of `package`; empty if none is missing."""
     absent = " and ".join(name for name in ("mujoco", package) if package and find_spec(name) is None)
     return f"robots of {package} need {absent}: pip install 'lavender-contact[robots]'" if absent else ""
-
-
-def get_package_versions(package: str) -> str:
-    """Return the versions of MuJoCo and of a package of models; empty for no package."""
-    from importlib.metadata import version
-
-    return ", ".join(f"{name} {version(name)}" for name in ("mujoco", package)) if package else ""

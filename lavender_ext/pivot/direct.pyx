@@ -405,7 +405,7 @@ cdef int32_t call_python_factor(void* owner, const int32_t* _place, int32_t n_fr
     if rows.error is not None:
         return -1
     try:
-        return rows.outside.factor(rows.ints[m:2 * m], n_free, shift)
+        return rows.outside.factor(rows.ints[m:2 * m], n_free, shift) if n_free > 0 else 0
     except BaseException as error:
         rows.error = error
         return -1
