@@ -127,17 +127,12 @@ def compute_block_levels_from_ground(problem: Problem, ground: Any = None) -> In
     ground = as_array("ground", ground, (None,), dtype=np.int32)
     if ground.size and (ground.min() < 0 or ground.max() >= k):
         raise InputError(f"ground holds block {ground.max()}; there are {k} blocks, numbered from 0")
+    if not ground.size:
+        return np.zeros(k, np.int32)
     graph = _build_block_graph(problem)
-    level = np.full(k, -1, np.int32)
-    front = np.unique(ground)
-    depth = 0
-    while len(front):
-        level[front] = depth
-        depth += 1
-        reached = np.unique(graph[front].indices)
-        front = reached[level[reached] < 0]
-    level[level < 0] = depth
-    return level
+    level = sp.csgraph.dijkstra(graph, unweighted=True, indices=np.unique(ground), min_only=True)
+    # Blocks that do not touch others have a level of their own.
+    return np.where(np.isfinite(level), level, level[np.isfinite(level)].max() + 1.0).astype(np.int32)
 
 
 # Bodies are renumbered if the numbers of two touching bodies differ by more than this on average. The velocities of a

@@ -73,8 +73,6 @@ VELOCITY_MAX_COST_RATIO = 10.0
 MAX_FORMED_ROWS = 3000
 SPARSE_WORK_RATIO = 4.0  # Time of a multiply-add of a sparse factor as a multiple of one of a dense factor.
 INTERRUPT_CHECK_INTERVAL = 0.05  # Longest estimated time [s] between two checks for Ctrl-C.
-# Texts of each count of the kernel: "1 exchange" and " exchanges".
-COUNT_TEXTS = tuple((format_work_count(1, kind), format_work_count(2, kind)[1:]) for kind in COUNTED)
 #: Message for each code of the first phase; None if it did not solve the problem.
 WARM_START_MESSAGES = {
     UNDECIDED: None, JUDGED: "as it came", SWEPT: "warm sweeps", SOLVED: "joints solved directly"
@@ -340,13 +338,8 @@ class Newton(Solver):
             problem, solve, impulse, max_iter - warm_factorisations, tol, deadline, steps, max_total, is_continued,
         )  # fmt: skip
         factorisations = warm_factorisations + run.counts[0]
-        message = ", ".join(
-            [
-                one if n == 1 else f"{n}{many}"
-                for n, (one, many) in zip(solve.counts, COUNT_TEXTS, strict=True)
-                if n
-            ]
-        )
+        counted = zip(solve.counts, COUNTED, strict=True)
+        message = ", ".join([format_work_count(n, kind) for n, kind in counted if n])
         work = {"factorisations": factorisations} | ({"sweeps": sweeps} if sweeps else {})
         return Claim(run.status, factorisations, work, message, form=system.form, certificate=run.certificate)
 
