@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, IntArray, check_sequence, resolve_index
+from lavender.base.arrays import FloatArray, check_sequence, resolve_index
 from lavender.base.errors import InputError
 from lavender.batch.solve import Solutions
 from lavender.gradient.derivative import MAX_ACCEPTED_RESIDUAL, Derivative, derivative
@@ -59,8 +59,7 @@ class Gradients(_PerProblem, GradientArrays):
             if name.startswith("_") or name not in INPUTS or name in MATRICES:
                 raise AttributeError(f"gradients of all problems have no {name!r}; gradients[i] may have it")
             if not self._separate and name in ("b", "target", "v_free"):
-                of = self._of
-                return self._numbers[of._velocities if name == "v_free" else of._rows]
+                return self._numbers[self._of._linears.result_indices(name == "v_free")]
             return np.concatenate([getattr(g, name) for g in self] or [np.zeros(0)])
 
 
@@ -78,14 +77,6 @@ class Derivatives(_PerProblem):
     def _items(self) -> list[Derivative]:
         get, item = self._separate.get, self._linears.item
         return [get(i) or Derivative(problem, item(i)) for i, problem in enumerate(self._problems)]
-
-    @cached_property
-    def _rows(self) -> IntArray:
-        return self._linears.result_indices(False)
-
-    @cached_property
-    def _velocities(self) -> IntArray:
-        return self._linears.result_indices(True)
 
     def vjp(self, *, velocity: Any = None, impulse: Any = None, slack: Any = None) -> Gradients:
         """Compute the gradients of each problem.

@@ -531,9 +531,3 @@ def available(problem: Problem | None = None, *, law: str | None = None, **capab
         and (law is None or law in table[name].laws)
         and all(getattr(table[name], c) == v for c, v in capabilities.items())
     ]
-
-
-def list_not_resumable(problem: Problem) -> list[str]:
-    """Return the names of built-in solvers that accept `problem` and are not resumable."""
-    kind = (s for s in specs().values() if not (s.resumable or s.external))
-    return [s.name for s in kind if not s.missing() and not s.refuses(problem)]

@@ -44,7 +44,7 @@ from lavender.judge.solution import (
 )
 from lavender.problem import Problem
 from lavender.problem.cones import project_impulse
-from lavender.solvers.registry import SolverSpec, list_not_resumable
+from lavender.solvers.registry import SolverSpec, specs
 from lavender_ext.judge.measure import Judged, all_finite, project_far_excess_of
 
 # A lower bound of every solution's impulse is reported only if it is at least this multiple of sum |b_i| / d_i, the
@@ -280,9 +280,10 @@ def _predict_iterations(run: FinishedRun, relative: float) -> str:
     remaining = per_decade * math.log10(relative / tol)
     if not run.claim.iterations < remaining < math.inf:
         return ""
+    others = [s for s in specs().values() if not (s.resumable or s.external or s.missing())]
     return (
         f"the residual falls tenfold in {per_decade:.3g} iterations, so tol needs about {remaining:.2g} more; "
-        f"solvers of another kind may be faster: {', '.join(list_not_resumable(run.problem))}"
+        f"solvers of another kind may be faster: {', '.join(s.name for s in others if not s.refuses(run.problem))}"
     )
 
 
