@@ -124,20 +124,6 @@ cdef inline double compute_sweep_step(acceleration_t* c, const blocks_t* p, cons
     return sqrt(subtract_and_weighted_norm(p.d, x, lam, p.n_rows))
 
 
-cdef inline void test_law(acceleration_t* c, const mixing_t* mixing, const double* lam) noexcept nogil:
-    """Compare both laws at lam (m) [N s]: begin the iterations under the cone law, or end them if (4) or (5) holds."""
-    cdef bint is_first = c.iterations == c.convex_begin, slips
-    cdef double coulomb = compute_sweep_step(c, c.sweeps.blocks, lam)
-    cdef double cone = compute_sweep_step(c, &c.cone, lam)
-    slips = not is_first and cone < 0.5 * coulomb and coulomb > 0.8 * c.last_coulomb_step
-    if slips or coulomb < (0.15 if is_first else 0.95) * cone:
-        c.convex = c.iterations
-    if is_first != (c.convex == c.iterations):          # The law changes.
-        clear_mixing_memory(mixing)
-    c.last_coulomb_step = coulomb
-    c.next_law_test = 2 * c.iterations
-
-
 cdef public void lav_nncg(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
     """Run n iterations (1) of nncg on lam (m) [N s] in place; first_sweep is 1 if no sweep was made before."""
     cdef acceleration_t* c = <acceleration_t*>context
@@ -188,6 +174,8 @@ cdef public void lav_anderson(void* context, double* lam, int32_t first_sweep, i
     cdef acceleration_t* c = <acceleration_t*>context
     cdef const blocks_t* p = c.sweeps.blocks
     cdef int32_t m = p.n_rows, i, s, mixed
+    cdef bint is_first, slips
+    cdef double coulomb, cone
     cdef double* x = c.work                             # x, later f
     cdef double* root                                   # (m) square roots of d
     cdef mixing_t mixing
@@ -208,7 +196,16 @@ cdef public void lav_anderson(void* context, double* lam, int32_t first_sweep, i
             c.last_coulomb_step = 1.0 / 0.0
     for s in range(n):
         if c.iterations == c.next_law_test and c.iterations < c.convex:
-            test_law(c, &mixing, lam)
+            # Begin the iterations under the cone law, or end them if (4) or (5) holds.
+            is_first = c.iterations == c.convex_begin
+            coulomb, cone = compute_sweep_step(c, p, lam), compute_sweep_step(c, &c.cone, lam)
+            slips = not is_first and cone < 0.5 * coulomb and coulomb > 0.8 * c.last_coulomb_step
+            if slips or coulomb < (0.15 if is_first else 0.95) * cone:
+                c.convex = c.iterations
+            if is_first != (c.convex == c.iterations):  # The law changes.
+                clear_mixing_memory(&mixing)
+            c.last_coulomb_step = coulomb
+            c.next_law_test = 2 * c.iterations
         # Do not limit sum |gamma|: recorded rockfalls need large sums to reach a residual of 1e-10.
         mixed = mix_anderson_iterates(&mixing, lam, 1.0 / 0.0)
         if mixed:

@@ -32,8 +32,7 @@ from libc.stdint cimport int32_t, int64_t
 
 import numpy as np
 
-from lavender_ext.accelerate.body_solve cimport (bind_body_solve, body_solve_t, body_solve_workspace_size,
-                                                 compute_body_inverses, solve_body_system)
+from lavender_ext.accelerate.body_solve cimport body_solve_t, compute_body_inverses, solve_body_system, BODY_SIZE
 from lavender_ext.accelerate.mixing cimport (CONTROL, MAX_MEMORY, UNDONE, clear_mixing_memory, mix_anderson_iterates, mixing_t,
                                              store_evaluation)
 from lavender_ext.core.block cimport (clip, euclidean_norm, norm2, index_of_row_group, classify_in_round_cone,
@@ -52,11 +51,6 @@ cdef enum:
     # limit, a block that becomes active would have a wrong c. Above 1e6, rho and the mixing lose digits of the other blocks to
     # rounding (tested with |b| up to 1e60).
     MAX_INACTIVE_RATIO = 10000
-
-
-cdef inline double max_start_ratio() noexcept nogil:
-    """Return the largest residual of a start under Coulomb's law, relative to the cone law, with which the shift is on."""
-    return 0.15
 
 
 cdef struct factor_t:           # factor of B + rho, or of the body form (2), or conjugate gradients on (2)
@@ -356,7 +350,7 @@ cdef public void lav_admm_start(admm_t* c, const double* lam, const double* w) n
             if not has_independent_rows(p, i):
                 c.y[p.ptr[i]] -= compute_friction_shift_of_normal(p, c.root, i, c.y)
         coulomb = compute_start_residual(c)
-        c.shifted = coulomb < max_start_ratio() * cone
+        c.shifted = coulomb < 0.15 * cone
         if not c.shifted:
             for i in range(p.n_rows):
                 c.y[i] = c.before[i]
@@ -401,8 +395,10 @@ cdef class BodySolve:
         self.keep = k_ptr, k_col, k_val, e
         self.f.m, self.f.n = <int32_t>len(e), n
         self.f.k_ptr, self.f.k_col, self.f.k_val, self.f.e = &k_ptr[0], &k_col[0], &k_val[0], &e[0]
-        self.workspace = np.zeros(<Py_ssize_t>body_solve_workspace_size(n))
-        bind_body_solve(&self.f, &self.workspace[0])
+        self.workspace = np.zeros((BODY_SIZE + 4) * <Py_ssize_t>n)
+        self.f.t = &self.workspace[0]
+        self.f.residual, self.f.direction, self.f.product = self.f.t + n, self.f.t + 2 * n, self.f.t + 3 * n
+        self.f.inverse = self.f.t + 4 * n
         if before is not None:
             self.workspace[:n] = before.workspace[:n]
             self.f.iterations = before.f.iterations

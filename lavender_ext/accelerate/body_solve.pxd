@@ -5,7 +5,7 @@ residual is at most 0.05 of the residual of that start (0.03 to 0.1 cost about t
 changes of b. No factor is stored: an iteration takes two multiply-adds per entry of K.
 """
 from libc.math cimport sqrt
-from libc.stdint cimport int32_t, int64_t
+from libc.stdint cimport int32_t
 
 from lavender_ext.core.dot cimport dot
 
@@ -28,19 +28,6 @@ cdef struct body_solve_t:
     double* direction           # (n)
     double* product             # (n)
     double iterations           # number of iterations of all solves
-
-
-cdef inline int64_t body_solve_workspace_size(int64_t n) noexcept nogil:
-    """Return the number of doubles of workspace."""
-    return (BODY_SIZE + 4) * n
-
-
-cdef inline void bind_body_solve(body_solve_t* f, double* workspace) noexcept nogil:
-    """Bind the arrays to workspace (`body_solve_workspace_size`); t must be initialised by the caller."""
-    cdef int64_t n = f.n
-    f.t, f.residual, f.direction, f.product = workspace, workspace + n, workspace + 2 * n, workspace + 3 * n
-    f.inverse = workspace + 4 * n
-    f.iterations = 0.0
 
 
 cdef inline void invert_body_block(double* a) noexcept nogil:

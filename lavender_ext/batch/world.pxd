@@ -12,7 +12,7 @@ from lavender_ext.core.generalized cimport multiply_jacobian_row
 from lavender_ext.core.mass cimport THIN_PADDING, compress_lower_triangle, compress_dense_rows, factor_mass, ordering_pays_off
 from lavender_ext.core.tree cimport find_tree_factor_pattern
 from lavender_ext.core.method cimport workspace_t
-from lavender_ext.core.block_types cimport blocks_t, offset_block_arrays
+from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.judge.rounding cimport mass_t
 from lavender_ext.host cimport grow_workspace_to
 from lavender_ext.core.thin cimport thin
@@ -216,7 +216,8 @@ cdef inline int32_t convert_world_blocks(const worlds_t* w, const int64_t* at, b
     for k in range(p.n_blocks + 1):
         ptr[k] = all.ptr[block + k] - first
     p.b, p.ptr, p.lower, p.upper = b, ptr, all.lower + first, all.upper + first
-    offset_block_arrays(p, all, block)
+    p.kind, p.mu = all.kind + block, all.mu + block
+    p.patch_radius, p.rolling = all.patch_radius + block, all.rolling + block
     if w.array[5] != NULL:
         convert_entries_to_float64(w, 5, at[MU], p.n_blocks, mu)
         p.mu = mu

@@ -24,21 +24,6 @@ from lavender_ext.core.view cimport get_block_bodies, get_moving_body, rows_t
 cdef object F8 = np.dtype(np.float64), I4 = np.dtype(np.int32)
 
 
-cdef void expand_rows(const blocks_t* p, const rows_t* r, double* jac, double* minv_jac) noexcept nogil:
-    """Write J and M^-1 J^T (m, 12) of every row, in the layout of joint rows: linear and angular on body a, then on body b."""
-    cdef int32_t i, j, k
-    cdef const int32_t* bodies
-    cdef const double* rows
-    for i in range(p.n_blocks):
-        j = p.ptr[i]
-        bodies = get_block_bodies(r, i)
-        rows = get_block_jacobian(p, r, i, jac + 12 * j)
-        if i < r.n_joints:
-            memcpy(jac + 12 * j, rows, 12 * (p.ptr[i + 1] - j) * sizeof(double))
-        for k in range(j, p.ptr[i + 1]):
-            multiply_inverse_mass(jac + 12 * k, r.inv_mass, r.inv_inertia, bodies[0], bodies[1], minv_jac + 12 * k)
-
-
 cdef public void lav_list_blocks_of_bodies(const blocks_t* p, const rows_t* r, int32_t* start, int32_t* blocks,
                                            int64_t* bound) noexcept nogil:
     """List the blocks of body i in increasing order in blocks[start[i]:start[i + 1]]; start (n + 1), blocks (2 k).
@@ -98,21 +83,10 @@ cdef inline int32_t list_coupled_blocks(const rows_t* r, int32_t i, const int32_
     return n
 
 
-cdef inline int32_t find_shared_bodies(const rows_t* r, int32_t i, int32_t j) noexcept nogil:
-    """Return a bit set. Bit 2 s + t is set if body s (0 or 1) of block i and body t of block j are the same moving body."""
-    cdef int32_t s, t, x, bits = 0
-    for s in range(2):
-        x = get_moving_body(r, i, s)
-        for t in range(2):
-            if x >= 0 and x == get_block_bodies(r, j)[t]:
-                bits |= 1 << (2 * s + t)
-    return bits
-
-
 cdef inline double compute_coupling_entry(const double* jac, const double* minv_jac, int32_t bits) noexcept nogil:
     """Return the entry of A of two rows, J (12) of one times M^-1 J^T (12) of the other over the bodies that they share.
 
-    bits is the result of `find_shared_bodies`.
+    Bit 2 s + t of `bits` is set if body s of the first row is body t of the other.
     """
     cdef double value = 0.0
     if bits & 1:
@@ -138,16 +112,30 @@ cdef public void lav_form_delassus_matrix(const blocks_t* p, const rows_t* r, co
     cdef int32_t* sides = scratch + 2 * <int64_t>p.n_blocks + 1
     # Entry of each row above the diagonal that will be copied next, into the row of that entry's column.
     cdef int32_t* next_ = sides + 2 * <int64_t>p.n_blocks + 1
-    cdef int32_t i, n, q, j, row, col, end, at, bit, nnz = 0
+    cdef int32_t i, n, q, j, row, col, end, at, bit, s, t, body, nnz = 0
     cdef double value
+    cdef const int32_t* bodies
     cdef const double* x
     cdef const double* y
-    expand_rows(p, r, jac, minv_jac)
+    for i in range(p.n_blocks):                         # J and M^-1 J^T (m, 12) in the layout of joint rows, of bodies a and b
+        row = p.ptr[i]
+        x = get_block_jacobian(p, r, i, jac + 12 * row)
+        if i < r.n_joints:
+            memcpy(jac + 12 * row, x, 12 * (p.ptr[i + 1] - row) * sizeof(double))
+        bodies = get_block_bodies(r, i)
+        for row in range(p.ptr[i], p.ptr[i + 1]):
+            multiply_inverse_mass(jac + 12 * row, r.inv_mass, r.inv_inertia, bodies[0], bodies[1], minv_jac + 12 * row)
     indptr[0] = 0
     for i in range(p.n_blocks):
         n = list_coupled_blocks(r, i, start, blocks, neighbors)
         for q in range(n):
-            sides[q] = find_shared_bodies(r, i, neighbors[q]) if i <= neighbors[q] else 0
+            # Bit 2 s + t is set if body s (0 or 1) of block i and body t of its neighbour are the same moving body.
+            sides[q] = 0
+            for s in range(2 if i <= neighbors[q] else 0):
+                body = get_moving_body(r, i, s)
+                for t in range(2):
+                    if body >= 0 and body == get_block_bodies(r, neighbors[q])[t]:
+                        sides[q] |= 1 << (2 * s + t)
         for row in range(p.ptr[i], p.ptr[i + 1]):
             for q in range(n):
                 j = neighbors[q]
@@ -440,13 +428,14 @@ cdef bint has_identical_row_columns(int32_t m, const int32_t* indptr, const int3
     return True
 
 
-cdef bint form_dense_gram_matrix(int32_t m, int64_t n, const double* y, const double* y_transposed, double* a,
-                                 deadline_t* deadline) noexcept nogil:
-    """Compute a (m, m) = Y Y^T of a dense Y (m, n), summed in the order of the columns, as in `form_sparse_gram_matrix`.
+cdef int32_t form_dense_gram_matrix(int32_t m, int64_t n, const double* y, const double* y_transposed, const double* diagonal,
+                                    int32_t* count, int32_t* out, double* a, deadline_t* deadline) noexcept nogil:
+    """Write A = Y Y^T + D of a dense Y (m, n) to `count`, `out` and `a` as compressed rows without zero entries.
 
-    Return False if the deadline has passed before the end.
+    The sums are in the order of the columns, as in `form_sparse_gram_matrix`. Return the number of entries, or -1 if the
+    deadline has passed before the end.
     """
-    cdef int32_t tiles = (m + TILE - 1) // TILE, down, right, i, j, r, c, high, wide
+    cdef int32_t tiles = (m + TILE - 1) // TILE, down, right, i, j, r, c, high, wide, to = 0
     cdef int64_t k
     cdef double x
     cdef double s[TILE * TILE]
@@ -471,23 +460,15 @@ cdef bint form_dense_gram_matrix(int32_t m, int64_t n, const double* y, const do
                 for c in range(wide):
                     a[<int64_t>(i + r) * m + j + c] = a[<int64_t>(j + c) * m + i + r] = s[TILE * r + c]
             if has_passed(deadline, TILE * TILE * n * 0.5):     # A multiply-add takes 0.5 ns.
-                return False
-    return True
-
-
-cdef int32_t compress_dense_gram_matrix(int32_t m, const double* diagonal, int32_t* count, int32_t* out,
-                                        double* entry) noexcept nogil:
-    """Add D to the dense A (m, m) and compress it to rows without zero entries; return the number of entries."""
-    cdef int32_t i, j, to = 0
-    cdef double x
-    for i in range(m):
+                return -1
+    for i in range(m):                                  # Add D to the dense (m, m) matrix and compress it.
         count[i] = to
         for j in range(m):
-            x = entry[<int64_t>i * m + j]
+            x = a[<int64_t>i * m + j]
             if i == j:
                 x += diagonal[i]
             if x != 0.0:
-                out[to], entry[to] = j, x
+                out[to], a[to] = j, x
                 to += 1
     count[m] = to
     return to
@@ -527,10 +508,7 @@ def form_gram_matrix(const double[::1] data, const int32_t[::1] indices, const i
     out, entry = out_array, entry_array
     with nogil:
         if full:
-            if form_dense_gram_matrix(m, nnz // m, numbers, &value[0], &entry[0], end):
-                total = compress_dense_gram_matrix(m, &diagonal[0], &count[0], &out[0], &entry[0])
-            else:
-                total = -1
+            total = form_dense_gram_matrix(m, nnz // m, numbers, &value[0], &diagonal[0], &count[0], &out[0], &entry[0], end)
         else:
             total = form_sparse_gram_matrix(m, &indptr[0], columns, numbers, ptr, row, &value[0], &diagonal[0], scratch,
                                             &value[nnz], &count[0], &out[0], &entry[0], end)

@@ -63,16 +63,6 @@ cdef struct friction_components_t:      # friction components of one contact
     double friction_coefficient[MAX_FRICTION_COMPONENTS]    # a_g of (1)
 
 
-cdef inline void bind_friction_arrays(blocks_t* p, const double* x, Py_ssize_t stride) noexcept nogil:
-    """Point mu, patch_radius and rolling of `p` at x, x + stride and x + 2 stride."""
-    p.mu, p.patch_radius, p.rolling = x, x + stride, x + 2 * stride
-
-
-cdef inline void offset_block_arrays(blocks_t* p, const blocks_t* all, int32_t i) noexcept nogil:
-    """Point the arrays of `p` with one entry per block at block i of `all`."""
-    p.kind, p.mu, p.patch_radius, p.rolling = all.kind + i, all.mu + i, all.patch_radius + i, all.rolling + i
-
-
 cdef inline bint allows_rows(int32_t kind, int32_t n) noexcept nogil:
     """Return whether a block of this kind may have n rows."""
     if kind == ROW:

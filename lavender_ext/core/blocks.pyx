@@ -9,8 +9,8 @@ import numpy as np
 
 from lavender_ext.core.arrays cimport DOUBLE, INT, make_read_only, has_element_type, ndarray
 from lavender_ext.core.faults cimport CONTACT_ELLIPSE, NO_FAULT, find_block_fault, find_body_block_fault
-from lavender_ext.core.block_types cimport (CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, ROUND, ROW, bind_friction_arrays,
-                                            blocks_t, choose_contact_kind, write_contact_bounds)
+from lavender_ext.core.block_types cimport (CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, ROUND, ROW, blocks_t,
+                                            choose_contact_kind, write_contact_bounds)
 
 #: Kernel numbers of the kinds of blocks.
 KINDS = (ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING, CONTACT_ELLIPSE)
@@ -103,7 +103,8 @@ cdef Blocks allocate_blocks(Py_ssize_t k, Py_ssize_t m, Py_ssize_t ints=0, Py_ss
     blocks.at.kind = blocks.at.ptr + k + 1
     blocks.at.lower = <double*>(<ndarray>blocks.numbers).data
     blocks.at.upper = blocks.at.lower + m
-    bind_friction_arrays(&blocks.at, blocks.at.upper + m, k)
+    blocks.at.mu = blocks.at.upper + m
+    blocks.at.patch_radius, blocks.at.rolling = blocks.at.mu + k, blocks.at.mu + 2 * k
     return blocks
 
 

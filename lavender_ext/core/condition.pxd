@@ -48,12 +48,3 @@ cdef inline double estimate_condition(const generalized_t* g, double* x) noexcep
 cdef inline double get_condition(const generalized_t* g, double* x) noexcept nogil:
     """Return the estimate stored with the factor, or a new one; x (2 n) is scratch."""
     return g.condition if g.condition > 0.0 else estimate_condition(g, x)
-
-
-cdef inline double bound_condition_by_determinant(const generalized_t* g) noexcept nogil:
-    """Return the upper bound e / det H of |H^-1|, which follows from trace H = n and is very loose for large n."""
-    cdef int32_t i
-    cdef double det = 1.0
-    for i in range(g.n):
-        det *= g.inv_pivot[i] * g.mval[g.mptr[i + 1] - 1]
-    return 2.72 * det

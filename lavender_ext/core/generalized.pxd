@@ -160,33 +160,6 @@ cdef inline void add_panel_transpose_product(const generalized_t* g, int32_t pan
         y += nc
 
 
-cdef inline void add_abs_panel_transpose_product(const generalized_t* g, int32_t panel, const double* lam,
-                                                 double* x) noexcept nogil:
-    """Add |Y|^T |lam| of the rows of a panel to x (n)."""
-    cdef int32_t i, a, first = g.prow[panel], end = g.prow[panel + 1], nc = g.pcol[panel + 1] - g.pcol[panel]
-    cdef const int32_t* cols = g.cols + g.pcol[panel]
-    cdef const double* y = g.y + g.pval[panel]
-    for i in range(first, end):
-        if lam[i] != 0.0:
-            for a in range(nc):
-                x[cols[a]] += fabs(y[a] * lam[i])
-        y += nc
-
-
-cdef inline void multiply_abs_whitened_panel(const generalized_t* g, int32_t panel, const double* x, double* out) noexcept nogil:
-    """Compute out (m) = |Y| x on the rows of a panel, for x >= 0."""
-    cdef int32_t i, a, first = g.prow[panel], end = g.prow[panel + 1], nc = g.pcol[panel + 1] - g.pcol[panel]
-    cdef const int32_t* cols = g.cols + g.pcol[panel]
-    cdef const double* y = g.y + g.pval[panel]
-    cdef double s
-    for i in range(first, end):
-        s = 0.0
-        for a in range(nc):
-            s += fabs(y[a]) * x[cols[a]]
-        out[i] = s
-        y += nc
-
-
 cdef class Operator:
     cdef generalized_t g                # without panels and compliance
     cdef readonly int failed            # the row of M with a pivot that is not positive, or -1

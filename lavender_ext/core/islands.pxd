@@ -117,14 +117,3 @@ cdef inline int32_t find_islands(const view_t* v, int32_t* index, islands_t* out
     out.n, out.label, out.ptr, out.order = count, label, ptr, order
     out.terms = NULL
     return count
-
-
-cdef inline void list_one_island(int32_t k, int32_t* index, islands_t* out) noexcept nogil:
-    """Write all k blocks as one island into `out`, with arrays in index (3 k + 2)."""
-    cdef int32_t i
-    for i in range(k):
-        index[i] = 0
-        index[k + i] = i
-    index[2 * k], index[2 * k + 1] = 0, k
-    out.terms = NULL
-    out.n, out.label, out.order, out.ptr = 1, index, index + k, index + 2 * k

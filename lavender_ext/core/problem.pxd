@@ -32,7 +32,6 @@ cdef struct derived_t:          # derived numbers in generalised coordinates; th
     double values               # number of values of Y
 
 
-cdef double count_gram_matrix_products(const generalized_t* g, double* on) noexcept nogil
 cdef int32_t compute_derived_numbers_of_jacobian(blocks_t* p, generalized_t* g, derived_t* out) noexcept nogil
 
 

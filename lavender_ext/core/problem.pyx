@@ -27,7 +27,7 @@ from lavender_ext.core.block_types cimport (CONE, COULOMB, MAX_FRICTION_COMPONEN
                                             count_angular_rows, get_friction_components, friction_components_t)
 from lavender_ext.core.rows cimport (compute_contact_delassus_block, dot12, largest_eigenvalue_2x2, multiply_inverse_mass,
                                      multiply_jacobian)
-from lavender_ext.core.steps cimport finish_metric, largest_eigenvalue_of_csr_pair
+from lavender_ext.core.steps cimport finish_metric
 from lavender_ext.core.whiten cimport find_panel_pattern, whiten_panel
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.core.weights cimport compute_velocity_weights, set_angular_joint_weights
@@ -53,6 +53,16 @@ cdef inline void replace_empty_diagonal(int32_t m, double* d) noexcept nogil:
             d[i] = mean
 
 
+cdef inline double get_csr_entry(const csr_t* a, int32_t i, int32_t j) noexcept nogil:
+    """Return A_ij."""
+    cdef int32_t q
+    cdef double s = 0.0
+    for q in range(a.indptr[i], a.indptr[i + 1]):
+        if a.indices[q] == j:
+            s += a.data[q]
+    return s
+
+
 cdef public int32_t lav_compute_csr_diagonal(const blocks_t* p, const csr_t* a, int32_t* empty) noexcept nogil:
     """Compute p.d, p.nu and p.step from the rows of A; mark empty rows (m) and return their number."""
     cdef double* d = <double*>p.d
@@ -74,14 +84,17 @@ cdef public int32_t lav_compute_csr_diagonal(const blocks_t* p, const csr_t* a, 
         if empty[i]:
             d[i] = 0.0
         n_empty += empty[i]
-        step[i] = big                                   # Store the largest |A_ij| of the row, which (3) needs below.
+        step[i] = big                                   # Store the largest |A_ij| of the row for the end of this function.
     replace_empty_diagonal(p.n_rows, d)
     for i in range(p.n_blocks):
         j = p.ptr[i]
         get_friction_components(p, i, &part)
         for g in range(part.n):
             if part.size[g] == 2:
-                eigenvalue[g] = largest_eigenvalue_of_csr_pair(a, j + part.first[g], step)
+                q = j + part.first[g]                   # (3) of core/steps.pxd, or 0 if it is at most 0 within rounding
+                x = largest_eigenvalue_2x2(get_csr_entry(a, q, q), 0.5 * (get_csr_entry(a, q, q + 1) + get_csr_entry(a, q + 1, q)),
+                                           get_csr_entry(a, q + 1, q + 1))
+                eigenvalue[g] = x if x > 1e-10 * (step[q] if step[q] > step[q + 1] else step[q + 1]) else 0.0
         finish_metric(p, i, eigenvalue, d, step)
     compute_velocity_weights(p, d, <double*>p.nu)
     return n_empty
@@ -227,22 +240,6 @@ cdef void bind_derived_numbers(blocks_t* p, generalized_t* g, const derived_t* d
     g.pval = g.pcol + k + 1
     g.home = derived.empty + m + 1
     g.cols = g.home + k
-
-
-cdef double count_gram_matrix_products(const generalized_t* g, double* on) noexcept nogil:
-    """Return the value of `Data.entries_of_matrix`. on (n) is scratch: at the root of each tree, the number of its rows."""
-    cdef int32_t b, q, rows
-    cdef double out = 0.0, dense = <double>g.m * g.m
-    for b in range(g.n):
-        on[b] = 0.0
-    for b in range(g.n_panels):
-        rows = g.prow[b + 1] - g.prow[b]
-        for q in range(g.pcol[b], g.pcol[b + 1]):
-            if g.parent[g.cols[q]] < 0:
-                on[g.cols[q]] += rows
-    for b in range(g.n):
-        out += on[b] * on[b]
-    return out if out < dense else dense
 
 
 cdef int32_t compute_derived_numbers_of_jacobian(blocks_t* p, generalized_t* g, derived_t* out) noexcept nogil:
@@ -483,8 +480,17 @@ cdef class Data:
     @property
     def entries_of_matrix(self):
         """Upper bound on the entries of A, from J and M: rows on the same tree are coupled; rows on two trees count twice."""
-        cdef double[::1] on = np.empty(self.general.n + 1)
-        return count_gram_matrix_products(&self.general, &on[0])
+        cdef const generalized_t* g = &self.general
+        cdef double[::1] on = np.zeros(g.n + 1)         # at the root of each tree, the number of its rows
+        cdef int32_t b, q
+        cdef double out = 0.0
+        for b in range(g.n_panels):
+            for q in range(g.pcol[b], g.pcol[b + 1]):
+                if g.parent[g.cols[q]] < 0:
+                    on[g.cols[q]] += g.prow[b + 1] - g.prow[b]
+        for b in range(g.n):
+            out += on[b] * on[b]
+        return min(out, <double>g.m * g.m)
 
     @property
     def products_of_matrix(self):

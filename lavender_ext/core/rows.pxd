@@ -53,29 +53,16 @@ cdef inline void compute_relative_velocity(const double* v, int32_t a, int32_t b
 
 
 cdef inline void apply_impulse_to_body(double* v, double inv_mass, const double* inv_inertia, const double* arm,
-                                       const double* impulse, const double* twist, double sign) noexcept nogil:
-    """Apply an impulse to one body by (3); twist = s n [N m s], or NULL. `sign` is -1 for body a, 1 for body b."""
+                                       const double* impulse, double sign) noexcept nogil:
+    """Apply an impulse to one body by (3) without s. `sign` is -1 for body a, 1 for body b."""
     cdef double l[3]
     cdef int32_t k
     cross(arm, impulse, l)
-    if twist != NULL:
-        for k in range(3):
-            l[k] += twist[k]
     for k in range(3):
         l[k] = sign * l[k]
         v[k] += sign * inv_mass * impulse[k]
     for k in range(3):
         v[3 + k] += dot3(inv_inertia + 3 * k, l)
-
-
-cdef inline void apply_impulse_to_bodies(double* v, int32_t a, int32_t b, const double* inv_mass, const double* inv_inertia,
-                                         const double* arm_a, const double* arm_b, const double* impulse,
-                                         const double* twist) noexcept nogil:
-    """Apply an impulse (3) [N s] and an angular impulse `twist` (3) [N m s] or NULL to the velocities of both bodies by (3)."""
-    if a >= 0:
-        apply_impulse_to_body(v + 6 * a, inv_mass[a], inv_inertia + 9 * a, arm_a, impulse, twist, -1.0)
-    if b >= 0:
-        apply_impulse_to_body(v + 6 * b, inv_mass[b], inv_inertia + 9 * b, arm_b, impulse, twist, 1.0)
 
 
 cdef inline double joint_row_velocity(const double* jac, const double* v, int32_t a, int32_t b) noexcept nogil:

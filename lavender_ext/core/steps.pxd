@@ -9,29 +9,7 @@
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block_types cimport blocks_t, friction_components_t, get_row_groups, is_round_cone_contact
-from lavender_ext.core.rows cimport largest_eigenvalue_2x2, reciprocal_or_zero
-from lavender_ext.core.view cimport csr_t
-
-
-cdef inline double get_csr_entry(const csr_t* a, int32_t i, int32_t j) noexcept nogil:
-    """Return A_ij."""
-    cdef int32_t q
-    cdef double s = 0.0
-    for q in range(a.indptr[i], a.indptr[i + 1]):
-        if a.indices[q] == j:
-            s += a.data[q]
-    return s
-
-
-cdef inline double largest_eigenvalue_of_csr_pair(const csr_t* a, int32_t j, const double* big) noexcept nogil:
-    """Return lambda_max of (3) on rows j and j + 1, or 0 if lambda_max is zero or negative within rounding.
-
-    big (m) is the largest absolute entry of each row of A.
-    """
-    cdef double scale = big[j] if big[j] > big[j + 1] else big[j + 1], e
-    e = largest_eigenvalue_2x2(get_csr_entry(a, j, j), 0.5 * (get_csr_entry(a, j, j + 1) + get_csr_entry(a, j + 1, j)),
-                           get_csr_entry(a, j + 1, j + 1))
-    return e if e > 1e-10 * scale else 0.0
+from lavender_ext.core.rows cimport reciprocal_or_zero
 
 
 cdef inline void finish_pair(double eigenvalue, double* d, double* step) noexcept nogil:

@@ -17,23 +17,6 @@ cdef inline void add_vector_6(double* total, const double* x) noexcept nogil:
         total[k] += x[k]
 
 
-cdef inline void add_joint_wrench(const blocks_t* p, const rows_t* r, int32_t i, const double* lam, double* f) noexcept nogil:
-    """Add J^T lam of joint i to f (n, 6)."""
-    cdef double x[12]
-    cdef const double* row
-    cdef int32_t j, k, a = r.joint_body[2 * i], b = r.joint_body[2 * i + 1]
-    for k in range(12):
-        x[k] = 0.0
-    for j in range(p.ptr[i], p.ptr[i + 1]):
-        row = r.jac + 12 * j
-        for k in range(12):
-            x[k] += row[k] * lam[j]
-    if a >= 0:
-        add_vector_6(f + 6 * a, x)
-    if b >= 0:
-        add_vector_6(f + 6 * b, x + 6)
-
-
 cdef inline void add_contact_wrench(const rows_t* r, int32_t c, int32_t nt, int32_t n_angular, const double* lam,
                                     double* f) noexcept nogil:
     """Add J^T lam of contact c to f (n, 6); lam points at its normal."""
@@ -85,11 +68,22 @@ cdef inline void apply_body_inverse_mass(const rows_t* r, double* v) noexcept no
 
 cdef inline void compute_body_wrenches(const blocks_t* p, const rows_t* r, const double* lam, double* f) noexcept nogil:
     """Compute f (n, 6) = J^T lam of all blocks."""
-    cdef int32_t i, j, c, nt, n_angular
+    cdef int32_t i, j, k, c, nt, n_angular
+    cdef double x[12]
+    cdef const double* row
     for i in range(6 * r.n_bodies):
         f[i] = 0.0
     for i in range(r.n_joints):
-        add_joint_wrench(p, r, i, lam, f)
+        for k in range(12):
+            x[k] = 0.0
+        for j in range(p.ptr[i], p.ptr[i + 1]):
+            row = r.jac + 12 * j
+            for k in range(12):
+                x[k] += row[k] * lam[j]
+        if r.joint_body[2 * i] >= 0:
+            add_vector_6(f + 6 * r.joint_body[2 * i], x)
+        if r.joint_body[2 * i + 1] >= 0:
+            add_vector_6(f + 6 * r.joint_body[2 * i + 1], x + 6)
     for c in range(r.n_contacts):
         i = r.n_joints + c
         j = p.ptr[i]

@@ -103,12 +103,6 @@ cdef inline void advance_rotation(double* q, double* omega, const double* inerti
     multiply_by_world_tensor(r, inv_inertia, momentum, omega)
 
 
-cdef inline int32_t is_body_out_of_range(const engine_t* e, int32_t body) noexcept nogil:
-    """Return whether the body's state is outside the range that core/validate.pxd (1) allows."""
-    return (find_invalid_number(e.v + 6 * body, 6) >= 0 or find_invalid_number(e.x + 3 * body, 3) >= 0
-            or find_invalid_number(e.q + 4 * body, 4) >= 0)
-
-
 cdef inline void begin_body_substep(engine_t* e) noexcept nogil:
     """Compute frames, world inverse inertia and v* = v + h g of the coming substep."""
     cdef int32_t i, b
@@ -150,6 +144,7 @@ cdef inline int32_t advance_bodies(engine_t* e, int32_t shifted) noexcept nogil:
         if shifted:
             add_scaled3(x, 1.0, e.shift + 6 * i, x)
             rotate_quaternion(q, e.shift + 6 * i + 3, 1.0)
-        if lost < 0 and is_body_out_of_range(e, b):
+        # the range that core/validate.pxd (1) allows
+        if lost < 0 and (find_invalid_number(v, 6) >= 0 or find_invalid_number(x, 3) >= 0 or find_invalid_number(q, 4) >= 0):
             lost = b
     return lost

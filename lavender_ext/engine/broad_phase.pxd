@@ -222,25 +222,9 @@ cdef inline void sort_broad_phase_pairs(engine_t* e, int32_t n_pairs) noexcept n
         goal = e.pair
 
 
-cdef inline int32_t remove_excluded_pairs(engine_t* e, int32_t n_pairs) noexcept nogil:
-    """Remove the excluded pairs by merging two sorted lists, and return the number of remaining pairs."""
-    cdef int32_t i, j = 0, n_kept = 0, n = e.size[N_EXCLUDED], a, b
-    for i in range(n_pairs):
-        a = e.pair[2 * i]
-        b = e.pair[2 * i + 1]
-        while j < n and (e.excluded[2 * j] < a or (e.excluded[2 * j] == a and e.excluded[2 * j + 1] < b)):
-            j += 1
-        if j < n and e.excluded[2 * j] == a and e.excluded[2 * j + 1] == b:
-            continue
-        e.pair[2 * n_kept] = a
-        e.pair[2 * n_kept + 1] = b
-        n_kept += 1
-    return n_kept
-
-
 cdef inline int32_t update_pair_list(engine_t* e) noexcept nogil:
     """Rebuild the pair list if a body has left its box; return the number of pairs, for which CAP_PAIR must have places."""
-    cdef int32_t n = e.size[N_BODY], i, j, k, n_pairs = 0
+    cdef int32_t n = e.size[N_BODY], i, j, k, a, b, n_pairs = 0
     cdef double half[3]
     cdef double enlargement = e.setting[S_MARGIN] + e.setting[S_SKIN]
     if is_pair_list_valid(e):
@@ -268,7 +252,16 @@ cdef inline int32_t update_pair_list(engine_t* e) noexcept nogil:
                         append_broad_phase_pair(e, i, j, &n_pairs)
         if n_pairs > e.size[CAP_PAIR]:
             return n_pairs
-    e.head[H_PAIRS] = remove_excluded_pairs(e, n_pairs)
+    j = k = 0
+    for i in range(n_pairs):                            # Remove the excluded pairs: both lists are sorted.
+        a, b = e.pair[2 * i], e.pair[2 * i + 1]
+        while j < e.size[N_EXCLUDED] and (e.excluded[2 * j] < a or (e.excluded[2 * j] == a and e.excluded[2 * j + 1] < b)):
+            j += 1
+        if j < e.size[N_EXCLUDED] and e.excluded[2 * j] == a and e.excluded[2 * j + 1] == b:
+            continue
+        e.pair[2 * k], e.pair[2 * k + 1] = a, b
+        k += 1
+    e.head[H_PAIRS] = k
     e.head[H_PAIRS_VALID] = 1
     e.head[H_REBUILDS] = 0 if e.head[H_REBUILDS] == 2147483647 else e.head[H_REBUILDS] + 1
     return e.head[H_PAIRS]

@@ -21,7 +21,7 @@ from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport clip, project_normal_update
-from lavender_ext.core.rows cimport (dot3, apply_joint_impulse, joint_row_velocity, apply_impulse_to_bodies,
+from lavender_ext.core.rows cimport (dot3, apply_joint_impulse, joint_row_velocity, apply_impulse_to_body,
                                      compute_relative_velocity)
 from lavender_ext.engine.arrays cimport (H_CONTACTS, H_POSITION_ITERATIONS, H_PROJECTED, J_HERTZ, N_DYNAMIC,
                                          N_JOINT, N_JOINT_REAL, N_JOINT_ROW, S_BETA, S_DEPTH, S_H,
@@ -115,8 +115,11 @@ cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
                 continue
             e.push[mj + c] = new_multiplier
             scale3(change, e.normal + 3 * c, impulse)
-            apply_impulse_to_bodies(e.shift, e.contact_body[2 * c], e.contact_body[2 * c + 1], e.inv_mass, e.inv_inertia,
-                                    e.arm_a + 3 * c, e.arm_b + 3 * c, impulse, NULL)
+            a, b = e.contact_body[2 * c], e.contact_body[2 * c + 1]
+            if a >= 0:
+                apply_impulse_to_body(e.shift + 6 * a, e.inv_mass[a], e.inv_inertia + 9 * a, e.arm_a + 3 * c, impulse, -1.0)
+            if b >= 0:
+                apply_impulse_to_body(e.shift + 6 * b, e.inv_mass[b], e.inv_inertia + 9 * b, e.arm_b + 3 * c, impulse, 1.0)
         if slop > 0.0 or sweep < n_sweeps:
             continue
         # (3)

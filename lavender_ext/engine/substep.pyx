@@ -122,30 +122,16 @@ cdef inline void record_sweep_error(const engine_t* e, const blocks_t* p, const 
     out[1] = s.energy
 
 
-cdef void sweep_joints_then_contacts(engine_t* e, const blocks_t* p, const rows_t* r, int32_t sweeps, double* curve,
-                                     double* scratch) noexcept nogil:
-    """Run sweeps over joints, then contacts.
-
-    curve (sweeps + 1, 2) or NULL receives max |e_n| and E after sweep s in row s + 1; the caller writes row 0."""
-    cdef int32_t s, mode
-    cdef uint64_t rng
-    mode = SYMMETRIC if e.head[H_ORDER] == SYMMETRICALLY else (RANDOM if e.head[H_ORDER] == AT_RANDOM else 0)
-    # every substep has its own random stream, a function of seed and substep alone
-    rng = ((<uint64_t>(<int64_t>e.head[H_SEED])) << 32) ^ (<uint64_t>(<int64_t>e.head[H_STEP]))
-    for s in range(sweeps):
-        update_sweep_order(mode, s == 0, e.order, 0, r.n_joints, &rng)
-        update_sweep_order(mode, s == 0, e.order, r.n_joints, p.n_blocks, &rng)
-        sweep_bodies(p, r, e.order, p.n_blocks, e.impulse, e.dv)
-        if curve != NULL:
-            record_sweep_error(e, p, r, curve + 2 * (s + 1), scratch)
-
-
 cdef inline void solve_substep(engine_t* e, int32_t sweeps, double* workspace, double* curve, double* scratch) noexcept nogil:
-    """Solve the substep's velocity problem by sweeps; sweeps = 0: warm start and its error only."""
+    """Solve the substep's velocity problem by sweeps; sweeps = 0: warm start and its error only.
+
+    curve (sweeps + 1, 2) or NULL receives max |e_n| and E before the first sweep and after each.
+    """
     cdef blocks_t p
     cdef rows_t r
     cdef double* out = e.setting + S_OUT
-    cdef int32_t i
+    cdef int32_t i, mode
+    cdef uint64_t rng
     cdef bint packs = e.head[H_ORDER] != SYMMETRICALLY and e.head[H_ORDER] != AT_RANDOM     # The order does not change.
     bind_substep_problem(e, &p, &r)
     # warm start, and error before the first sweep
@@ -164,7 +150,15 @@ cdef inline void solve_substep(engine_t* e, int32_t sweeps, double* workspace, d
     sweeps = e.head[H_ITERATIONS]
     packs = packs and workspace != NULL and sweeps >= MIN_PACKED_SWEEPS
     if not packs or not sweep_packed(&p, &r, e.order, sweeps, workspace, e.impulse, e.dv):
-        sweep_joints_then_contacts(e, &p, &r, sweeps, curve, scratch)
+        mode = SYMMETRIC if e.head[H_ORDER] == SYMMETRICALLY else (RANDOM if e.head[H_ORDER] == AT_RANDOM else 0)
+        # every substep has its own random stream, a function of seed and substep alone
+        rng = ((<uint64_t>(<int64_t>e.head[H_SEED])) << 32) ^ (<uint64_t>(<int64_t>e.head[H_STEP]))
+        for i in range(sweeps):                         # over joints, then contacts
+            update_sweep_order(mode, i == 0, e.order, 0, r.n_joints, &rng)
+            update_sweep_order(mode, i == 0, e.order, r.n_joints, p.n_blocks, &rng)
+            sweep_bodies(&p, &r, e.order, p.n_blocks, e.impulse, e.dv)
+            if curve != NULL:
+                record_sweep_error(e, &p, &r, curve + 2 * (i + 1), scratch)
     measure_contact_errors(e, out + 5, out + 7)
 
 

@@ -152,12 +152,3 @@ cdef inline void dense_lu_solve_transposed(int32_t n, const double* a, const int
     for k in range(n - 1, -1, -1):
         x[k] *= a[<int64_t>k * (n + 1)]
         axpy_subtract(k, x[k], a + <int64_t>k * n, x)
-
-
-cdef inline int32_t dense_lu_sign(int32_t n, const double* a, const int32_t* swap) noexcept nogil:
-    """Return the sign of det N after `dense_lu`."""
-    cdef int32_t k, sign = 1
-    for k in range(n):
-        if (swap[k] != k) != (a[<int64_t>k * (n + 1)] < 0.0):
-            sign = -sign
-    return sign

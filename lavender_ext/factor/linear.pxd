@@ -96,16 +96,6 @@ cdef inline void analyse_band(linear_t* f, int32_t n, int32_t width) noexcept no
     f.deadline = NULL
 
 
-cdef inline void analyse_tree(linear_t* f, int32_t n, const int32_t* lptr, const int32_t* lidx, double* values,
-                              double* diagonal) noexcept nogil:
-    """Set the pattern of L^T D L and the arrays of A: entries left of the diagonal, and the diagonal (n).
-
-    `scale` must have the diagonal as well.
-    """
-    f.kind, f.n, f.lptr, f.lidx, f.matrix, f.diagonal = TREE, n, lptr, lidx, values, diagonal
-    f.deadline = NULL
-
-
 cdef int64_t cholesky_workspace_size(int32_t n) noexcept nogil
 cdef int32_t analyse_rows(linear_t* f, int32_t n, const int32_t* indptr, const int32_t* indices, int64_t capacity,
                           arena_t* a) noexcept nogil

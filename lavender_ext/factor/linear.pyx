@@ -13,16 +13,14 @@ from lavender_ext.core.tree_solve cimport solve_tree_factor
 from lavender_ext.core.validate cimport norm_inf
 from lavender_ext.factor.band cimport back_substitute_all_band_ldl, factor_band_ldl, solve_band_ldl
 from lavender_ext.factor.blocks cimport factor_blocks
-from lavender_ext.factor.dense cimport (PANEL_COLUMNS, dense_cholesky, dense_cholesky_solve, dense_lu, dense_lu_sign,
-                                        dense_lu_solve, dense_lu_solve_transposed, panel_offset)
+from lavender_ext.factor.dense cimport (PANEL_COLUMNS, dense_cholesky, dense_cholesky_solve, dense_lu, dense_lu_solve,
+                                        dense_lu_solve_transposed, panel_offset)
 from lavender_ext.factor.factors cimport block_matrix_t, has_wide, interrupt_t, clear_pivot_statistics, supernodal_t
 from lavender_ext.factor.linear cimport (BAND, BLOCKS, CHOLESKY, DENSE, FALLBACK, LU, NO_FACTOR, ROWS, TREE, PythonCalls,
                                          analyse_dense, backward_tolerance, fallback_t, linear_t)
 from lavender_ext.factor.sparse cimport factor_sparse, solve_sparse
-from lavender_ext.factor.supernodal cimport (panel_width, rows_below, solve_supernodes, supernodal_lu_sign,
-                                             supernodal_scratch_size)
-from lavender_ext.factor.symbolic cimport (find_supernodes, number_rows, order_rows, find_vertex_supernodes,
-                                           list_factor_rows_by_column, list_supernode_rows)
+from lavender_ext.factor.supernodal cimport panel_width, rows_below, solve_supernodes, supernodal_scratch_size
+from lavender_ext.factor.symbolic cimport find_supernodes, order_rows, list_factor_rows_by_column, list_supernode_rows
 
 
 #: Largest accepted backward error (3) of `linear.pxd`.
@@ -55,8 +53,8 @@ cdef int32_t analyse_rows(linear_t* f, int32_t n, const int32_t* indptr, const i
     The arena's integers are aligned to 8 bytes. Return 1; 0 if more than `capacity` integers are needed, at least
     a.n_index; -1 if L has 2^31 entries or more.
     """
-    cdef int32_t nnz = indptr[n], workspace = nnz + nnz // 4 + n + 1, count, k
-    cdef int64_t below
+    cdef int32_t nnz = indptr[n], workspace = nnz + nnz // 4 + n + 1, count, i, j, k, at = 0
+    cdef int64_t below = 0                              # rows below all supernodes
     cdef supernodal_t* p = &f.rows.factor
     cdef int64_t* outside = take_offsets(a, n)
     cdef int32_t* begin = take_integers(a, n + 1)
@@ -78,7 +76,11 @@ cdef int32_t analyse_rows(linear_t* f, int32_t n, const int32_t* indptr, const i
     lind = take_integers(a, lptr[count] + 1)
     if a.n_index > capacity:
         return 0
-    k = find_vertex_supernodes(count, nptr, nind, parent, size, lptr, lind, scratch, group, &below)
+    list_factor_rows_by_column(count, nptr, nind, parent, scratch, lptr, scratch + count, lind)
+    k = find_supernodes(count, lptr, lind, size, group)
+    for i in range(k):
+        for j in range(lptr[group[i + 1] - 1], lptr[group[i + 1]]):
+            below += size[lind[j]]
     if below > 2147483647:
         return -1
     p.n, p.supernodes = n, k
@@ -90,7 +92,13 @@ cdef int32_t analyse_rows(linear_t* f, int32_t n, const int32_t* indptr, const i
     p.value_offset, p.upper_offset = take_offsets(a, k + 1), take_offsets(a, k + 1)
     if a.n_index > capacity:
         return 0
-    number_rows(n, count, begin, order, scratch, <int32_t*>p.order, <int32_t*>p.position)
+    # the first position of each vertex in scratch (count + 1), the row at each position, and the position of each row
+    for i in range(count):
+        scratch[i] = at
+        for j in range(begin[order[i]], begin[order[i] + 1]):
+            (<int32_t*>p.order)[at], (<int32_t*>p.position)[j] = j, at
+            at += 1
+    scratch[count] = n
     f.cost = list_supernode_rows(k, scratch, lptr, lind, group, <int32_t*>p.first, <int32_t*>p.supernode_of, <int32_t*>p.row_ptr,
                                  <int32_t*>p.row_indices, <int64_t*>p.value_offset, <int64_t*>p.upper_offset)
     return 1
@@ -196,23 +204,10 @@ cdef inline void shift_dense(const linear_t* f) noexcept nogil:
             f.matrix[i * (<int64_t>f.n + 1)] += f.shift * (f.d[i] if f.d != NULL else 1.0)
 
 
-cdef inline void scale_dense(const linear_t* f) noexcept nogil:
-    """Replace A by D^-1/2 A D^-1/2 + shift."""
-    cdef int32_t i, j
-    cdef double* row = f.matrix
-    for i in range(f.n):
-        f.scale[i] = 1.0 / sqrt(f.d[i])
-    for i in range(f.n):
-        for j in range(f.n):
-            if row[j] != 0.0:
-                row[j] = f.scale[i] * row[j] * f.scale[j]
-        row[i] += f.shift
-        row += f.n
-
-
 cdef inline void factor_dense(linear_t* f) noexcept nogil:
     """Factor a full matrix by L L^T, unless only LU is allowed; use L U if L L^T is not allowed or loses a pivot."""
-    cdef int32_t i
+    cdef int32_t i, j
+    cdef double* row
     cdef const double* min_pivot = NULL
     if f.by & CHOLESKY:
         shift_dense(f)
@@ -224,25 +219,19 @@ cdef inline void factor_dense(linear_t* f) noexcept nogil:
         f.factored = CHOLESKY if f.pivots.small == 0 or min_pivot != NULL else NO_FACTOR
         if f.pivots.small == 0 or not f.by & LU or is_late(f):
             return
-    elif f.d != NULL:
-        scale_dense(f)
+    elif f.d != NULL:                                   # D^-1/2 A D^-1/2 + shift
+        for i in range(f.n):
+            f.scale[i] = 1.0 / sqrt(f.d[i])
+        for i in range(f.n):
+            row = f.matrix + <int64_t>i * f.n
+            for j in range(f.n):
+                if row[j] != 0.0:
+                    row[j] = f.scale[i] * row[j] * f.scale[j]
+            row[i] += f.shift
     else:
         shift_dense(f)
     f.pivots.small = dense_lu(f.wide, f.n, f.matrix, f.swap, f.tiny, f.deadline)
     f.factored = LU if f.pivots.small == 0 else NO_FACTOR
-
-
-cdef inline void factor_compressed_rows(linear_t* f) noexcept nogil:
-    """Factor compressed rows; use the fallback if a pivot is lost."""
-    cdef int32_t i, negative = 0
-    cdef bint lu = f.by == LU
-    f.factored = LU if lu else CHOLESKY
-    f.largest = norm_inf(f.rows.data, f.rows.indptr[f.n]) if lu else 0.0
-    for i in range(f.n if f.d != NULL else 0):
-        negative += not f.d[i] > 0.0
-    f.pivots.small = negative if negative else factor_sparse(&f.rows, lu, f.d, f.shift, f.tiny)
-    if f.pivots.small and f.fallback != NULL and not is_late(f):
-        replace_factor_by_fallback(f)
 
 
 cdef inline void replace_factor_by_fallback(linear_t* f) noexcept nogil:
@@ -257,7 +246,7 @@ cdef int32_t factor_linear_system_matrix(linear_t* f) noexcept nogil:
 
     For BAND, `pivots` also contains the number of negative pivots.
     """
-    cdef int32_t i, lost
+    cdef int32_t i, lost, negative
     f.rows.factor.deadline = f.blocks.factor.deadline = f.deadline
     clear_pivot_statistics(&f.pivots)
     if f.kind == DENSE:
@@ -269,7 +258,13 @@ cdef int32_t factor_linear_system_matrix(linear_t* f) noexcept nogil:
         factor_band_ldl(f.n, f.width, f.matrix, f.d, f.tiny, f.ahead, &f.pivots, f.deadline)
         f.factored = CHOLESKY
     elif f.kind == ROWS:
-        factor_compressed_rows(f)
+        f.factored, negative = LU if f.by == LU else CHOLESKY, 0
+        f.largest = norm_inf(f.rows.data, f.rows.indptr[f.n]) if f.by == LU else 0.0
+        for i in range(f.n if f.d != NULL else 0):
+            negative += not f.d[i] > 0.0
+        f.pivots.small = negative if negative else factor_sparse(&f.rows, f.by == LU, f.d, f.shift, f.tiny)
+        if f.pivots.small and f.fallback != NULL and not is_late(f):
+            replace_factor_by_fallback(f)
     elif f.kind == BLOCKS:
         f.factored = f.by
         f.pivots.small = factor_blocks(&f.blocks, f.by == LU)
@@ -335,17 +330,6 @@ cdef void multiply_by_system_matrix(const linear_t* f, const double* x, double* 
         y[i] = s
 
 
-cdef inline bint has_backward_error(const linear_t* f, const double* r, const double* x, double* error) noexcept nogil:
-    """Compute error = r - A x; return whether it exceeds the limit (3)."""
-    cdef int32_t i
-    multiply_by_system_matrix(f, x, error)
-    for i in range(f.n):
-        error[i] = r[i] - error[i]
-        if f.shift != 0.0:
-            error[i] -= f.shift * x[i]
-    return not norm_inf(error, f.n) <= backward_tolerance() * ((f.largest + f.shift) * norm_inf(x, f.n) + norm_inf(r, f.n))
-
-
 cdef int32_t solve_linear_system_checked(linear_t* f, const double* r, double* x, double* scratch) noexcept nogil:
     """Solve A x = r. Refine L U of ROWS until (3) holds, then use the fallback if necessary; return whether (3) holds.
 
@@ -358,7 +342,12 @@ cdef int32_t solve_linear_system_checked(linear_t* f, const double* r, double* x
     if f.kind != ROWS or f.factored != LU:
         return f.factored != NO_FACTOR
     for k in range(MAX_REFINEMENTS + 1):
-        if not has_backward_error(f, r, x, scratch):
+        multiply_by_system_matrix(f, x, scratch)
+        for i in range(f.n):                            # r - A x
+            scratch[i] = r[i] - scratch[i]
+            if f.shift != 0.0:
+                scratch[i] -= f.shift * x[i]
+        if norm_inf(scratch, f.n) <= backward_tolerance() * ((f.largest + f.shift) * norm_inf(x, f.n) + norm_inf(r, f.n)):
             return True
         if k < MAX_REFINEMENTS:
             solve_linear_system(f, scratch)
@@ -373,13 +362,22 @@ cdef int32_t solve_linear_system_checked(linear_t* f, const double* r, double* x
 
 cdef int32_t compute_determinant_sign(const linear_t* f) noexcept nogil:
     """Return the sign of det A after a factorisation; 0 if it is not known."""
-    if f.factored == CHOLESKY:
-        return 1
+    cdef const supernodal_t* s = &f.blocks.factor if f.kind == BLOCKS else &f.rows.factor
+    cdef int32_t i, k, sign = 1
+    cdef int64_t rows
     if f.factored != LU:
-        return 0
+        return f.factored == CHOLESKY
     if f.kind == DENSE:
-        return dense_lu_sign(f.n, f.matrix, f.swap)
-    return supernodal_lu_sign(&f.blocks.factor if f.kind == BLOCKS else &f.rows.factor)
+        for k in range(f.n):
+            if (f.swap[k] != k) != (f.matrix[<int64_t>k * (f.n + 1)] < 0.0):
+                sign = -sign
+        return sign
+    for i in range(s.supernodes):
+        rows = panel_width(s, i) + rows_below(s, i)
+        for k in range(panel_width(s, i)):
+            if (s.swap[s.first[i] + k] != k) != (s.values[s.value_offset[i] + k * (rows + 1)] < 0.0):
+                sign = -sign
+    return sign
 
 
 # -- for Python --------------------------------------------------------------------------------------------------

@@ -374,15 +374,3 @@ cdef inline void solve_supernodes(const supernodal_t* f, double* y, const int32_
     """Overwrite y (n), in the order of positions, with N^-1 y."""
     solve_lower(f, y, lu)
     solve_upper(f, y, lu)
-
-
-cdef inline int32_t supernodal_lu_sign(const supernodal_t* f) noexcept nogil:
-    """Return the sign of det N after L U."""
-    cdef int32_t i, k, sign = 1
-    cdef int64_t rows
-    for i in range(f.supernodes):
-        rows = panel_width(f, i) + rows_below(f, i)
-        for k in range(panel_width(f, i)):
-            if (f.swap[f.first[i] + k] != k) != (f.values[f.value_offset[i] + k * (rows + 1)] < 0.0):
-                sign = -sign
-    return sign

@@ -85,33 +85,26 @@ cdef inline void list_permuted_lower_pattern(int32_t n, const int32_t* ptr, cons
     nptr[n] = to
 
 
-cdef inline void find_elimination_tree(int32_t n, const int32_t* nptr, const int32_t* nind, int32_t* parent,
-                                       int32_t* ancestor) noexcept nogil:
-    """Compute the elimination tree of a lower pattern with path compression (Liu 1986); ancestor (n) is scratch."""
-    cdef int32_t k, q, j, above
-    for k in range(n):
-        parent[k] = ancestor[k] = -1
-        for q in range(nptr[k], nptr[k + 1]):
-            j = nind[q]
-            while j >= 0 and j < k:
-                above = ancestor[j]
-                ancestor[j] = k
-                if above < 0:
-                    parent[j] = k
-                j = above
-
-
 cdef inline void apply_postorder(int32_t n, const int32_t* ptr, const int32_t* neighbour, int32_t* order, int32_t* rank,
                                  int32_t* nptr, int32_t* nind, int32_t* parent, int32_t* scratch) noexcept nogil:
     """Replace an order of a graph by the postorder of its tree, which keeps the fill, and list the lower pattern in it.
 
     Columns with one pattern are then adjacent. scratch has 4 n entries; `parent` is the tree of the original order.
     """
-    cdef int32_t i
+    cdef int32_t i, j, k, q, above
     for i in range(n):
         rank[order[i]] = i
     list_permuted_lower_pattern(n, ptr, neighbour, rank, order, nptr, nind)
-    find_elimination_tree(n, nptr, nind, parent, scratch)
+    for k in range(n):                                  # elimination tree with path compression (Liu 1986)
+        parent[k] = scratch[k] = -1
+        for q in range(nptr[k], nptr[k + 1]):
+            j = nind[q]
+            while j >= 0 and j < k:
+                above = scratch[j]
+                scratch[j] = k
+                if above < 0:
+                    parent[j] = k
+                j = above
     find_postorder(n, parent, scratch, scratch + n, scratch + 2 * n, scratch + 3 * n)
     for i in range(n):
         rank[i] = scratch[3 * n + rank[i]]
@@ -188,8 +181,3 @@ cdef inline double list_supernode_rows(int32_t supernodes, const int32_t* starts
 cdef int32_t order_rows(int32_t n, const int32_t* indptr, const int32_t* indices, int32_t workspace, int32_t* scratch,
                         int64_t* outside, int32_t* begin, int32_t* order, int32_t* size, int32_t* nptr, int32_t* nind,
                         int32_t* parent, int32_t* lptr) noexcept nogil
-cdef int32_t find_vertex_supernodes(int32_t count, const int32_t* nptr, const int32_t* nind, const int32_t* parent,
-                                    const int32_t* size, const int32_t* lptr, int32_t* lind, int32_t* scratch, int32_t* group,
-                                    int64_t* below) noexcept nogil
-cdef void number_rows(int32_t n, int32_t count, const int32_t* begin, const int32_t* order, int32_t* starts, int32_t* row_order,
-                      int32_t* position) noexcept nogil

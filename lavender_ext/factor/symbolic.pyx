@@ -5,8 +5,7 @@ Consecutive rows with the same columns are one vertex; its size is the number of
 from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.factor.minimum_degree cimport minimum_degree_order
-from lavender_ext.factor.symbolic cimport (apply_postorder, compute_block_elimination_tree, find_supernodes,
-                                           list_factor_rows_by_column)
+from lavender_ext.factor.symbolic cimport apply_postorder, compute_block_elimination_tree
 
 
 cdef int32_t find_equal_rows(int32_t n, const int32_t* indptr, const int32_t* indices, int32_t* vertex,
@@ -89,34 +88,3 @@ cdef int32_t order_rows(int32_t n, const int32_t* indptr, const int32_t* indices
             return -1
         lptr[k + 1] += lptr[k]
     return count
-
-
-cdef int32_t find_vertex_supernodes(int32_t count, const int32_t* nptr, const int32_t* nind, const int32_t* parent,
-                                    const int32_t* size, const int32_t* lptr, int32_t* lind, int32_t* scratch, int32_t* group,
-                                    int64_t* below) noexcept nogil:
-    """Find supernodes of vertices: write their first vertices to group (count + 1); return their number.
-
-    lind (lptr[count]) receives the vertices below each, `below` the rows below all supernodes; scratch has 2 count entries.
-    """
-    cdef int32_t i, c, q, k
-    list_factor_rows_by_column(count, nptr, nind, parent, scratch, lptr, scratch + count, lind)
-    k = find_supernodes(count, lptr, lind, size, group)
-    below[0] = 0
-    for i in range(k):
-        c = group[i + 1] - 1
-        for q in range(lptr[c], lptr[c + 1]):
-            below[0] += size[lind[q]]
-    return k
-
-
-cdef void number_rows(int32_t n, int32_t count, const int32_t* begin, const int32_t* order, int32_t* starts, int32_t* row_order,
-                      int32_t* position) noexcept nogil:
-    """Write the row at each position, the position of each row, and the first position of each vertex (count + 1)."""
-    cdef int32_t i, j, c = 0
-    for i in range(count):
-        starts[i] = c
-        for j in range(begin[order[i]], begin[order[i] + 1]):
-            row_order[c] = j
-            position[j] = c
-            c += 1
-    starts[count] = n

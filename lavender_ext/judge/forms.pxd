@@ -11,8 +11,7 @@ v = M^-1 J^T lam, and a second loop computes J v.
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.csr cimport csr_row_dot, csr_row_dot_with_abs_sum
-from lavender_ext.core.generalized cimport add_abs_panel_transpose_product, multiply_abs_whitened_panel
+from lavender_ext.core.csr cimport csr_row_dot
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.rows cimport get_block_jacobian
 from lavender_ext.core.velocity cimport add_vector_6, compute_velocity_change
@@ -30,19 +29,6 @@ cdef inline void compute_csr_slack(const blocks_t* p, const csr_t* a, const doub
     cdef int32_t i
     for i in range(p.n_rows):
         w[i] = csr_row_dot(a, i, lam) - p.b[i]
-
-
-cdef inline void judge_impulse_over_csr(const blocks_t* p, const csr_t* a, const double* lam, double* w, double* e, double* sizes,
-                                        bint floor, score_t* out) noexcept nogil:
-    """Judge lam over A in compressed rows; sizes (m) is scratch, not used without a floor."""
-    cdef int32_t i
-    if not floor:
-        compute_csr_slack(p, a, lam, w)
-        score_all_blocks(p, lam, w, e, NULL, out)
-        return
-    for i in range(p.n_rows):
-        w[i] = csr_row_dot_with_abs_sum(a, i, lam, sizes + i) - p.b[i]
-    score_all_blocks(p, lam, w, e, sizes, out)
 
 
 # -- the factored form -------------------------------------------------------------------------------
@@ -80,20 +66,6 @@ cdef inline void compute_abs_velocity(const blocks_t* p, const rows_t* r, const 
             x[3 + k] = (fabs(inv[3 * k]) * t[0] + fabs(inv[3 * k + 1]) * t[1]) + fabs(inv[3 * k + 2]) * t[2]
 
 
-cdef inline double compute_row_abs_velocity(const double* jac, const int32_t* bodies, const double* size) noexcept nogil:
-    """Return |J| size of one row; two sums, for two vector lanes."""
-    cdef double s = 0.0, t = 0.0
-    cdef const double* x
-    cdef int32_t k, side
-    for side in range(2):
-        if bodies[side] >= 0:
-            x = size + 6 * bodies[side]
-            for k in range(3):
-                s += fabs(jac[6 * side + 2 * k]) * x[2 * k]
-                t += fabs(jac[6 * side + 2 * k + 1]) * x[2 * k + 1]
-    return s + t
-
-
 cdef inline void judge_impulse_over_bodies(const blocks_t* p, const rows_t* r, const double* lam, double* w, double* e,
                                            double* v, bint floor, score_t* out) noexcept nogil:
     """Judge lam over bodies; v (12 n + m) is scratch, (6 n) without a floor."""
@@ -101,7 +73,10 @@ cdef inline void judge_impulse_over_bodies(const blocks_t* p, const rows_t* r, c
     cdef double* sizes = abs_velocity + 6 * <ssize_t>r.n_bodies
     cdef double scratch[72]
     cdef const double* jac
-    cdef int32_t i, j
+    cdef const double* x
+    cdef const int32_t* bodies
+    cdef int32_t i, j, k, side
+    cdef double s, t
     compute_velocity_change(p, r, lam, v)
     compute_body_slack(p, r, lam, v, w)
     if not floor:
@@ -109,9 +84,16 @@ cdef inline void judge_impulse_over_bodies(const blocks_t* p, const rows_t* r, c
         return
     compute_abs_velocity(p, r, lam, abs_velocity)
     for i in range(p.n_blocks):
-        jac = get_block_jacobian(p, r, i, scratch)
+        jac, bodies = get_block_jacobian(p, r, i, scratch), get_block_bodies(r, i)
         for j in range(p.ptr[i], p.ptr[i + 1]):
-            sizes[j] = r.compliance[j] * fabs(lam[j]) + compute_row_abs_velocity(jac, get_block_bodies(r, i), abs_velocity)
+            s = t = 0.0                                 # |J| |v| of the row: two sums, for two vector lanes
+            for side in range(2):
+                if bodies[side] >= 0:
+                    x = abs_velocity + 6 * bodies[side]
+                    for k in range(3):
+                        s += fabs(jac[6 * side + 2 * k]) * x[2 * k]
+                        t += fabs(jac[6 * side + 2 * k + 1]) * x[2 * k + 1]
+            sizes[j] = r.compliance[j] * fabs(lam[j]) + (s + t)
             jac += 12
     score_all_blocks(p, lam, w, e, sizes, out)
 
@@ -126,14 +108,28 @@ cdef inline void score_generalized_slack(const blocks_t* p, const generalized_t*
     The floors follow from |Y| |Y|^T |lam| + c |lam| + extra, an upper bound of |A| |lam|; extra is (m) or NULL, x (n + m) is
     scratch.
     """
-    cdef int32_t i
+    cdef int32_t i, a, b, nc
     cdef double* size = x + g.n
+    cdef const int32_t* cols
+    cdef const double* y
+    cdef double s
     for i in range(g.n):
         x[i] = 0.0
-    for i in range(g.n_panels):
-        add_abs_panel_transpose_product(g, i, lam, x)
-    for i in range(g.n_panels):
-        multiply_abs_whitened_panel(g, i, x, size)
+    for b in range(g.n_panels):                         # x = |Y|^T |lam|
+        cols, y, nc = g.cols + g.pcol[b], g.y + g.pval[b], g.pcol[b + 1] - g.pcol[b]
+        for i in range(g.prow[b], g.prow[b + 1]):
+            if lam[i] != 0.0:
+                for a in range(nc):
+                    x[cols[a]] += fabs(y[a] * lam[i])
+            y += nc
+    for b in range(g.n_panels):                         # |Y| x
+        cols, y, nc = g.cols + g.pcol[b], g.y + g.pval[b], g.pcol[b + 1] - g.pcol[b]
+        for i in range(g.prow[b], g.prow[b + 1]):
+            s = 0.0
+            for a in range(nc):
+                s += fabs(y[a]) * x[cols[a]]
+            size[i] = s
+            y += nc
     for i in range(p.n_rows):
         size[i] += g.compliance[i] * fabs(lam[i])
     if extra != NULL:

@@ -7,8 +7,9 @@ import numpy as np
 
 from lavender_ext.core.validate cimport all_finite as is_finite
 from lavender_ext.core.arrays cimport as_double_pointer
+from lavender_ext.core.csr cimport csr_row_dot_with_abs_sum
 from lavender_ext.core.generalized cimport multiply_whitened_transpose
-from lavender_ext.core.islands cimport find_islands, island_workspace_integers, list_one_island
+from lavender_ext.core.islands cimport find_islands, island_workspace_integers
 from lavender_ext.core.block_types cimport blocks_t, islands_t
 from lavender_ext.core.problem cimport Data, Workspace, allocate_bytes
 from lavender_ext.core.velocity cimport compute_velocity_change
@@ -17,11 +18,11 @@ from lavender_ext.judge.bounds cimport project_far_excess, project_on_bounds
 from lavender_ext.core.start cimport is_zero_impulse
 from lavender_ext.judge.best cimport (begin_at_better_point, best_workspace_size, best_t, bind_best, count_islands,
                                       copy_score_without_islands, store_better_islands, store_start)
-from lavender_ext.judge.forms cimport (compute_csr_slack, judge_impulse_over_bodies, judge_impulse_over_csr,
-                                       judge_impulse_over_generalized, score_generalized_slack)
+from lavender_ext.judge.forms cimport (compute_csr_slack, judge_impulse_over_bodies, judge_impulse_over_generalized,
+                                       score_generalized_slack)
 from lavender_ext.judge.measure cimport (residual_above_floor, set_zero_impulse, relative_floor_of_score,
                                          relative_residual_of_score, count_judge_scratch)
-from lavender_ext.judge.reference cimport (compute_reference, compute_terms, has_island_without_scale, has_unmoved_row)
+from lavender_ext.judge.reference cimport compute_reference, compute_terms, has_island_without_scale, is_row_unmoved
 from lavender_ext.judge.refine cimport estimate_factor_loss, min_reported_loss, refine_generalized_slack
 from lavender_ext.judge.rounding cimport mass_t, relative_size_of_change, compute_squared_float32_rounding
 from lavender_ext.judge.score cimport is_at_floor, make_empty_score, relative_residual, score_t
@@ -36,12 +37,18 @@ cdef void judge_view(const view_t* v, const double* lam, double* w, double* e, d
 
     scratch has `count_judge_scratch` doubles; without a floor 6 n suffice over n bodies, and none over A.
     """
+    cdef int32_t i
     if v.g != NULL:
         judge_impulse_over_generalized(&v.p, v.g, lam, w, e, scratch, floor, out)
     elif v.r != NULL:
         judge_impulse_over_bodies(&v.p, v.r, lam, w, e, scratch, floor, out)
+    elif floor:                                         # scratch (m) receives |A| |lam|.
+        for i in range(v.p.n_rows):
+            w[i] = csr_row_dot_with_abs_sum(v.a, i, lam, scratch + i) - v.p.b[i]
+        score_all_blocks(&v.p, lam, w, e, scratch, out)
     else:
-        judge_impulse_over_csr(&v.p, v.a, lam, w, e, scratch, floor, out)
+        compute_csr_slack(&v.p, v.a, lam, w)
+        score_all_blocks(&v.p, lam, w, e, NULL, out)
 
 
 cdef bint refine_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, double reference_energy,
@@ -100,7 +107,11 @@ cdef bint judge_zero_impulse(view_t* v, int32_t* index, islands_t* islands, doub
     a row needs it; the references are then not valid.
     """
     cdef score_t s = make_empty_score()
-    cdef bint unmoved = has_unmoved_row(&v.p, empty)
+    cdef bint unmoved = False                           # whether no impulse moves a row with b != 0
+    cdef int32_t i, k
+    for i in range(v.p.n_blocks if empty != NULL else 0):
+        for k in range(v.p.ptr[i], v.p.ptr[i + 1]):
+            unmoved = unmoved or (is_row_unmoved(&v.p, empty, i, k) and v.p.b[k] != 0.0)
     v.p.islands = NULL
     if set_zero_impulse(&v.p, x, w):
         judge_view(v, x, w, e, scratch, False, &s)
@@ -111,7 +122,12 @@ cdef bint judge_zero_impulse(view_t* v, int32_t* index, islands_t* islands, doub
         v.p.islands = islands
     compute_reference(&v.p, x, w, e, out)
     if v.p.islands == NULL and (unmoved or out[0] < 0.0 and v.p.n_rows > 0):    # (3) of judge/reference.pxd needs a list.
-        list_one_island(v.p.n_blocks, index, islands)
+        k = v.p.n_blocks
+        for i in range(k):
+            index[i], index[k + i] = 0, i
+        index[2 * k], index[2 * k + 1] = 0, k
+        islands.n, islands.label, islands.order, islands.ptr = 1, index, index + k, index + 2 * k
+        islands.terms = NULL
         v.p.islands = islands
         compute_reference(&v.p, x, w, e, out)
     if not unmoved and not has_island_without_scale(&v.p, empty):

@@ -34,21 +34,6 @@ cdef struct progress_t:
     double* before              # (m) N s, impulse of the check before
 
 
-cdef inline void begin_progress(progress_t* s, double* workspace, int32_t m) noexcept nogil:
-    """Initialise s before the first check; workspace (2 m)."""
-    s.n = 0
-    s.last_at = s.before_at = -1
-    s.last = workspace
-    s.before = workspace + m
-
-
-cdef inline void record_residual(progress_t* s, int32_t at, double r) noexcept nogil:
-    """Store the residual r of a check after `at` sweeps."""
-    s.at[s.n % N_STORED_CHECKS] = at
-    s.r[s.n % N_STORED_CHECKS] = r
-    s.n += 1
-
-
 cdef inline void record_impulse(progress_t* s, int32_t at, const double* lam, int32_t m) noexcept nogil:
     """Store the impulse lam (m) of a check after `at` sweeps."""
     cdef double* x = s.before
@@ -105,23 +90,11 @@ cdef inline bint closes_gap_within(double gap, double closing_speed, double max_
     return gap > 0.0 and closing_speed > 0.0 and gap <= max_sweeps * closing_speed
 
 
-cdef inline bint reaches_friction_bound(const progress_t* s, const double* lam, int32_t now, int32_t first, int32_t end,
-                                        double slope, double normal, double rate, double max_sweeps) noexcept nogil:
-    """Return whether the norm of rows [first, end) reaches its bound, slope times the normal, within `max_sweeps` sweeps."""
-    cdef double size = 0.0, along = 0.0, v = 0.0
-    cdef int32_t k
-    for k in range(first, end):
-        size = norm2(size, lam[k])
-        along += lam[k] * compute_row_speed(s, lam, now, k)
-        v = norm2(v, compute_row_speed(s, lam, now, k))
-    return closes_gap_within(slope * normal - size, (along / size if size > 0.0 else v) - slope * rate, max_sweeps)
-
-
 cdef inline bint any_row_reaches_bound(const progress_t* s, const blocks_t* p, const double* lam, int32_t now,
                                        double max_sweeps) noexcept nogil:
     """Return whether (2) holds for a row within `max_sweeps` sweeps."""
     cdef int32_t i, j, k, g
-    cdef double v, rate
+    cdef double v, rate, size, along, slope
     cdef friction_components_t q
     if not now > s.last_at > s.before_at >= 0:
         return False
@@ -139,9 +112,14 @@ cdef inline bint any_row_reaches_bound(const progress_t* s, const blocks_t* p, c
         if closes_gap_within(lam[j], -rate, max_sweeps):
             return True
         get_friction_components(p, i, &q)
-        for g in range(q.n):
-            k = j + q.first[g]
-            if reaches_friction_bound(s, lam, now, k, k + q.size[g], q.friction_coefficient[g], lam[j], rate, max_sweeps):
+        for g in range(q.n):                            # Does the norm of these rows reach its bound, slope times the normal?
+            size = along = v = 0.0
+            for k in range(j + q.first[g], j + q.first[g] + q.size[g]):
+                size = norm2(size, lam[k])
+                along += lam[k] * compute_row_speed(s, lam, now, k)
+                v = norm2(v, compute_row_speed(s, lam, now, k))
+            slope = q.friction_coefficient[g]
+            if closes_gap_within(slope * lam[j] - size, (along / size if size > 0.0 else v) - slope * rate, max_sweeps):
                 return True
     return False
 

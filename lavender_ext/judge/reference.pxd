@@ -68,15 +68,6 @@ cdef inline bint is_strictly_inactive_contact(const blocks_t* p, int32_t i, cons
     return gap > max_rounding_ratio() * size
 
 
-cdef inline bint is_satisfied_at_zero(const blocks_t* p, int32_t i, const double* e) noexcept nogil:
-    """Return whether (1) holds for the rows of block i."""
-    cdef int32_t k
-    for k in range(p.ptr[i], p.ptr[i + 1]):
-        if not p.d[k] * fabs(e[k]) <= max_rounding_ratio() * fabs(p.b[k]):
-            return False
-    return True
-
-
 cdef inline void add_row_terms(const blocks_t* p, int32_t k, int32_t n, double* energy, double* fast) noexcept nogil:
     """Add rows [k, k + n) to the sum and the maximum of (2); the maximum is over the norm of these rows."""
     cdef int32_t i
@@ -115,13 +106,13 @@ cdef inline double compute_island_reference(const blocks_t* p, const int32_t* or
     """
     cdef int32_t a, i, k
     cdef double energy = 0.0, fast = 0.0, check = 0.0       # check stays 0, or becomes NaN at a slack that is not finite.
-    cdef bint rest = True
+    cdef bint rest = True                               # (1) holds for all rows.
     cdef tally_t s = make_empty_tally()
     for a in range(first, end):
         i = get_block_in_order(order, a)
-        rest = rest and is_satisfied_at_zero(p, i, e)
         add_block_error(p, i, e, &s)
         for k in range(p.ptr[i], p.ptr[i + 1]):
+            rest = rest and p.d[k] * fabs(e[k]) <= max_rounding_ratio() * fabs(p.b[k])
             check += 0.0 * w[k]
     s.energy = sqrt(s.energy)
     s.fast = sqrt(s.fast) if s.fast > 0.0 else 0.0
@@ -176,18 +167,6 @@ cdef inline bint is_row_unmoved(const blocks_t* p, const int32_t* empty, int32_t
     empty (m) marks zero rows of A; NULL if there are none.
     """
     return empty != NULL and empty[k] and (has_independent_rows(p, i) or empty[p.ptr[i]])
-
-
-cdef inline bint has_unmoved_row(const blocks_t* p, const int32_t* empty) noexcept nogil:
-    """Return whether a row with b != 0 `is_row_unmoved`."""
-    cdef int32_t i, k
-    if empty == NULL:
-        return False
-    for i in range(p.n_blocks):
-        for k in range(p.ptr[i], p.ptr[i + 1]):
-            if is_row_unmoved(p, empty, i, k) and p.b[k] != 0.0:
-                return True
-    return False
 
 
 cdef inline bint has_island_without_scale(const blocks_t* p, const int32_t* empty) noexcept nogil:

@@ -27,7 +27,7 @@ from libc.stdint cimport int32_t, uint64_t
 from libc.string cimport memcpy
 
 from lavender_ext.core.dot cimport dot
-from lavender_ext.core.condition cimport bound_condition_by_determinant, get_condition
+from lavender_ext.core.condition cimport get_condition
 from lavender_ext.core.generalized cimport solve_mass_matrix
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport generalized_t
@@ -65,41 +65,6 @@ cdef inline void add_product_double_double(double x, double y, double* high, dou
     high[0] = total
 
 
-cdef inline void add_number_double_double(double x, double* high, double* low) noexcept nogil:
-    """Add x to high + low; the rounding error of high + x is added to low."""
-    cdef double total = high[0] + x, part = total - high[0]
-    low[0] += (high[0] - (total - part)) + (x - part)
-    high[0] = total
-
-
-cdef inline void multiply_jacobian_transpose_double_double(const generalized_t* g, const double* lam, double* high,
-                                                           double* low) noexcept nogil:
-    """Compute high + low (n) = J^T lam."""
-    cdef int32_t i, q
-    for i in range(g.n):
-        high[i] = low[i] = 0.0
-    for i in range(g.m):
-        if lam[i] != 0.0:
-            for q in range(g.jptr[i], g.jptr[i + 1]):
-                add_product_double_double(g.jval[q], lam[i], high + g.jidx[q], low + g.jidx[q])
-
-
-cdef inline void subtract_mass_product_double_double(const generalized_t* g, const double* x, const double* x_low, double* high,
-                                                     double* low) noexcept nogil:
-    """Subtract M (x + x_low) from high + low (n)."""
-    cdef int32_t i, j, q
-    cdef double a
-    for i in range(g.n):
-        for q in range(g.mptr[i], g.mptr[i + 1]):
-            j = g.midx[q]
-            a = -g.mval[q]
-            add_product_double_double(a, x[j], high + i, low + i)
-            low[i] += a * x_low[j]
-            if j != i:
-                add_product_double_double(a, x[i], high + j, low + j)
-                low[j] += a * x_low[i]
-
-
 # -- the pass ----------------------------------------------------------------------------------------
 
 
@@ -110,7 +75,7 @@ cdef inline double estimate_factor_loss(const blocks_t* p, const generalized_t* 
     w (m) is the slack of the first pass, x (2 n) is scratch.
     """
     cdef int32_t i = 0
-    cdef double energy = 0.0, other = 0.0, nu = 0.0, size
+    cdef double energy = 0.0, other = 0.0, nu = 0.0, det = 1.0, size
     while i + 2 <= p.n_rows:                            # Two sums halve the latency of the additions.
         energy += lam[i] * (w[i] + (p.b[i] - g.compliance[i] * lam[i]))
         other += lam[i + 1] * (w[i + 1] + (p.b[i + 1] - g.compliance[i + 1] * lam[i + 1]))
@@ -127,8 +92,12 @@ cdef inline double estimate_factor_loss(const blocks_t* p, const generalized_t* 
     take_smallest_island_reference(p, &reference_energy, &reference_velocity)
     size = 0.1 * relative_residual(energy, sqrt(nu) * energy, reference_energy, reference_velocity)
     size = g.n * unit_roundoff() * (size if size > 1.0 else 1.0)
-    if g.condition == 0.0 and size * bound_condition_by_determinant(g) <= threshold:
-        return 0.0
+    if g.condition == 0.0:
+        # |H^-1| <= e / det H, which follows from trace H = n and is very loose for large n.
+        for i in range(g.n):
+            det *= g.inv_pivot[i] * g.mval[g.mptr[i + 1] - 1]
+        if size * (2.72 * det) <= threshold:
+            return 0.0
     size *= get_condition(g, x)
     return size if size > threshold else 0.0
 
@@ -138,14 +107,19 @@ cdef inline double refine_velocity_change(const generalized_t* g, const double* 
 
     loss is n u |H^-1|.
     """
-    cdef int32_t i, n = g.n
+    cdef int32_t i, j, q, n = g.n
     cdef double* x_low = x + n
     cdef double* force = x + 2 * n
     cdef double* force_low = x + 3 * n
     cdef double* r = x + 4 * n
     cdef double* r_low = x + 5 * n
-    cdef double norm, last, size, rate = loss if loss < 0.5 else 0.5
-    multiply_jacobian_transpose_double_double(g, lam, force, force_low)
+    cdef double norm, last, size, a, total, part, rate = loss if loss < 0.5 else 0.5
+    for i in range(n):
+        force[i] = force_low[i] = 0.0
+    for i in range(g.m):                                # force + force_low = J^T lam
+        if lam[i] != 0.0:
+            for q in range(g.jptr[i], g.jptr[i + 1]):
+                add_product_double_double(g.jval[q], lam[i], force + g.jidx[q], force_low + g.jidx[q])
     for i in range(n):
         x[i] = force[i]
         x_low[i] = 0.0
@@ -155,7 +129,15 @@ cdef inline double refine_velocity_change(const generalized_t* g, const double* 
     for _step in range(MAX_CORRECTIONS):
         memcpy(r, force, n * sizeof(double))
         memcpy(r_low, force_low, n * sizeof(double))
-        subtract_mass_product_double_double(g, x, x_low, r, r_low)
+        for i in range(n):                              # Subtract M (x + x_low) from r + r_low.
+            for q in range(g.mptr[i], g.mptr[i + 1]):
+                j = g.midx[q]
+                a = -g.mval[q]
+                add_product_double_double(a, x[j], r + i, r_low + i)
+                r_low[i] += a * x_low[j]
+                if j != i:
+                    add_product_double_double(a, x[i], r + j, r_low + j)
+                    r_low[j] += a * x_low[i]
         for i in range(n):
             r[i] += r_low[i]
             r_low[i] = r[i]
@@ -163,8 +145,11 @@ cdef inline double refine_velocity_change(const generalized_t* g, const double* 
         size = sqrt(fabs(dot(r, r_low, n)))
         if not size < 0.5 * last:
             return 2.0 * last
-        for i in range(n):
-            add_number_double_double(r_low[i], x + i, x_low + i)
+        for i in range(n):                              # The rounding error of x + r_low is added to x_low.
+            total = x[i] + r_low[i]
+            part = total - x[i]
+            x_low[i] += (x[i] - (total - part)) + (r_low[i] - part)
+            x[i] = total
         if size > rate * last:
             rate = size / last
         last = size

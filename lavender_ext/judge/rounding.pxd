@@ -33,20 +33,6 @@ cdef inline double multiply_squared_row(const generalized_t* g, int32_t i, const
     return s
 
 
-cdef inline void unwhiten_row(const generalized_t* g, int32_t panel, int32_t row, double* z) noexcept nogil:
-    """Compute z (n) = M^-1 J_row^T = L^-1 D^-1/2 Y_row^T, half of a solve with the factor of M."""
-    cdef int32_t k, q
-    cdef double x
-    for k in range(g.n):
-        z[k] = 0.0
-    add_scaled_whitened_row(g, panel, row, 1.0, z)
-    for k in range(g.n):
-        x = z[k] * g.root[k]
-        for q in range(g.lptr[k], g.lptr[k + 1]):
-            x -= g.lval[q] * z[g.lidx[q]]
-        z[k] = x
-
-
 cdef inline void compute_squared_float32_rounding(const blocks_t* p, const generalized_t* g, const mass_t* mass,
                                                   const double* free, const double* lam, double* impulse, double* data,
                                                   double* velocities, double* work) noexcept nogil:
@@ -90,7 +76,15 @@ cdef inline void compute_squared_float32_rounding(const blocks_t* p, const gener
     for i in range(m):
         while g.prow[panel + 1] <= i:
             panel += 1
-        unwhiten_row(g, panel, i, z)
+        # z = M^-1 J_i^T = L^-1 D^-1/2 Y_i^T, half of a solve with the factor of M
+        for k in range(n):
+            z[k] = 0.0
+        add_scaled_whitened_row(g, panel, i, 1.0, z)
+        for k in range(n):
+            s = z[k] * g.root[k]
+            for q in range(g.lptr[k], g.lptr[k + 1]):
+                s -= g.lval[q] * z[g.lidx[q]]
+            z[k] = s
         data[i] += 2.0 * multiply_squared_row(g, i, xx)
         for k in range(n):
             data[i] += z[k] * z[k] * f[k]

@@ -27,7 +27,7 @@ from libc.stdint cimport int32_t, int64_t
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport view_t
 from lavender_ext.judge.best cimport best_workspace_size, best_t, bind_best, restore_best_islands
-from lavender_ext.judge.progress cimport begin_progress, progress_t
+from lavender_ext.judge.progress cimport progress_t
 
 
 cpdef enum:
@@ -90,7 +90,10 @@ cdef inline void begin_stopping_test(stopping_test_t* s, const blocks_t* p, doub
     bind_best(&s.best, p, workspace)
     s.best.reference_energy = reference_energy
     s.marked = workspace + best_workspace_size(p.n_rows, s.best.n)
-    begin_progress(&s.progress, s.marked + s.best.n, p.n_rows)
+    s.progress.n = 0
+    s.progress.last_at = s.progress.before_at = -1
+    s.progress.last = s.marked + s.best.n
+    s.progress.before = s.progress.last + p.n_rows
 
 
 cdef inline bint restart_if_stalled(stopping_test_t* s, int32_t patience) noexcept nogil:

@@ -13,7 +13,7 @@ from lavender_ext.judge.best cimport (count_islands, copy_score_without_islands,
                                       store_better_islands, store_start)
 from lavender_ext.judge.measure cimport (residual_above_floor, relative_floor_of_score, judge_view, refine_view,
                                          relative_residual_of_score, count_judge_scratch)
-from lavender_ext.judge.progress cimport residual_envelope_slope, record_impulse, has_stalled, record_residual
+from lavender_ext.judge.progress cimport residual_envelope_slope, record_impulse, has_stalled, N_STORED_CHECKS
 from lavender_ext.judge.score cimport make_empty_score, relative_residual, score_t, take_smallest_island_reference
 from lavender_ext.judge.stopping_test cimport (AT_FLOOR, CONVERGED, DIVERGED, N_EARLY_SWEEPS, RUNNING, STALLED,
                                                begin_stopping_test, restore_at_end, sweep_t, stopping_test_workspace_size,
@@ -125,7 +125,9 @@ cdef inline int32_t perform_residual_check(stopping_test_t* s, const view_t* v, 
     lost = not now < inf and (s.reference_energy > 0.0 or not x.finite)
     if s.total <= N_EARLY_SWEEPS and s.start < now < inf:
         s.start = now
-    record_residual(&s.progress, s.total, now)
+    s.progress.at[s.progress.n % N_STORED_CHECKS] = s.total
+    s.progress.r[s.progress.n % N_STORED_CHECKS] = now
+    s.progress.n += 1
     s.check_at = s.total + sweeps_until_next_check(s, now, tol)
     s.last = now
     s.last_at = s.total

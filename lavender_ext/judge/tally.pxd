@@ -116,21 +116,6 @@ cdef inline void add_block_error(const blocks_t* p, int32_t i, const double* e, 
             add_row_error(p, j + q.first[g], e[j + q.first[g]], s)
 
 
-cdef inline void write_score_norms(const blocks_t* p, const double* e, const tally_t* s, score_t* out) noexcept nogil:
-    """Write the norms of e (m) to the score; the floor entries are not changed."""
-    cdef int32_t k
-    out.energy = sqrt(s.energy)
-    out.velocity = sqrt(s.fast) if s.fast > 0.0 else 0.0
-    out.worst = s.worst
-    out.finite = out.energy + out.velocity < 1.0 / 0.0
-    if not out.finite:
-        out.velocity = 1.0 / 0.0
-        for k in range(p.n_rows):
-            if not fabs(e[k]) < 1.0 / 0.0:
-                out.worst = k
-                break
-
-
 cdef inline double compute_rhs_energy_norm(const blocks_t* p) noexcept nogil:
     """Return sqrt(sum b^2 / d) [sqrt J]."""
     cdef int32_t k
@@ -138,11 +123,6 @@ cdef inline double compute_rhs_energy_norm(const blocks_t* p) noexcept nogil:
     for k in range(p.n_rows):
         sum_ += (p.b[k] / p.d[k]) * p.b[k]
     return sqrt(sum_)
-
-
-cdef inline floor_t make_empty_floor() noexcept nogil:
-    """Return a floor to which no row has been added."""
-    return floor_t(0.0, 0.0, 0.0)
 
 
 cdef inline double slack_rounding_of_row(const blocks_t* p, int32_t k, double size) noexcept nogil:
@@ -242,18 +222,6 @@ cdef inline int32_t index_of_island_end(const blocks_t* p, int32_t island) noexc
     return p.islands.ptr[island + 1] if p.islands != NULL else p.n_blocks
 
 
-cdef inline double relative_residual_of_island(const blocks_t* p, int32_t island, const double* e, const tally_t* s) noexcept nogil:
-    """Return the relative residual (1) of judge/score.pxd of one island."""
-    cdef const double* reference = p.islands.reference + 2 * island
-    cdef double energy = sqrt(s.energy), velocity = sqrt(s.fast) if s.fast > 0.0 else 0.0
-    if not energy + velocity < 1.0 / 0.0:
-        return 1.0 / 0.0
-    if reference[0] < 0.0:
-        return relative_residual_by_rows(p, p.islands.order, p.islands.ptr[island], p.islands.ptr[island + 1], e)
-    return max(relative_residual(energy, velocity, reference[0], reference[1]),
-               relative_residual_of_unmoved_rows(p, p.islands.order, p.islands.ptr[island], p.islands.ptr[island + 1], e))
-
-
 cdef inline void add_island_to_score(const blocks_t* p, int32_t island, const double* w, const double* e, const tally_t* s,
                                      const floor_t* f, tally_t* total, score_t* out) noexcept nogil:
     """Add the sums of an island to the total and its relative residual to the score; f is NULL without a floor.
@@ -261,13 +229,22 @@ cdef inline void add_island_to_score(const blocks_t* p, int32_t island, const do
     If the problem has no list of islands, only the sums are added; the caller computes the relative residual from them.
     """
     cdef const double* reference
-    cdef double now, floor = 0.0
+    cdef double now, energy, velocity, floor = 0.0
     cdef double check = 0.0                             # This stays 0, or becomes NaN at an infinite or NaN slack.
     cdef int32_t a, i, k
     if p.islands == NULL:
         total[0] = s[0]
         return
-    now = relative_residual_of_island(p, island, e, s)
+    # the relative residual (1) of judge/score.pxd
+    reference = p.islands.reference + 2 * island
+    energy, velocity = sqrt(s.energy), sqrt(s.fast) if s.fast > 0.0 else 0.0
+    if not energy + velocity < 1.0 / 0.0:
+        now = 1.0 / 0.0
+    elif reference[0] < 0.0:
+        now = relative_residual_by_rows(p, p.islands.order, p.islands.ptr[island], p.islands.ptr[island + 1], e)
+    else:
+        now = max(relative_residual(energy, velocity, reference[0], reference[1]),
+                  relative_residual_of_unmoved_rows(p, p.islands.order, p.islands.ptr[island], p.islands.ptr[island + 1], e))
     for a in range(p.islands.ptr[island], p.islands.ptr[island + 1]):
         i = p.islands.order[a]
         for k in range(p.ptr[i], p.ptr[i + 1]):
@@ -275,7 +252,6 @@ cdef inline void add_island_to_score(const blocks_t* p, int32_t island, const do
     if check != 0.0:
         now = 1.0 / 0.0
     if f != NULL:
-        reference = p.islands.reference + 2 * island
         floor = f.own if reference[0] < 0.0 else relative_residual(sqrt(f.energy), sqrt(f.fast), reference[0], reference[1])
         if floor_hides_residual(floor) and now < floor < 1.0 / 0.0:
             now = floor
@@ -300,12 +276,12 @@ cdef inline void score_all_blocks(const blocks_t* p, const double* lam, const do
     cdef int32_t island, a, i, k, end
     cdef const int32_t* order = p.islands.order if p.islands != NULL else NULL
     cdef tally_t own, s = make_empty_tally()
-    cdef floor_t floor, f = make_empty_floor()
+    cdef floor_t floor, f = floor_t(0.0, 0.0, 0.0)
     if p.islands != NULL:
         out.relative = out.floor = out.above_floor = 0.0
         out.island = 0
     for island in range(p.islands.n if p.islands != NULL else 1):
-        own, floor = make_empty_tally(), make_empty_floor()
+        own, floor = make_empty_tally(), floor_t(0.0, 0.0, 0.0)
         end = index_of_island_end(p, island)
         for a in range(index_of_island_begin(p, island), end):
             i = get_block_in_order(order, a)
@@ -323,6 +299,15 @@ cdef inline void score_all_blocks(const blocks_t* p, const double* lam, const do
         add_island_to_score(p, island, w, e, &own, &floor if sizes != NULL else NULL, &s, out)
         f.energy += floor.energy
         f.fast = floor.fast if floor.fast > f.fast else f.fast
-    write_score_norms(p, e, &s, out)
+    out.energy = sqrt(s.energy)
+    out.velocity = sqrt(s.fast) if s.fast > 0.0 else 0.0
+    out.worst = s.worst
+    out.finite = out.energy + out.velocity < 1.0 / 0.0
+    if not out.finite:
+        out.velocity = 1.0 / 0.0
+        for k in range(p.n_rows):
+            if not fabs(e[k]) < 1.0 / 0.0:
+                out.worst = k
+                break
     if sizes != NULL:
         out.floor_energy, out.floor_velocity = sqrt(f.energy), sqrt(f.fast)

@@ -142,25 +142,15 @@ cdef inline bint run_damped_newton_iterations(scaled_block_t* x, const int32_t n
     return now <= 1e-13 * x.size
 
 
-cdef inline bint run_newton_from_start(scaled_block_t* x, double t) noexcept nogil:
-    """Take damped Newton steps (1) from the `start` of x; return whether |F| is then 0 within rounding."""
-    cdef int32_t i
-    for i in range(x.n):
-        x.z[i] = x.start[i]
-    if x.n == 2:
-        return run_damped_newton_iterations(x, 2, t)
-    if x.n == 3:
-        return run_damped_newton_iterations(x, 3, t)
-    if x.n == 4:
-        return run_damped_newton_iterations(x, 4, t)
-    return run_damped_newton_iterations(x, x.n, t)
-
-
 cdef inline bint solve_scaled_block(scaled_block_t* x, double t) noexcept nogil:
     """Solve (1) from `start`, or else from the point with w = 0; return False if both fail."""
     cdef double A[MAX_ROWS * MAX_ROWS]
     cdef int32_t i
-    if run_newton_from_start(x, t):
+    for i in range(x.n):
+        x.z[i] = x.start[i]
+    # The common sizes are compiled with a constant n.
+    if (run_damped_newton_iterations(x, 2, t) if x.n == 2 else run_damped_newton_iterations(x, 3, t) if x.n == 3
+            else run_damped_newton_iterations(x, 4, t) if x.n == 4 else run_damped_newton_iterations(x, x.n, t)):
         return True
     for i in range(x.n):
         x.z[i] = -x.s0[i]
@@ -170,19 +160,6 @@ cdef inline bint solve_scaled_block(scaled_block_t* x, double t) noexcept nogil:
     for i in range(x.n):
         x.z[i] += x.z0[i]
     return run_damped_newton_iterations(x, x.n, t)
-
-
-cdef inline void take_projected_steps(scaled_block_t* x) noexcept nogil:
-    """Replace the `start` of x by the result of N_PROJECTED_STEPS steps z = Pi(z - s / trace H) from it."""
-    cdef double trace = 0.0
-    cdef int32_t i, _step
-    for i in range(x.n):
-        x.z[i] = x.start[i]
-        trace += fabs(x.H[(x.n + 1) * i])
-    for _step in range(N_PROJECTED_STEPS if trace > 0.0 else 0):    # No eigenvalue of a symmetric H exceeds its trace.
-        evaluate_natural_residual(x, x.n, 1.0 / trace)
-        for i in range(x.n):
-            x.z[i] = x.start[i] = x.projected[i]
 
 
 cdef inline bint is_contact_open(const scaled_block_t* x) noexcept nogil:
@@ -215,8 +192,8 @@ cdef inline int32_t solve_block_newton(scaled_block_t* x, const double* g, const
     """
     cdef const double* root = g + x.n * x.n
     cdef const double* inverse = root + x.n
-    cdef double t = 1.0
-    cdef int32_t i, attempt
+    cdef double t = 1.0, trace
+    cdef int32_t i, attempt, _step
     x.H = g
     for i in range(x.n):
         x.start[i] = x.z0[i] = root[i] * lam[i]
@@ -238,7 +215,15 @@ cdef inline int32_t solve_block_newton(scaled_block_t* x, const double* g, const
             if attempt > 0 and run_damped_newton_iterations(x, x.n, 1.0):         # F is most accurate for t = 1.
                 store_block_impulse(x, inverse, lam)
             return STICK
-        take_projected_steps(x)
+        # Replace `start` by the result of steps z = Pi(z - s / trace H) from it. No eigenvalue of a symmetric H exceeds its trace.
+        trace = 0.0
+        for i in range(x.n):
+            x.z[i] = x.start[i]
+            trace += fabs(x.H[(x.n + 1) * i])
+        for _step in range(N_PROJECTED_STEPS if trace > 0.0 else 0):
+            evaluate_natural_residual(x, x.n, 1.0 / trace)
+            for i in range(x.n):
+                x.z[i] = x.start[i] = x.projected[i]
         if attempt == 0:
             for i in range(x.n):
                 lam[i] = x.start[i] * inverse[i]

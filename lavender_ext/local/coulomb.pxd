@@ -17,7 +17,7 @@ Delta > 0 in between. For S = s I one step of Newton's method on the quotient of
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.local.small cimport FAILED, OPEN, SLIP, STICK, safeguard_newton_step
+from lavender_ext.local.small cimport FAILED, OPEN, SLIP, STICK
 
 
 cdef enum:
@@ -169,7 +169,11 @@ cdef inline int32_t solve_coulomb_disk(const double* g, const double* q, double 
         step = f * U2 / (mu * (a * (tr + 2.0 * beta) + hr) * U2 + P * (x0 * r0 + x1 * r1))
         # Convergence is quadratic: the next point is exact within rounding.
         done = fabs(f) <= 1e-8 * U and fabs(step) <= 1e-7 * beta
-        beta = safeguard_newton_step(beta, step, lo, hi, &done)
+        if lo < beta - step and (hi < 0.0 or beta - step < hi):
+            beta = beta - step
+        else:                                           # the middle of the interval, or 4 beta if its end is unknown
+            done = hi >= 0.0 and hi - lo <= 1e-15 * hi
+            beta = 0.5 * (lo + hi) if hi >= 0.0 else 4.0 * beta
     n = U + mu * hu
     if not n > 0.0 or not a / n < 1.0 / 0.0 or not done:
         return FAILED

@@ -1,4 +1,4 @@
-"""Helpers of the exact block solvers: dense elimination, bracketed Newton steps, and states of contacts.
+"""Helpers of the exact block solvers: dense elimination, and states of contacts.
 
 W is the diagonal block of A, 1x1 to 8x8, not necessarily symmetric; w = W lam + q.
 """
@@ -14,17 +14,6 @@ cdef enum:
 
 cdef enum:
     MAX_ROWS = 8                # Blocks of more rows are not solved exactly.
-
-
-cdef inline double safeguard_newton_step(double x, double step, double lo, double hi, int32_t* done) noexcept nogil:
-    """Return x - step if it lies between lo and hi, otherwise their midpoint, or 4 x if hi is unknown (negative).
-
-    `done` is set if lo and hi are equal within rounding.
-    """
-    if lo < x - step and (hi < 0.0 or x - step < hi):
-        return x - step
-    done[0] = hi >= 0.0 and hi - lo <= 1e-15 * hi
-    return 0.5 * (lo + hi) if hi >= 0.0 else 4.0 * x
 
 
 cdef inline bint solve_three(const double* a, double* x) noexcept nogil:

@@ -62,26 +62,6 @@ cdef inline void begin_active_set(newton_t* n, const double* z) noexcept nogil:
     push_phase(n, ACTIVE_SET)
 
 
-cdef inline bint exchange_rows(newton_t* n) noexcept nogil:
-    """Make one exchange of the active set; return False if the new z is not finite."""
-    cdef active_set_t* x = &n.active
-    cdef int32_t j
-    cdef bint finite
-    for j in range(n.s.e.m):
-        n.slack[j] = x.hz[j] - n.s.e.g[j]
-    evaluate_system_natural_map(&n.s, x.z, n.slack, CONE, exchange_weight(), n.f)
-    factor_newton_system(&n.s, NATURAL, exchange_weight())
-    for j in range(n.s.e.m):
-        n.f[j] = -n.f[j]
-    solve_natural_map_system_refined(&n.s, n.f, n.dz, n.r, n.da)
-    finite = all_finite(n.dz, n.s.e.m)
-    if finite:
-        for j in range(n.s.e.m):
-            x.z[j] += n.dz[j]
-        multiply_system_matrix(&n.s, x.z, x.hz)
-    return finite
-
-
 cdef inline bint predicts_too_many_exchanges(int32_t first, int32_t now, int32_t exchanges) noexcept nogil:
     """Return whether (2) predicts more exchanges than an interior point takes steps."""
     cdef double a = 1.0, b = 1.0
@@ -108,7 +88,7 @@ cdef inline void step_active_set(newton_t* n) noexcept nogil:
     """Make one exchange. End the phase if the judge accepts, no row changes, or (2) predicts too many exchanges."""
     cdef active_set_t* x = &n.active
     cdef double residual
-    cdef int32_t changed
+    cdef int32_t changed, j
     cdef bint gains
     if x.best <= n.tol and not x.is_scored:
         x.is_scored = 1
@@ -119,9 +99,19 @@ cdef inline void step_active_set(newton_t* n) noexcept nogil:
         end_active_set(n)
         return
     n.counts[N_ACTIVE_SET] += 1
-    if not exchange_rows(n):
+    for j in range(n.s.e.m):
+        n.slack[j] = x.hz[j] - n.s.e.g[j]
+    evaluate_system_natural_map(&n.s, x.z, n.slack, CONE, exchange_weight(), n.f)
+    factor_newton_system(&n.s, NATURAL, exchange_weight())
+    for j in range(n.s.e.m):
+        n.f[j] = -n.f[j]
+    solve_natural_map_system_refined(&n.s, n.f, n.dz, n.r, n.da)
+    if not all_finite(n.dz, n.s.e.m):
         end_active_set(n)
         return
+    for j in range(n.s.e.m):
+        x.z[j] += n.dz[j]
+    multiply_system_matrix(&n.s, x.z, x.hz)
     residual = convex_residual(n, x.z, x.hz)
     gains = residual < 0.5 * x.best
     if residual < x.best:

@@ -8,7 +8,7 @@ from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.arena cimport arena_t, take_integers
 from lavender_ext.core.block_types cimport blocks_t
-from lavender_ext.core.view cimport get_block_bodies, generalized_t, rows_t
+from lavender_ext.core.view cimport generalized_t, rows_t
 from lavender_ext.factor.graph cimport order_bodies_and_list_block_rows, pattern_workspace_size
 from lavender_ext.factor.linear cimport BLOCKS, NO_FACTOR
 from lavender_ext.factor.symbolic cimport compute_block_elimination_tree
@@ -58,18 +58,6 @@ cdef inline int64_t order_bodies(pattern_t* a) noexcept nogil:
         if below <= 2147483647:
             a.lptr[i + 1] += a.lptr[i]
     return below
-
-
-cdef inline int64_t order_elements(const scaled_t* s, pattern_t* a, const rows_t* r) noexcept nogil:
-    """Order the bodies of the elements that `index_unfixed_elements` found; return the off-diagonal blocks of L."""
-    cdef int32_t i
-    cdef const int32_t* body
-    a.k = s.e.n
-    for i in range(a.k):
-        body = get_block_bodies(r, s.block[i])
-        a.body[2 * i] = body[0]
-        a.body[2 * i + 1] = body[1]
-    return order_bodies(a)
 
 
 cdef inline void remove_fixed_rows_and_columns(const scaled_t* s, const int32_t* swapped, const int32_t* column, int32_t size,

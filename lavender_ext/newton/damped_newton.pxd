@@ -24,10 +24,10 @@ from libc.stdint cimport int32_t
 from lavender_ext.core.block_types cimport CONE
 from lavender_ext.core.line_search cimport is_reduction_sufficient
 from lavender_ext.core.validate cimport all_finite, norm_inf
-from lavender_ext.newton.run cimport (DAMPED_NEWTON, DAMPED_STRETCHES, MAX_INNER_STEPS, N_PROXIMAL, UNLIMITED,
-                                      copy_vector, damped_newton_t, end_separate_best, is_at_roundoff,
-                                      is_budget_spent, is_finished, judge_and_keep_best_point, newton_t, pop_phase, push_phase,
-                                      stretches_t)
+from lavender_ext.judge.best cimport relative_residual_of_best
+from lavender_ext.newton.run cimport (DAMPED_NEWTON, DAMPED_STRETCHES, MAX_INNER_STEPS, N_PROXIMAL, UNLIMITED, copy_vector,
+                                      damped_newton_t, is_at_roundoff, is_budget_spent, is_finished, judge_and_keep_best_point,
+                                      newton_t, pop_phase, push_phase, stretches_t, write_unknown)
 from lavender_ext.newton.system cimport (NATURAL, evaluate_system_natural_map, factor_newton_system, multiply_system_matrix,
                                          solve_natural_map_system, system_t)
 
@@ -202,7 +202,7 @@ cdef inline void begin_damped_newton_stretches(newton_t* n, int32_t length, doub
 cdef inline void continue_damped_newton_stretches(newton_t* n) noexcept nogil:
     """Continue damped Newton by another stretch if the last stretch halved the residual; else end the phase."""
     cdef stretches_t* x = &n.stretches
-    cdef double best
+    cdef double best, all_phases
     if not x.is_running:
         if is_finished(n) or n.damped.is_stuck or x.stretches == MAX_STRETCHES:
             pop_phase(n)
@@ -213,7 +213,10 @@ cdef inline void continue_damped_newton_stretches(newton_t* n) noexcept nogil:
         push_damped_newton(n, x.length)
         return
     x.is_running = 0
-    best = end_separate_best(n)
+    best, all_phases = n.best, relative_residual_of_best(&n.island_best)
+    if all_phases < best:                               # Keep the better of this best point and the best impulse of all.
+        n.best = all_phases
+        write_unknown(n, n.island_best.impulse, n.best_z)
     if best > 0.5 * x.residual or best == 1.0 / 0.0 or is_at_roundoff(n):
         pop_phase(n)
         return

@@ -13,7 +13,7 @@ and N (normal_matrix.pxd), with a block of `s` columns for each body, is factore
 condition of N is that of J squared once, not twice, and linearly dependent rows do no harm.
 """
 from libc.math cimport fabs
-from libc.stdint cimport int32_t, int64_t
+from libc.stdint cimport int32_t
 
 
 cdef struct elements_t:

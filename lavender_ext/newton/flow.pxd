@@ -37,24 +37,9 @@ cdef enum:
     FLOW_TRIAL_FACTORISATIONS = 4   # Budget of damped Newton under Coulomb's law, at each decade of the residual.
 
 
-cdef inline double first_flow_weight() noexcept nogil:
-    """Return the first eps, relative to d; 1e-2 takes a tenth more factorisations on twelve walls, pyramids and heaps."""
-    return 3e-3
-
-
-cdef inline double min_flow_weight() noexcept nogil:
-    """Return the smallest eps."""
-    return 1e-6
-
-
 cdef inline double flow_weight_fall() noexcept nogil:
     """Return the factor by which eps falls; with 0.5, some heaps are not solved."""
     return 0.8
-
-
-cdef inline double flow_weight_rise() noexcept nogil:
-    """Return the factor by which eps rises after an Euler step that is not solved."""
-    return 3.0
 
 
 cdef inline void begin_flow(newton_t* n, const double* z, int32_t limit, int32_t patience) noexcept nogil:
@@ -75,7 +60,7 @@ cdef inline void begin_flow(newton_t* n, const double* z, int32_t limit, int32_t
     evaluate_all_natural_maps(n.s.e, z, n.slack, CONE, 0.0, n.f, n.s.p, n.s.einv, NULL)
     for j in range(n.s.e.m):
         x.centre[j] = z[j] - n.f[j]
-    x.eps = first_flow_weight()
+    x.eps = 3e-3                # relative to d; 1e-2 takes a tenth more factorisations on twelve walls, pyramids and heaps
     x.trial_residual = 1e-3
     x.inner_steps = 0
     x.lowest, x.patience = 1.0 / 0.0, patience
@@ -134,28 +119,10 @@ cdef inline void move_flow_centre(newton_t* n) noexcept nogil:
     copy_vector(n, n.flow.saved_z, n.flow.z)
 
 
-cdef inline void end_flow_step(newton_t* n) noexcept nogil:
-    """End an Euler step that is solved. Near a solution of Coulomb's law, damped Newton is tried."""
-    cdef flow_t* x = &n.flow
-    cdef double residual = judge_and_keep_best_point(n, n.t1)
-    move_flow_centre(n)
-    if residual < 0.5 * x.lowest:
-        x.lowest, x.since = residual, n.s.factorisations
-    if x.inner_steps <= FEW_FLOW_STEPS:
-        x.eps = max(flow_weight_fall() * x.eps, min_flow_weight())
-    elif x.inner_steps >= MANY_FLOW_STEPS:
-        x.eps = min(x.eps / flow_weight_fall(), 1.0)
-    x.inner_steps = 0
-    if residual < x.trial_residual and not is_finished(n):
-        x.trial_residual = 0.1 * residual
-        begin_damped_newton(n, n.t1, COULOMB, 1e-7, FLOW_TRIAL_FACTORISATIONS)
-        push_damped_newton(n, FLOW_TRIAL_FACTORISATIONS)
-
-
 cdef inline void fail_flow_step(newton_t* n, double size) noexcept nogil:
     """Raise eps after an Euler step that is not solved; return to the last solved one if |F| `size` is large."""
     cdef flow_t* x = &n.flow
-    x.eps = min(flow_weight_rise() * x.eps, 1.0)
+    x.eps = min(3.0 * x.eps, 1.0)
     x.inner_steps = 0
     if size <= 2.0 * x.move:
         move_flow_centre(n)
@@ -168,7 +135,7 @@ cdef inline void step_flow(newton_t* n) noexcept nogil:
     """Take a Newton step (2), and end the Euler step if it is solved or takes too many."""
     cdef flow_t* x = &n.flow
     cdef int32_t j, _, m = n.s.e.m
-    cdef double size, value = 1.0 / 0.0, t = 1.0
+    cdef double size, residual, value = 1.0 / 0.0, t = 1.0
     if is_finished(n) or n.s.factorisations >= x.last or n.s.factorisations - x.since > x.patience:
         pop_phase(n)
         return
@@ -197,7 +164,19 @@ cdef inline void step_flow(newton_t* n) noexcept nogil:
     for j in range(m):
         x.z[j] += t * n.dz[j]
         x.hz[j] += t * n.hdz[j]
-    if value <= 0.3 * x.move or value < 1e-14:
-        end_flow_step(n)
+    if value <= 0.3 * x.move or value < 1e-14:          # The Euler step is solved.
+        residual = judge_and_keep_best_point(n, n.t1)
+        move_flow_centre(n)
+        if residual < 0.5 * x.lowest:
+            x.lowest, x.since = residual, n.s.factorisations
+        if x.inner_steps <= FEW_FLOW_STEPS:
+            x.eps = max(flow_weight_fall() * x.eps, 1e-6)
+        elif x.inner_steps >= MANY_FLOW_STEPS:
+            x.eps = min(x.eps / flow_weight_fall(), 1.0)
+        x.inner_steps = 0
+        if residual < x.trial_residual and not is_finished(n):      # Near a solution of Coulomb's law, damped Newton is tried.
+            x.trial_residual = 0.1 * residual
+            begin_damped_newton(n, n.t1, COULOMB, 1e-7, FLOW_TRIAL_FACTORISATIONS)
+            push_damped_newton(n, FLOW_TRIAL_FACTORISATIONS)
     elif x.inner_steps >= MAX_FLOW_STEPS:
         fail_flow_step(n, value)

@@ -41,12 +41,13 @@ from libc.string cimport memset
 
 from lavender_ext.core.validate cimport all_finite
 from lavender_ext.core.block_types cimport COULOMB
+from lavender_ext.factor.linear cimport compute_determinant_sign
 from lavender_ext.newton.cones cimport has_lower_bound, has_upper_bound
 from lavender_ext.newton.elements cimport elements_t, invert_and_multiply, is_row
 from lavender_ext.newton.damped_newton cimport begin_damped_newton, push_damped_newton
 from lavender_ext.newton.run cimport (N_PATH, PATH, compute_slack, copy_vector, is_finished, newton_t, path_t,
                                       pop_phase, push_phase, judge_and_keep_best_point)
-from lavender_ext.newton.system cimport (NATURAL, solve_natural_map_system, factor_newton_system, determinant_sign,
+from lavender_ext.newton.system cimport (NATURAL, SPARSE, solve_natural_map_system, factor_newton_system,
                                          multiply_system_matrix)
 
 
@@ -356,7 +357,7 @@ cdef inline bint compute_path_directions(newton_t* n, const double* z, double ta
     n.counts[N_PATH] += 1
     n.s.law = COULOMB
     factor_newton_system(&n.s, NATURAL, n.path.eps)
-    n.path.sign = determinant_sign(&n.s)
+    n.path.sign = 0 if n.s.augmented or n.s.form == SPARSE else compute_determinant_sign(n.s.linear)      # of (3); 0: unknown
     solve_natural_map_system(&n.s, n.f, n.dz)
     solve_natural_map_system(&n.s, n.c, n.path.b)
     for j in range(m):
@@ -404,19 +405,6 @@ cdef inline void compute_path_tangent(newton_t* n, double tau) noexcept nogil:
         x.tl = 1.0 if compute_coordinate_rate(n, x.parameter, n.psi, 1.0, tau, &turned) * x.speed > 0.0 else -1.0
     for j in range(n.s.e.m):
         x.t[j] = x.tl * x.b[j]
-
-
-cdef inline void save_path_point(newton_t* n) noexcept nogil:
-    """Save the last point, to which the path returns if steps fail. Two points are saved; a third one replaces the older."""
-    cdef path_t* x = &n.path
-    cdef double* z = x.saved_z[0]
-    cdef double* tangent = x.saved_t[0]
-    x.saved_z[0], x.saved_t[0], x.saved_z[1], x.saved_t[1] = x.saved_z[1], x.saved_t[1], z, tangent
-    x.saved_l[0], x.saved_tl[0], x.saved_h[0] = x.saved_l[1], x.saved_tl[1], x.saved_h[1]
-    copy_vector(n, x.saved_z[1], x.z)
-    copy_vector(n, x.saved_t[1], x.t)
-    x.saved_l[1], x.saved_tl[1], x.saved_h[1] = x.l, x.tl, x.h
-    x.n_saved = 2 if x.n_saved else 1
 
 
 cdef inline bint return_to_saved_path_point(newton_t* n) noexcept nogil:
@@ -480,7 +468,15 @@ cdef inline void accept_path_point(newton_t* n) noexcept nogil:
     """Make n.u the last point, choose the next step length, and try to end the path by damped Newton."""
     cdef path_t* x = &n.path
     cdef double factor, residual
-    save_path_point(n)
+    cdef double* z = x.saved_z[0]
+    cdef double* tangent = x.saved_t[0]
+    # Save the last point, to which the path returns if steps fail. Two points are saved; a third one replaces the older.
+    x.saved_z[0], x.saved_t[0], x.saved_z[1], x.saved_t[1] = x.saved_z[1], x.saved_t[1], z, tangent
+    x.saved_l[0], x.saved_tl[0], x.saved_h[0] = x.saved_l[1], x.saved_tl[1], x.saved_h[1]
+    copy_vector(n, x.saved_z[1], x.z)
+    copy_vector(n, x.saved_t[1], x.t)
+    x.saved_l[1], x.saved_tl[1], x.saved_h[1] = x.l, x.tl, x.h
+    x.n_saved = 2 if x.n_saved else 1
     copy_vector(n, x.z, n.u)
     x.l = x.next
     compute_path_tangent(n, compute_exponential(x.l))

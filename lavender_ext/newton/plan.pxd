@@ -130,41 +130,9 @@ cdef inline double derivative_fraction() noexcept nogil:
     return 0.95
 
 
-cdef inline double augmented_derivative_fraction() noexcept nogil:
-    """Return the part of phi's derivative in De Saxce's interior point on the augmented system, after a failure of the other."""
-    return 0.7
-
-
 cdef inline double far_from_end() noexcept nogil:
     """Return the residual of De Saxce's interior point above which no damped Newton phase follows."""
     return 1e-2
-
-
-cdef inline double max_sliding_fraction() noexcept nogil:
-    """Return the fraction of sliding contacts above which the paths come before Euler steps from the convex point.
-
-    Of piles of balls that it solves up to 4 % slide at the convex point; of towers, walls and pyramids 7 % to 80 %.
-    """
-    return 0.05
-
-
-cdef inline double max_start_residual() noexcept nogil:
-    """Return the residual of the start above which damped Newton from it gains nothing on large problems.
-
-    Relaxed points of resting heaps have 1e-3 to 5e-3, where it gained nothing; a pyramid of unequal masses at rest takes 47
-    factorisations from 5e-5 where the other states take 88.
-    """
-    return 1e-4
-
-
-cdef inline double max_flow_residual() noexcept nogil:
-    """Return the residual of De Saxce's point above which the paths come before Euler steps, as on heaps."""
-    return 1e-3
-
-
-cdef inline double max_start_residual_ratio() noexcept nogil:
-    """Return the residual, relative to the start, above which an interior point follows the first stretch of damped Newton."""
-    return 0.9
 
 
 cdef inline double start_alpha() noexcept nogil:
@@ -173,24 +141,6 @@ cdef inline double start_alpha() noexcept nogil:
     With weights from 1e-4 to 1e-7, 68 test problems take 2,030 to 2,530 factorisations in all.
     """
     return 1e-5
-
-
-cdef inline double first_cone_weight() noexcept nogil:
-    """Return the first proximal weight on cones, as a fraction of d; N loses 2^-53 / weight to rounding.
-
-    It is larger than on rows because the scaling matrices of cones have a wider range of eigenvalues. On a pyramid of
-    redundant contacts, 1e-10 ends at a residual of 3e-8 and 1e-8 at 4e-10; 1e-6 takes one more step.
-    """
-    return 1e-8
-
-
-cdef inline double third_cone_weight() noexcept nogil:
-    """Return the third proximal weight on cones, for masses that differ by factors of 1e5 and more.
-
-    Of six pyramids under the cone law (5 to 7 layers, mass ratios of 1e5 to 1e7), damped Newton solves five from its point
-    to 1e-8 and the sixth to its round-off limit. From the point of the second weight it solves none.
-    """
-    return 1e-13
 
 
 # -- first points of bounded rows --------------------------------------------------------------------------------------
@@ -290,13 +240,19 @@ cdef inline void enter_next_convex_state(newton_t* n) noexcept nogil:
     elif state == ROWS_INTERIOR_POINT:
         begin_interior_steps(n, True)
     elif state == FIRST_CONE_WEIGHT:
-        begin_interior_point(n, first_cone_weight(), 0.0)
+        # The weight, a fraction of d, is larger than on rows: the scaling matrices of cones have a wider range of eigenvalues,
+        # and N loses 2^-53 / weight to rounding. On a pyramid of redundant contacts, 1e-10 ends at a residual of 3e-8 and 1e-8
+        # at 4e-10; 1e-6 takes one more step.
+        begin_interior_point(n, 1e-8, 0.0)
         begin_interior_steps(n, False)
     elif state == SECOND_CONE_WEIGHT:
         begin_interior_point(n, compute_proximal_weight(), 0.0)
         begin_interior_steps(n, False)
     elif state == THIRD_CONE_WEIGHT:
-        begin_interior_point(n, third_cone_weight(), 0.0)
+        # This weight is for masses that differ by factors of 1e5 and more. Of six pyramids under the cone law (5 to 7 layers,
+        # mass ratios of 1e5 to 1e7), damped Newton solves five from its point to 1e-8 and the sixth to its round-off limit.
+        # From the point of the second weight it solves none.
+        begin_interior_point(n, 1e-13, 0.0)
         begin_interior_steps(n, False)
     elif state == AUGMENTED_INTERIOR_POINT:
         if may_need_augmented_system(n):
@@ -327,9 +283,12 @@ cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
     if is_over(n):
         state = COULOMB_END
     if state == START_DAMPED_NEWTON:
-        if n.s.e.m < MIN_FLOW_ROWS or n.best < max_start_residual():
+        # On large problems this gains nothing above a residual of 1e-4: relaxed points of resting heaps have 1e-3 to 5e-3. A
+        # pyramid of unequal masses at rest takes 47 factorisations from 5e-5 where the other states take 88.
+        if n.s.e.m < MIN_FLOW_ROWS or n.best < 1e-4:
             begin_damped_newton(n, n.best_z, COULOMB, start_alpha(), START_FACTORISATIONS)
-            begin_damped_newton_stretches(n, START_FACTORISATIONS, 2.0 * max_start_residual_ratio() * n.best)
+            # An interior point follows if the first stretch leaves more than 0.9 of the residual.
+            begin_damped_newton_stretches(n, START_FACTORISATIONS, 2.0 * 0.9 * n.best)
     elif state == DE_SAXCE:
         begin_interior_point(n, compute_proximal_weight(), derivative_fraction())
         begin_interior_with_newton(n, 0)
@@ -342,7 +301,7 @@ cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
             begin_damped_newton(n, n.best_z, COULOMB, min(n.best, 1e-7), SECOND_END_FACTORISATIONS)
             begin_damped_newton_stretches(n, SECOND_END_FACTORISATIONS, 0.0)
     elif state == FIRST_FLOW:
-        if n.s.e.m >= MIN_FLOW_ROWS and n.best < max_flow_residual():
+        if n.s.e.m >= MIN_FLOW_ROWS and n.best < 1e-3:  # Further away, as on heaps, the paths come first.
             begin_flow(n, n.best_z, FIRST_FLOW_FACTORISATIONS, FLOW_PATIENCE)
     elif state == CONVEX_POINT:
         if has_convex_law(n):
@@ -350,11 +309,12 @@ cdef inline void enter_next_coulomb_state(newton_t* n) noexcept nogil:
             begin_interior_steps(n, False)
     elif state == CONVEX_FLOW:
         z = n.progress.best_z
-        if has_convex_law(n) and not n.mostly_slides and compute_sliding_fraction(n, z, 1e-6) <= max_sliding_fraction():
+        # Of piles of balls that this solves up to 4 % slide at the convex point; of towers, walls and pyramids 7 % to 80 %.
+        if has_convex_law(n) and not n.mostly_slides and compute_sliding_fraction(n, z, 1e-6) <= 0.05:
             begin_flow(n, z, CONVEX_FLOW_FACTORISATIONS, CONVEX_FLOW_FACTORISATIONS)
     elif state == AUGMENTED_DE_SAXCE:
         if may_need_augmented_system(n):
-            begin_augmented_interior_point(n, augmented_derivative_fraction())
+            begin_augmented_interior_point(n, 0.7)      # less of phi's derivative, after a failure of `derivative_fraction`
     elif state == BEGIN_PATH:
         begin_path(n)
     elif state == PATH_FLOW:

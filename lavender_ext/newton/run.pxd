@@ -7,19 +7,18 @@ in between.
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy, memset
 
-from lavender_ext.core.arena cimport arena_t, has_memory, take_doubles, take_integers
+from lavender_ext.core.arena cimport arena_t, take_doubles, take_integers, has_memory
 from lavender_ext.core.block_types cimport COULOMB, blocks_t
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.factor.linear cimport linear_t
-from lavender_ext.judge.best cimport (
-    best_t, best_workspace_size, bind_best, copy_score_without_islands, relative_residual_of_best,
-    store_better_islands,
-)
+from lavender_ext.judge.best cimport (best_t, best_workspace_size, bind_best, copy_score_without_islands, store_better_islands,
+                                      relative_residual_of_best)
 from lavender_ext.judge.measure cimport residual_above_floor, relative_floor_of_score, judge_view, relative_residual_of_score
 from lavender_ext.judge.score cimport make_empty_score, relative_residual, score_t
+from lavender_ext.newton.cones cimport CONE_SCALING_SIZE
 from lavender_ext.newton.interior cimport interior_t
 from lavender_ext.newton.natural_map cimport compute_convex_residual
-from lavender_ext.newton.scaling cimport bind_element_indices, bind_element_values, scale_elements, scaled_t
+from lavender_ext.newton.scaling cimport bind_element_indices, scale_elements, scaled_t
 from lavender_ext.newton.system cimport has_passed_after_part, multiply_system_matrix, system_t
 
 
@@ -49,7 +48,7 @@ cdef enum:                      # counters
 
 cdef enum:
     MAX_PHASE_DEPTH = 8         # Phases nest at most four deep.
-    N_VECTORS = 28              # vectors (m) of `bind_vectors`
+    N_VECTORS = 28              # vectors (m) of `bind_values`
     UNLIMITED = 2147483647      # limit of factorisations that no phase reaches
     MAX_INNER_STEPS = 20        # Newton steps of one proximal iteration; more rarely end it.
 
@@ -226,40 +225,11 @@ cdef struct newton_t:           # bound to its workspace; it must not move
 # -- workspace -------------------------------------------------------------------------------------------------------
 
 
-cdef inline void bind_judge_arrays(newton_t* n, arena_t* a) noexcept nogil:
-    """Take the judge's arrays for the problem that is judged."""
-    cdef const problem_t* o = &n.problem
-    cdef int64_t m = o.p.n_rows
-    cdef double* best
-    n.lam, n.certificate = take_doubles(a, m), take_doubles(a, m)
-    n.problem.w, n.problem.error = take_doubles(a, m), take_doubles(a, m)
-    best = take_doubles(a, best_workspace_size(m, <int64_t>o.p.n_blocks + 1))
-    n.problem.x = take_doubles(a, m + (12 * <int64_t>o.r.n_bodies if o.r != NULL else o.g.n if o.g != NULL else 0))
-    if has_memory(a):
-        bind_best(&n.island_best, &n.problem.p, best)
-        n.island_best.by_energy = 1                   # Only solved islands are combined.
-
-
 cdef inline void bind_indices(newton_t* n, arena_t* a) noexcept nogil:
     """Take the integer arrays for the problem that is judged."""
     cdef int64_t m = n.problem.p.n_rows
     bind_element_indices(&n.sc, m, a)
     n.active.bound, n.linear.swap, n.s.free = take_integers(a, m), take_integers(a, m), take_integers(a, m)
-
-
-cdef inline void bind_vectors(newton_t* n, int64_t m, arena_t* a) noexcept nogil:
-    """Take the vectors (m)."""
-    cdef double** at[N_VECTORS]
-    cdef int32_t i
-    at[0], at[1], at[2], at[3] = &n.best_z, &n.s.t, &n.s.q, &n.direction
-    at[4], at[5], at[6], at[7] = &n.f, &n.r, &n.da, &n.dz
-    at[8], at[9], at[10], at[11] = &n.t1, &n.t2, &n.u, &n.psi
-    at[12], at[13], at[14], at[15] = &n.c, &n.hz, &n.hdz, &n.trial
-    at[16], at[17], at[18], at[19] = &n.slack, &n.ip.z, &n.ip.u1, &n.ip.u2
-    at[20], at[21], at[22], at[23] = &n.ip.hz, &n.ip.unbounded_z, &n.active.z, &n.active.hz
-    at[24], at[25], at[26], at[27] = &n.active.best_z, &n.progress.best_z, &n.augmented.z, &n.damped.z
-    for i in range(N_VECTORS):
-        at[i][0] = take_doubles(a, m)
 
 
 cdef inline void bind_values(newton_t* n, int64_t small, bint clear, arena_t* a) noexcept nogil:
@@ -270,16 +240,39 @@ cdef inline void bind_values(newton_t* n, int64_t small, bint clear, arena_t* a)
     """
     cdef path_t* p = &n.path
     cdef flow_t* f = &n.flow
-    cdef int64_t m = n.problem.p.n_rows, first
-    bind_judge_arrays(n, a)
+    cdef scaled_t* s = &n.sc
+    cdef const problem_t* o = &n.problem
+    cdef int64_t m = o.p.n_rows, first
+    cdef double* best
+    cdef double** at[N_VECTORS]
+    cdef int32_t i
+    # the judge's arrays for the problem that is judged
+    n.lam, n.certificate = take_doubles(a, m), take_doubles(a, m)
+    n.problem.w, n.problem.error = take_doubles(a, m), take_doubles(a, m)
+    best = take_doubles(a, best_workspace_size(m, <int64_t>o.p.n_blocks + 1))
+    n.problem.x = take_doubles(a, m + (12 * <int64_t>o.r.n_bodies if o.r != NULL else o.g.n if o.g != NULL else 0))
+    if has_memory(a):
+        bind_best(&n.island_best, &n.problem.p, best)
+        n.island_best.by_energy = 1                     # Only solved islands are combined.
     first = a.n_real
-    bind_element_values(&n.sc, m, a)
-    bind_vectors(n, m, a)
+    # the elements, for up to m rows
+    s.fixed, s.scale, s.speed = take_doubles(a, m), take_doubles(a, m), take_doubles(a, m)
+    s.e.theta, s.e.g, s.e.lower, s.e.upper = take_doubles(a, m), take_doubles(a, m), take_doubles(a, m), take_doubles(a, m)
+    s.e.reach, s.e.scaling = take_doubles(a, m), take_doubles(a, CONE_SCALING_SIZE * m)
+    at[0], at[1], at[2], at[3] = &n.best_z, &n.s.t, &n.s.q, &n.direction
+    at[4], at[5], at[6], at[7] = &n.f, &n.r, &n.da, &n.dz
+    at[8], at[9], at[10], at[11] = &n.t1, &n.t2, &n.u, &n.psi
+    at[12], at[13], at[14], at[15] = &n.c, &n.hz, &n.hdz, &n.trial
+    at[16], at[17], at[18], at[19] = &n.slack, &n.ip.z, &n.ip.u1, &n.ip.u2
+    at[20], at[21], at[22], at[23] = &n.ip.hz, &n.ip.unbounded_z, &n.active.z, &n.active.hz
+    at[24], at[25], at[26], at[27] = &n.active.best_z, &n.progress.best_z, &n.augmented.z, &n.damped.z
+    for i in range(N_VECTORS):
+        at[i][0] = take_doubles(a, m)
     n.s.v, n.s.einv, n.s.p, n.s.pair, n.s.bt = (take_doubles(a, small), take_doubles(a, small), take_doubles(a, small),
                                                 take_doubles(a, small), take_doubles(a, small))
     if clear:
         memset(a.real + first, 0, (a.n_real - first) * sizeof(double))
-    if n.problem.p.law == COULOMB:                      # Paths and Euler steps set their vectors before they read them.
+    if o.p.law == COULOMB:                              # Paths and Euler steps set their vectors before they read them.
         p.z, p.t, p.b = take_doubles(a, m), take_doubles(a, m), take_doubles(a, m)
         p.saved_z[0], p.saved_z[1] = take_doubles(a, m), take_doubles(a, m)
         p.saved_t[0], p.saved_t[1] = take_doubles(a, m), take_doubles(a, m)
@@ -339,15 +332,6 @@ cdef inline void write_unknown(const newton_t* n, const double* lam, double* z) 
     cdef int32_t j
     for j in range(n.s.e.m):
         z[j] = lam[n.sc.keep[j]] / n.sc.scale[j]
-
-
-cdef inline const double* write_certificate(newton_t* n) noexcept nogil:
-    """Write `direction` as an impulse (rows) and return it."""
-    cdef int32_t j
-    memset(n.certificate, 0, n.problem.p.n_rows * sizeof(double))
-    for j in range(n.s.e.m):
-        n.certificate[n.sc.keep[j]] = n.direction[j] * n.sc.scale[j]
-    return n.certificate
 
 
 # -- residuals -------------------------------------------------------------------------------------------------------
@@ -418,15 +402,3 @@ cdef inline bint is_over(newton_t* n) noexcept nogil:
 
 
 # -- the best point --------------------------------------------------------------------------------------------------
-
-
-cdef inline double end_separate_best(newton_t* n) noexcept nogil:
-    """End a phase that began with an infinite `best`, and keep the better of its best point and the best impulse of all.
-
-    Return the lowest residual of the phase.
-    """
-    cdef double best = n.best, all_phases = relative_residual_of_best(&n.island_best)
-    if all_phases < best:
-        n.best = all_phases
-        write_unknown(n, n.island_best.impulse, n.best_z)
-    return best

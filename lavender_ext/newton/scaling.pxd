@@ -10,14 +10,13 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memset
 
-from lavender_ext.core.arena cimport arena_t, take_doubles, take_integers
+from lavender_ext.core.arena cimport arena_t, take_integers
 from lavender_ext.core.block_types cimport (
     blocks_t, friction_components_t, get_friction_components, is_round_cone_contact, has_independent_rows,
 )
 from lavender_ext.core.velocity cimport compute_velocity_change
 from lavender_ext.core.view cimport csr_t, rows_t, view_t
 from lavender_ext.judge.slack cimport compute_generalized_slack, compute_body_slack
-from lavender_ext.newton.cones cimport CONE_SCALING_SIZE
 from lavender_ext.newton.elements cimport elements_t
 from lavender_ext.velocity_newton.soft cimport has_bounded_rows_only
 
@@ -121,13 +120,6 @@ cdef inline void bind_element_indices(scaled_t* s, int64_t m, arena_t* a) noexce
     s.e.s = 1
 
 
-cdef inline void bind_element_values(scaled_t* s, int64_t m, arena_t* a) noexcept nogil:
-    """Take the arrays of doubles for up to m rows."""
-    s.fixed, s.scale, s.speed = take_doubles(a, m), take_doubles(a, m), take_doubles(a, m)
-    s.e.theta, s.e.g, s.e.lower, s.e.upper = take_doubles(a, m), take_doubles(a, m), take_doubles(a, m), take_doubles(a, m)
-    s.e.reach, s.e.scaling = take_doubles(a, m), take_doubles(a, CONE_SCALING_SIZE * m)
-
-
 cdef inline void index_unfixed_elements(scaled_t* s, const view_t* v) noexcept nogil:
     """Find the rows that are not fixed and their elements; the arrays are bound by `bind_element_indices`."""
     cdef const blocks_t* p = &v.p
@@ -172,27 +164,19 @@ cdef inline void index_unfixed_elements(scaled_t* s, const view_t* v) noexcept n
     s.whole = m == p.n_rows
 
 
-cdef inline bint write_fixed_impulses(scaled_t* s, const view_t* v) noexcept nogil:
-    """Write the impulses of the fixed rows; return whether any of them is not 0."""
+cdef inline void scale_elements(scaled_t* s, const view_t* v, double* w, double* scratch) noexcept nogil:
+    """Compute the values of the elements; w (rows) and scratch (velocities) are lost."""
     cdef const blocks_t* p = &v.p
-    cdef int32_t i, j
+    cdef int32_t i, j, q, h, g
     cdef double x
     cdef bint any_fixed_impulse = False
+    # the impulses of the fixed rows
     memset(s.fixed, 0, p.n_rows * sizeof(double))
     for i in range(0 if s.whole else p.n_blocks):
         for j in range(p.ptr[i], p.ptr[i + 1]):
             if is_fixed(v, i, j, &x):
                 s.fixed[j] = x
                 any_fixed_impulse = any_fixed_impulse or x != 0.0
-    return any_fixed_impulse
-
-
-cdef inline void scale_elements(scaled_t* s, const view_t* v, double* w, double* scratch) noexcept nogil:
-    """Compute the values of the elements, bound by `bind_element_values`; w (rows) and scratch (velocities) are lost."""
-    cdef const blocks_t* p = &v.p
-    cdef int32_t i, j, q, h, g
-    cdef double x
-    cdef bint any_fixed_impulse = write_fixed_impulses(s, v)
     if any_fixed_impulse and v.r != NULL:
         compute_velocity_change(p, v.r, s.fixed, scratch)
         compute_body_slack(p, v.r, s.fixed, scratch, w)

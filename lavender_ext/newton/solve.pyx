@@ -20,20 +20,18 @@ from lavender_ext.core.method cimport (CERTIFICATE, MORE, NEEDS_WORKSPACE, SPENT
 from lavender_ext.core.block_types cimport CONE, COULOMB
 from lavender_ext.core.csr cimport measure_asymmetry_and_bandwidth
 from lavender_ext.core.problem cimport Data
-from lavender_ext.core.view cimport rows_t, view_t
+from lavender_ext.core.view cimport get_block_bodies, rows_t, view_t
 from lavender_ext.factor.factors cimport block_matrix_t, has_wide, interrupt_t
 from lavender_ext.factor.linear cimport (FALLBACK, PythonCalls, analyse_blocks, bind_block_factor_indices,
                                          bind_block_factor_values, fallback_t)
 from lavender_ext.judge.score cimport take_smallest_island_reference
-from lavender_ext.newton.bodies cimport (bind_pattern, form_panel, form_velocity_panel, order_bodies, order_elements,
-                                         pattern_t, use_panel)
+from lavender_ext.newton.bodies cimport bind_pattern, form_panel, form_velocity_panel, order_bodies, pattern_t, use_panel
 from lavender_ext.newton.elements cimport elements_t
 from lavender_ext.newton.interior cimport compute_scaling
 from lavender_ext.newton.interior_phases cimport compute_fraction_near_sliding
 from lavender_ext.newton.path cimport path_compliance
 from lavender_ext.newton.plan cimport start_newton_solve, step_newton_solve
-from lavender_ext.newton.run cimport (N_COUNTED, bind_indices, bind_values, newton_t, scale_problem, write_certificate,
-                                      write_impulse)
+from lavender_ext.newton.run cimport N_COUNTED, bind_indices, bind_values, newton_t, scale_problem, write_impulse
 from lavender_ext.newton.rows cimport (ANY_FORM, MAX_ALWAYS_DENSE_ROWS, analyse_row_system, bind_row_values,
                                        form_generalized_matrix, form_row_system, has_dense_rows, is_dense_faster)
 from lavender_ext.newton.scaling cimport bind_element_indices, index_unfixed_elements, is_problem_supported
@@ -127,7 +125,7 @@ cdef inline int32_t begin(newton_t* n, const options_t* o, const double* lam) no
 cdef int32_t step_newton_system(const view_t* v, const options_t* o, const workspace_t* r, int32_t work, double* lam,
                                 info_t* info) noexcept nogil:
     cdef newton_t* n = state_of(r)
-    cdef int32_t how
+    cdef int32_t how, j
     n.budget, n.proven, n.stop, n.linear.deadline = o.budget, o.proven, o.stop, o.deadline
     how = step_newton_solve(n, work)
     if n.best <= n.tol or n.island_best.seen == 0:
@@ -136,7 +134,12 @@ cdef int32_t step_newton_system(const view_t* v, const options_t* o, const works
         memcpy(lam, n.island_best.impulse, v.p.n_rows * sizeof(double))
     info.work = info.factorisations = n.s.factorisations
     info.relative, info.tried = n.best, n.lam
-    info.direction = write_certificate(n) if how == CERTIFICATE else NULL
+    info.direction = NULL
+    if how == CERTIFICATE:                              # The direction is written as an impulse (rows).
+        memset(n.certificate, 0, v.p.n_rows * sizeof(double))
+        for j in range(n.s.e.m):
+            n.certificate[n.sc.keep[j]] = n.direction[j] * n.sc.scale[j]
+        info.direction = n.certificate
     return how
 
 
@@ -285,6 +288,7 @@ cdef inline int32_t analyse_bodies(state_t* s, const view_t* v, const options_t*
     cdef const host_t* host = <const host_t*>o.host
     cdef arena_t a = make_arena(NULL, r.index), counted
     cdef workspace_t need
+    cdef int32_t i
     bodies_workspace_size(v, o, &need)
     if not require_workspace(r, need.n_index, 0):
         return NEEDS_WORKSPACE
@@ -292,7 +296,10 @@ cdef inline int32_t analyse_bodies(state_t* s, const view_t* v, const options_t*
     bind_body_indices(s, v, host, &a)
     index_unfixed_elements(&n.sc, v)
     if host == NULL:
-        if 6 * order_elements(&n.sc, p, v.r) > 2147483647:
+        p.k = n.sc.e.n
+        for i in range(p.k):                            # Order the bodies of the elements.
+            p.body[2 * i], p.body[2 * i + 1] = get_block_bodies(v.r, n.sc.block[i])[0], get_block_bodies(v.r, n.sc.block[i])[1]
+        if 6 * order_bodies(p) > 2147483647:
             return UNFIT
         counted = arena_t(NULL, NULL, 0, a.n_index)
         n.linear.blocks.n, n.linear.blocks.factor.n = p.n, 6 * p.n

@@ -23,7 +23,7 @@ from lavender_ext.core.dot cimport dot
 from lavender_ext.core.block_types cimport CONE
 from lavender_ext.core.view cimport csr_t
 from lavender_ext.factor.linear cimport (CHOLESKY, CHOLESKY_OR_LU, LU, NO_FACTOR, factor_linear_system_matrix,
-                                         compute_determinant_sign, solve_linear_system, solve_linear_system_checked, linear_t)
+                                         solve_linear_system, solve_linear_system_checked, linear_t)
 from lavender_ext.newton.cones cimport has_lower_bound, has_upper_bound
 from lavender_ext.newton.coupled cimport form_coupled_entries, coupled_t
 from lavender_ext.newton.elements cimport multiply_by_element_matrices, elements_t, is_row
@@ -181,25 +181,18 @@ cdef inline void form_dense_matrix(system_t* s, int32_t what, double eps) noexce
             s.linear.matrix[<int64_t>j * (m + 1)] += 1.0
 
 
-cdef inline void form_sparse_matrix(system_t* s, int32_t what, double eps) noexcept nogil:
-    """Form the sparse matrix of a system."""
-    cdef int32_t j
-    cdef double* values = s.linear.rows.data
-    if what == NATURAL:
-        form_coupled_entries(&s.coupled, s.e, s.p, s.p if s.bt == NULL else NULL, eps - 1.0, values)
-    elif s.bt != NULL:
-        form_coupled_entries(&s.coupled, s.e, s.bt if what == BARRIER else s.pair, s.bt, 0.0, values)
-    else:
-        memcpy(values, s.coupled.h, s.coupled.indptr[s.e.m] * sizeof(double))
-        for j in range(s.e.m):
-            values[s.coupled.diagonal[j]] += 1.0 / s.v[j]       # Infinite for a row at its bound: the step then fails.
-
-
 cdef inline int32_t factor_sparse(system_t* s, int32_t what, double eps) noexcept nogil:
     """Form and factor the sparse matrix of a system; return 0 if that fails."""
     cdef int32_t j
     cdef linear_t* f = s.linear
-    form_sparse_matrix(s, what, eps)
+    if what == NATURAL:
+        form_coupled_entries(&s.coupled, s.e, s.p, s.p if s.bt == NULL else NULL, eps - 1.0, f.rows.data)
+    elif s.bt != NULL:
+        form_coupled_entries(&s.coupled, s.e, s.bt if what == BARRIER else s.pair, s.bt, 0.0, f.rows.data)
+    else:
+        memcpy(f.rows.data, s.coupled.h, s.coupled.indptr[s.e.m] * sizeof(double))
+        for j in range(s.e.m):
+            f.rows.data[s.coupled.diagonal[j]] += 1.0 / s.v[j]      # Infinite for a row at its bound: the step then fails.
     f.factored, f.by = NO_FACTOR, LU
     f.d = NULL          # C++ converts no NULL through a temporary.
     if not all_finite(f.rows.data, s.coupled.indptr[s.e.m]):
@@ -248,11 +241,6 @@ cdef inline int32_t factor_newton_system(system_t* s, int32_t what, double eps) 
     s.linear.by = LU if what == PAIR or (what == NATURAL and s.law != CONE) else CHOLESKY
     form_normal_matrix(s.e, s.v, &s.linear.blocks, s.linear.by == LU)
     return factor_linear_system_matrix(s.linear) == 0
-
-
-cdef inline int32_t determinant_sign(const system_t* s) noexcept nogil:
-    """Return the sign of the determinant of the last matrix (3); 0 if it is not known."""
-    return 0 if s.augmented or s.form == SPARSE else compute_determinant_sign(s.linear)
 
 
 cdef inline void apply_body_inverse(system_t* s, const double* x, double* out) noexcept nogil:

@@ -67,30 +67,24 @@ cdef void measure_as_engine(const blocks_t* p, const rows_t* r, const warm_t* s,
     violation[0] = low
 
 
-cdef inline void store_score_in_trace(const blocks_t* p, const rows_t* r, warm_t* s, double energy) noexcept nogil:
-    """Store the work, energy and max |e_n| of a judged impulse in the trace, in place of an earlier one after the same work."""
-    cdef double violation, work = s.sweeps + s.factorisations
-    cdef double* out
-    if s.n_traced > 0 and s.trace[3 * s.n_traced - 3] == work:
-        s.n_traced -= 1
-    if s.n_traced == MAX_TRACED_SCORES:
-        return
-    out = s.trace + 3 * s.n_traced
-    out[0] = work
-    out[1] = energy
-    measure_as_engine(p, r, s, &out[2], &violation)
-    s.n_traced += 1
-
-
 cdef inline double score_impulse(const blocks_t* p, const rows_t* r, warm_t* s, const double* lam, const double* v, double e0,
                           double v0) noexcept nogil:
     """Return the judge's relative residual of lam, given v = M^-1 J^T lam; infinite if it is not finite."""
     cdef score_t x = make_empty_score()
+    cdef double violation, work = s.sweeps + s.factorisations
+    cdef double* out
     x.by_island = s.by_island
     compute_body_slack(p, r, lam, v, s.slack)
     score_given_slack(p, lam, s.slack, s.error, &x)
-    if s.trace != NULL:
-        store_score_in_trace(p, r, s, x.energy)
+    # Trace the work, energy and max |e_n| of a judged impulse, in place of an earlier one after the same work.
+    if s.trace != NULL and s.n_traced > 0 and s.trace[3 * s.n_traced - 3] == work:
+        s.n_traced -= 1
+    if s.trace != NULL and s.n_traced < MAX_TRACED_SCORES:
+        out = s.trace + 3 * s.n_traced
+        out[0] = work
+        out[1] = x.energy
+        measure_as_engine(p, r, s, &out[2], &violation)
+        s.n_traced += 1
     if x.relative >= 0.0:                               # This is the residual of the worst island.
         return x.relative
     return relative_residual(x.energy, x.velocity, e0, v0) if x.finite else 1.0 / 0.0

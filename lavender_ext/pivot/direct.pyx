@@ -32,6 +32,7 @@ from lavender_ext.core.deadline cimport get_pointer
 from lavender_ext.core.arena cimport arena_t, make_arena, take_doubles, take_integers
 from lavender_ext.core.block cimport clip
 from lavender_ext.core.problem cimport Data
+from lavender_ext.factor.factors cimport clear_pivot_statistics
 from lavender_ext.factor.linear cimport CHOLESKY, LU
 from lavender_ext.judge.measure cimport (residual_above_floor, relative_floor_of_score, judge_view, make_judged,
                                          relative_residual_of_score, count_judge_scratch)
@@ -40,9 +41,8 @@ from lavender_ext.pivot.direct cimport CYCLING, DESCENT, EXCHANGE, GUESS, PASS, 
 from lavender_ext.pivot.principal cimport (INDEFINITE, ROUNDS_USED, SMALL_PIVOT, SOLVED, STUCK, bind_pivoting_arrays,
                                            compute_slack_and_rounding, correct_free_row_solution, exchange_infeasible_rows,
                                            factor_all_rows, factor_free_rows, guess_free_rows_by_sweeps,
-                                           has_passed_after_product, pivoting_t,
-                                           reset_exchange_patience, reset_pivoting, run_exchange_rounds, set_diagonal_shift,
-                                           solve_with_all_rows_free)
+                                           has_passed_after_product, pivoting_t, reset_exchange_patience, run_exchange_rounds,
+                                           set_diagonal_shift, solve_with_all_rows_free, FREE)
 
 
 cdef enum:
@@ -72,7 +72,12 @@ cdef void bind_direct_arrays(direct_t* t, arena_t* a) noexcept nogil:
 
 cdef void reset_direct_solve(direct_t* t) noexcept nogil:
     """Begin without an impulse."""
-    reset_pivoting(&t.s)
+    cdef int32_t i
+    for i in range(t.s.n):
+        t.s.at[i] = FREE
+    t.s.exchanged = t.s.factorisations = t.s.n_rounds = t.s.late = 0
+    clear_pivot_statistics(&t.s.linear.pivots)
+    set_diagonal_shift(&t.s, 0.0)
     t.relative = INFINITY
     t.floor = 0.0
     t.rank = t.solved = t.swept = t.refined = t.shifts = t.searches = t.passes = t.is_over = 0
@@ -183,30 +188,6 @@ cdef inline double get_proximal_shift(int32_t i) noexcept nogil:
     return 1e-2 if i == 0 else 1e-4 if i == 1 else 1e-6 if i == 2 else 1e-8 if i == 3 else 1e-10
 
 
-cdef inline void begin_proximal_passes(direct_t* t, int32_t state) noexcept nogil:
-    """Prepare passes from the best impulse, with every shift for DESCENT and with the smallest for PASS."""
-    cdef bint has_best = t.relative < INFINITY and t.floor <= 1e-6
-    memcpy(t.s.x, t.best if has_best else t.start, t.s.n * sizeof(double))
-    t.state = state
-    t.next_shift = 0 if state == DESCENT else N_SHIFTS - 1
-    t.larger_shift = 0.0
-    t.passes = t.waited = 0
-    t.is_pass_over = 1
-    t.halved_from = INFINITY
-
-
-cdef inline void begin_proximal_pass(direct_t* t) noexcept nogil:
-    t.is_pass_over = t.descent_steps = 0
-    t.passes += 1
-    memcpy(t.s.center, t.s.x, t.s.n * sizeof(double))
-    if t.larger_shift > 0.0 or t.next_shift < N_SHIFTS:
-        set_diagonal_shift(&t.s, t.larger_shift if t.larger_shift > 0.0 else get_proximal_shift(t.next_shift))
-        t.next_shift += t.larger_shift == 0.0
-        t.larger_shift = 0.0
-        t.shifts += 1
-    reset_exchange_patience(&t.s)
-
-
 cdef inline void repeat_proximal_pass(direct_t* t) noexcept nogil:
     """Repeat the pass on its free rows with its factor while that halves the residual, whatever the signs are."""
     cdef double previous = INFINITY
@@ -231,7 +212,15 @@ cdef inline int32_t step_proximal_pass(direct_t* t, int32_t max_rounds) noexcept
     if t.is_pass_over and t.passes == MAX_PASSES:
         return PASSES_USED
     if t.is_pass_over:
-        begin_proximal_pass(t)
+        t.is_pass_over = t.descent_steps = 0
+        t.passes += 1
+        memcpy(t.s.center, t.s.x, t.s.n * sizeof(double))
+        if t.larger_shift > 0.0 or t.next_shift < N_SHIFTS:
+            set_diagonal_shift(&t.s, t.larger_shift if t.larger_shift > 0.0 else get_proximal_shift(t.next_shift))
+            t.next_shift += t.larger_shift == 0.0
+            t.larger_shift = 0.0
+            t.shifts += 1
+        reset_exchange_patience(&t.s)
     code = run_descent_steps(t, max_rounds) if t.state == DESCENT else step_exchanges(t, max_rounds)
     if is_solved_to_rounding(t):
         return SOLVED
@@ -266,22 +255,6 @@ cdef inline int32_t step_proximal_pass(direct_t* t, int32_t max_rounds) noexcept
 
 
 # -- descent -----------------------------------------------------------------------------------------------------
-
-cdef inline bint choose_free_rows(direct_t* t) noexcept nogil:
-    """Choose F of (3) at the origin; return whether the factor of these rows is known."""
-    cdef pivoting_t* s = &t.s
-    cdef int32_t i, changed = 0
-    cdef double low, high, tolerance
-    for i in range(s.n):
-        low, high, tolerance = s.p.lower[i], s.p.upper[i], 8.0 * s.f[i]
-        if low == high or (t.origin[i] <= low and t.slope[i] >= -tolerance):
-            t.side[i] = -1
-        else:
-            t.side[i] = t.origin[i] >= high and t.slope[i] <= tolerance
-        changed += t.side[i] != s.at[i]
-    s.exchanged += changed
-    memcpy(s.at, t.side, s.n * sizeof(int32_t))
-    return s.is_factored and changed == 0
 
 
 cdef inline double search_step_length(direct_t* t) noexcept nogil:
@@ -326,14 +299,24 @@ cdef inline bint is_descent_minimum(const direct_t* t) noexcept nogil:
 cdef inline int32_t run_descent_steps(direct_t* t, int32_t max_steps) noexcept nogil:
     """Do at most `max_steps` steps (3) and judge x; return SOLVED, ROUNDS_USED, SMALL_PIVOT or INDEFINITE."""
     cdef pivoting_t* s = &t.s
-    cdef int32_t i, _, code = ROUNDS_USED
-    cdef double length
+    cdef int32_t i, _, changed, code = ROUNDS_USED
+    cdef double length, tolerance
     clip_rows_to_bounds(t, s.x, s.x)
     compute_slack_and_rounding(s)
     for _ in range(max_steps):
         memcpy(t.origin, s.x, s.n * sizeof(double))
         memcpy(t.slope, s.w, s.n * sizeof(double))
-        if not choose_free_rows(t):
+        changed = 0
+        for i in range(s.n):                            # Choose F of (3) at the origin.
+            tolerance = 8.0 * s.f[i]
+            if s.p.lower[i] == s.p.upper[i] or (t.origin[i] <= s.p.lower[i] and t.slope[i] >= -tolerance):
+                t.side[i] = -1
+            else:
+                t.side[i] = t.origin[i] >= s.p.upper[i] and t.slope[i] <= tolerance
+            changed += t.side[i] != s.at[i]
+        s.exchanged += changed
+        memcpy(s.at, t.side, s.n * sizeof(int32_t))
+        if not s.is_factored or changed:
             factor_free_rows(s, NULL)
             if s.late:
                 break
@@ -369,7 +352,14 @@ cdef inline int32_t choose_state_after_exchanges(direct_t* t, int32_t code) noex
         return CYCLING
     if not t.symmetric and t.linear:
         return INDEFINITE if code == SMALL_PIVOT else PASSES_USED
-    begin_proximal_passes(t, DESCENT if code == STUCK else PASS)
+    # Passes from the best impulse follow, with every shift for DESCENT and with the smallest for PASS.
+    memcpy(t.s.x, t.best if t.relative < INFINITY and t.floor <= 1e-6 else t.start, t.s.n * sizeof(double))
+    t.state = DESCENT if code == STUCK else PASS
+    t.next_shift = 0 if t.state == DESCENT else N_SHIFTS - 1
+    t.larger_shift = 0.0
+    t.passes = t.waited = 0
+    t.is_pass_over = 1
+    t.halved_from = INFINITY
     return SMALL_PIVOT if code == SMALL_PIVOT else STUCK
 
 

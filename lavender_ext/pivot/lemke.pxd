@@ -11,7 +11,7 @@ from lavender_ext.pivot.direct cimport direct_t
 cpdef enum:                     # results of `follow_lemke_paths`
     DONE = 0                    # the residual is at rounding, or every path has ended
     PIVOTS = 1                  # the pivots of the call are used up
-    RAY = 2                     # no variable leaves: `get_ray_direction` may be a certificate
+    RAY = 2                     # no variable leaves: the ray may be a certificate
     LATE = 3                    # the deadline has passed
     EXCHANGES = 4               # the exchanges at the end of a path need another call, which does not count as pivots
 
@@ -45,4 +45,3 @@ cdef void bind_lemke_arrays(lemke_t* l, direct_t* t, arena_t* a) noexcept nogil
 cdef void begin_lemke_solve(lemke_t* l) noexcept nogil
 cdef int32_t follow_lemke_paths(lemke_t* l, int32_t pivots) noexcept nogil
 cdef void judge_unfinished_path(lemke_t* l) noexcept nogil
-cdef void get_ray_direction(const lemke_t* l, double* y) noexcept nogil

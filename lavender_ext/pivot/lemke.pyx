@@ -449,20 +449,6 @@ cdef inline void judge_path_impulse(lemke_t* l) noexcept nogil:
     judge_iterate(l.t)
 
 
-cdef void get_ray_direction(const lemke_t* l, double* y) noexcept nogil:
-    """Write the direction (m) of the ray that ended the path; rows with two bounds have the direction 0."""
-    cdef const dictionary_t* d = &l.d
-    cdef const blocks_t* p = l.t.s.p
-    cdef double size = 1.0
-    cdef int32_t i
-    for i in range(d.n):
-        size = max(size, fabs(d.t[i * d.width + d.entering]))
-    read_dictionary_column(l, d.entering, 1e-11 * size, y)
-    for i in range(p.n_rows):
-        if p.lower[i] > -INFINITY and p.upper[i] < INFINITY:
-            y[i] = 0.0
-
-
 # -- calls -------------------------------------------------------------------------------------------------------
 
 cdef void bind_lemke_arrays(lemke_t* l, direct_t* t, arena_t* a) noexcept nogil:
@@ -565,9 +551,18 @@ cdef class Lemke:
 
     @property
     def ray(self):
-        """Direction (m,) of the ray, after RAY."""
+        """Direction (m,) of the ray, after RAY; rows with two bounds have the direction 0."""
         cdef double[::1] y = np.empty(self.rows.t.s.n)
-        get_ray_direction(&self.l, &y[0])
+        cdef const dictionary_t* d = &self.l.d
+        cdef const blocks_t* p = self.l.t.s.p
+        cdef double size = 1.0
+        cdef int32_t i
+        for i in range(d.n):
+            size = max(size, fabs(d.t[i * d.width + d.entering]))
+        read_dictionary_column(&self.l, d.entering, 1e-11 * size, &y[0])
+        for i in range(p.n_rows):
+            if p.lower[i] > -INFINITY and p.upper[i] < INFINITY:
+                y[i] = 0.0
         return y.base
 
     @property

@@ -58,7 +58,6 @@ cdef struct pivoting_t:
 
 cdef bint has_passed_after_product(pivoting_t* s) noexcept nogil
 cdef void bind_pivoting_arrays(pivoting_t* s, arena_t* a) noexcept nogil
-cdef void reset_pivoting(pivoting_t* s) noexcept nogil
 cdef void set_diagonal_shift(pivoting_t* s, double shift) noexcept nogil
 cdef void reset_exchange_patience(pivoting_t* s) noexcept nogil
 cdef void factor_free_rows(pivoting_t* s, double* x) noexcept nogil

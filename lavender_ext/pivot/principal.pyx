@@ -206,21 +206,6 @@ cdef int32_t exchange_infeasible_rows(pivoting_t* s) noexcept nogil:
     return n_infeasible
 
 
-cdef inline void predict_active_bounds(pivoting_t* s) noexcept nogil:
-    """Decide from x - w / d, with the slack w of x, which rows are free and which are at a bound."""
-    cdef int32_t i
-    cdef double y
-    for i in range(s.n):
-        y = s.x[i] - s.w[i] / s.p.d[i]
-        if y <= s.p.lower[i] or s.p.lower[i] == s.p.upper[i]:
-            s.at[i] = AT_LOWER
-        elif y >= s.p.upper[i]:
-            s.at[i] = AT_UPPER
-        else:
-            s.at[i] = FREE
-    s.is_factored = 0
-
-
 cdef bint has_passed_after_product(pivoting_t* s) noexcept nogil:
     """Count the work of a symmetric sweep, or of a round without its factor; return and store whether the deadline has passed."""
     cdef double cost = 4.0 * s.a.indptr[s.n]            # 4 ns per entry of A
@@ -318,6 +303,7 @@ cdef int32_t guess_free_rows_by_sweeps(pivoting_t* s, const double* start, int32
     All rows free are tried only if their factor costs less than the sweeps, and `max_rounds` allows a round.
     """
     cdef int32_t i
+    cdef double y
     # Multiply-adds: (band + 1)^2 / 2 per row of a factor, two per nonzero of a sweep.
     cdef bint is_cheap = s.band >= 0 and max_rounds > 0 and s.n > 0 and (
         (s.band + 1.0) * (s.band + 1) * s.n <= 4.0 * sweeps * s.a.indptr[s.n])
@@ -328,7 +314,15 @@ cdef int32_t guess_free_rows_by_sweeps(pivoting_t* s, const double* start, int32
         s.x[i] = start[i]
     run_symmetric_sweeps(s, sweeps)
     compute_slack_and_rounding(s)
-    predict_active_bounds(s)
+    for i in range(s.n):                                # x - w / d decides which rows are free and which are at a bound.
+        y = s.x[i] - s.w[i] / s.p.d[i]
+        if y <= s.p.lower[i] or s.p.lower[i] == s.p.upper[i]:
+            s.at[i] = AT_LOWER
+        elif y >= s.p.upper[i]:
+            s.at[i] = AT_UPPER
+        else:
+            s.at[i] = FREE
+    s.is_factored = 0
     return 0
 
 
@@ -343,16 +337,6 @@ cdef void set_diagonal_shift(pivoting_t* s, double shift) noexcept nogil:
     s.linear.shift = shift
     s.is_factored = 0
     reset_exchange_patience(s)
-
-
-cdef void reset_pivoting(pivoting_t* s) noexcept nogil:
-    """Reset the state: every row is free, there is no factor, and all counts are 0."""
-    cdef int32_t i
-    for i in range(s.n):
-        s.at[i] = FREE
-    s.exchanged = s.factorisations = s.n_rounds = s.late = 0
-    clear_pivot_statistics(&s.linear.pivots)
-    set_diagonal_shift(s, 0.0)
 
 
 cdef void bind_pivoting_arrays(pivoting_t* s, arena_t* a) noexcept nogil:

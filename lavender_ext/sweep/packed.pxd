@@ -27,8 +27,8 @@ cdef int64_t packed_workspace_size(int64_t joints, int64_t joint_rows, int64_t c
 cdef int64_t packed_workspace_size_of_blocks(const blocks_t* p, const rows_t* r) noexcept nogil
 cdef int32_t pack_blocks_in_order(const blocks_t* p, const rows_t* r, const int32_t* order, bint single, double* workspace,
                                   const double* lam, packed_t* out) noexcept nogil
-cdef void load_packed_impulses(const blocks_t* p, const int32_t* order, const packed_t* packed, const double* lam) noexcept nogil
-cdef void store_packed_impulses(const blocks_t* p, const int32_t* order, const packed_t* packed, double* lam) noexcept nogil
+cdef void copy_packed_impulses(const blocks_t* p, const int32_t* order, const packed_t* packed, bint into,
+                               double* lam) noexcept nogil
 cdef void sweep_records(const blocks_t* p, const rows_t* r, const packed_t* packed, int32_t sweeps, bint backwards,
                         double* lam, double* v) noexcept nogil
 cdef int32_t sweep_packed(const blocks_t* p, const rows_t* r, const int32_t* order, int32_t sweeps, double* workspace,

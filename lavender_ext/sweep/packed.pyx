@@ -301,31 +301,20 @@ cdef int32_t pack_blocks_in_order(const blocks_t* p, const rows_t* r, const int3
     return 1
 
 
-cdef inline double* locate_packed_impulses(const packed_t* packed, int32_t lane, int32_t* n) noexcept nogil:
-    """Return the first impulse of a block in its record, and their number; successive impulses are LANES doubles apart."""
-    cdef double* record = <double*>(packed.first + lane // LANES)
-    n[0] = count_record_rows(decode_record_kind((<int64_t*>record)[CODE * LANES]))
-    return record + LANES * HEADER_SIZE + lane % LANES
-
-
-cdef void load_packed_impulses(const blocks_t* p, const int32_t* order, const packed_t* packed, const double* lam) noexcept nogil:
-    """Copy the impulses lam (m) into the records."""
+cdef void copy_packed_impulses(const blocks_t* p, const int32_t* order, const packed_t* packed, bint into,
+                               double* lam) noexcept nogil:
+    """Copy the impulses in the records to lam (m), or with `into` lam into the records."""
     cdef int32_t i, k, n
     cdef double* x
     for i in range(p.n_blocks):
-        x = locate_packed_impulses(packed, packed.lane[i], &n)
+        x = <double*>(packed.first + packed.lane[i] // LANES)
+        n = count_record_rows(decode_record_kind((<int64_t*>x)[CODE * LANES]))
+        x += LANES * HEADER_SIZE + packed.lane[i] % LANES   # Successive impulses of a block are LANES doubles apart.
         for k in range(n):
-            x[LANES * k] = lam[p.ptr[order[i]] + k]
-
-
-cdef void store_packed_impulses(const blocks_t* p, const int32_t* order, const packed_t* packed, double* lam) noexcept nogil:
-    """Copy the impulses in the records to lam (m)."""
-    cdef int32_t i, k, n
-    cdef double* x
-    for i in range(p.n_blocks):
-        x = locate_packed_impulses(packed, packed.lane[i], &n)
-        for k in range(n):
-            lam[p.ptr[order[i]] + k] = x[LANES * k]
+            if into:
+                x[LANES * k] = lam[p.ptr[order[i]] + k]
+            else:
+                lam[p.ptr[order[i]] + k] = x[LANES * k]
 
 
 cdef inline void mask_inactive_lanes(const pair_t* record, int32_t n, int32_t due, int64_t unused, int64_t* write_offset,
@@ -430,5 +419,5 @@ cdef int32_t sweep_packed(const blocks_t* p, const rows_t* r, const int32_t* ord
     sweep_records(p, r, &packed, sweeps, False, lam, body)
     for i in range(6 * r.n_bodies):
         v[i] = body[i]
-    store_packed_impulses(p, order, &packed, lam)
+    copy_packed_impulses(p, order, &packed, False, lam)
     return 1

@@ -24,8 +24,8 @@ from lavender_ext.core.view cimport csr_t, view_t
 from lavender_ext.judge.stopping_test cimport (CONVERGED, RUNNING, STALLED, StoppingTest, check_start, restart_if_stalled,
                                                run_until_stop, stopping_test_t)
 from lavender_ext.local.gauss_seidel cimport prepare_exact_blocks, index_prepared_numbers, sweep_exact_blocks
-from lavender_ext.sweep.packed cimport (MAX_PACKED_BLOCKS, load_packed_impulses, pack_blocks_in_order,
-                                        packed_workspace_size_of_blocks, store_packed_impulses, sweep_records)
+from lavender_ext.sweep.packed cimport (MAX_PACKED_BLOCKS, copy_packed_impulses, pack_blocks_in_order,
+                                        packed_workspace_size_of_blocks, sweep_records)
 from lavender_ext.sweep.pgs cimport (sweep_bodies, sweep_matrix_sor, sweep_generalized, sweep_csr_once, sweep_bounded_rows,
                                      sweep_jacobi)
 from lavender_ext.sweep.serial cimport (ALL_SWEEPS, MIN_PACKED_BLOCKS, NOT_PACKED, NOT_WORTH_PACKING, PACKED, packing_t,
@@ -172,9 +172,9 @@ cdef void run_sweep_chunk(void* context, double* lam, int32_t first_sweep, int32
     cdef sweep_context_t* c = <sweep_context_t*>context
     cdef int32_t s
     if pack_blocks_of_long_run(c, lam, n) and n >= c.packing.packed.n_stages:
-        load_packed_impulses(c.blocks, c.order, &c.packing.packed, lam)
+        copy_packed_impulses(c.blocks, c.order, &c.packing.packed, True, lam)
         sweep_records(c.blocks, c.rows, &c.packing.packed, n, False, lam, c.v)
-        store_packed_impulses(c.blocks, c.order, &c.packing.packed, lam)
+        copy_packed_impulses(c.blocks, c.order, &c.packing.packed, False, lam)
         return
     for s in range(n):
         sweep_over_form(c, c.blocks, c.exact, lam, first_sweep and s == 0)

@@ -37,15 +37,6 @@ cdef inline int32_t islands_workspace_size(const view_t* v, const options_t* o, 
     return 1
 
 
-cdef inline bint exceeds_limits(const options_t* o, const requirements_t* need, double entries, double n) noexcept nogil:
-    """Return whether a factor with more than `entries` entries in n rows exceeds the caller's size or work limit.
-
-    A factor with c_i entries in row i takes sum c_i^2 / 2 multiply-adds, which is smallest if all c_i are equal.
-    """
-    cdef double factored = max(entries - need.unused_entries, 0.0)
-    return entries > o.most or 0.0 < o.work < 0.5 * factored * factored / n
-
-
 cdef inline void keep_island_matrix(workspace_t* r) noexcept nogil:
     """Let later starts, with the same J and M, keep the columns of A of a single island."""
     (<state_t*>r.index).f.keeps_matrix = True
@@ -56,6 +47,7 @@ cdef inline int32_t start_islands(const view_t* v, const options_t* o, workspace
     cdef state_t* s = <state_t*>r.index
     cdef requirements_t* need = &s.need
     cdef int32_t per
+    cdef double entries, factored
     cdef workspace_t smallest = r[0]
     cdef structure_t memory
     cdef arena_t a, counted = make_arena(NULL, NULL)
@@ -69,7 +61,10 @@ cdef inline int32_t start_islands(const view_t* v, const options_t* o, workspace
         find_islands_and_factor_patterns(&s.f, &v.p, v.g, per, &memory, need)
         r.is_bound = not need.exceeds_pattern
         r.work, r.islands = need.work, s.f.n_islands
-        if (need.exceeds_pattern and exceeds_limits(o, need, <double>per * v.g.n, v.g.n)
+        # A factor with c_i entries in row i takes sum c_i^2 / 2 multiply-adds, which is smallest if all c_i are equal.
+        entries = <double>per * v.g.n
+        factored = max(entries - need.unused_entries, 0.0)
+        if (need.exceeds_pattern and (entries > o.most or 0.0 < o.work < 0.5 * factored * factored / v.g.n)
                 or r.is_bound and max(need.values, need.row_matrix_values) > o.most):
             return UNFIT
         smallest.tries = r.tries = r.tries + (1 - r.is_bound)  # Retry with twice the entries per row.

@@ -77,22 +77,10 @@ cdef inline void evaluate_on_line(const flow_t* f, int32_t island, double t) noe
     compute_island_impulses(f, island, w, f.trial)
 
 
-cdef inline double directional_derivative(flow_t* f, int32_t island, double py, double pp, double t) noexcept nogil:
-    """Return the derivative of the convex function along p at y + t p; lambda there is in `trial`."""
-    cdef int32_t a, k
-    cdef double out = py + t * pp
-    f.evaluations += 1
-    evaluate_on_line(f, island, t)
-    for a in range(f.iptr[island], f.iptr[island + 1]):
-        k = first_row_of_run(f, a)
-        out -= dot(f.q + k, f.trial + k, end_row_of_run(f, a) - k)
-    return out
-
-
 cdef inline double search_line(flow_t* f, int32_t island) noexcept nogil:
     """Return t of line_search.pxd (1); 0 if p is not a descent direction."""
     cdef int32_t a, c
-    cdef double py = 0.0, pp = 0.0, pg = 0.0
+    cdef double py = 0.0, pp = 0.0, pg = 0.0, slope
     cdef line_t line
     cdef const int32_t* own = f.unknowns
     cdef const double* y = f.y
@@ -107,9 +95,15 @@ cdef inline double search_line(flow_t* f, int32_t island) noexcept nogil:
     if not pg < 0.0:
         return 0.0
     begin_line_search(&line, pg)
-    while not narrow_line_search(&line, directional_derivative(f, island, py, pp, line.t)):
-        pass
-    return line.t
+    while True:
+        f.evaluations += 1
+        evaluate_on_line(f, island, line.t)
+        slope = py + line.t * pp                        # derivative of the convex function along p at y + t p
+        for a in range(f.iptr[island], f.iptr[island + 1]):
+            c = first_row_of_run(f, a)
+            slope -= dot(f.q + c, f.trial + c, end_row_of_run(f, a) - c)
+        if narrow_line_search(&line, slope):
+            return line.t
 
 
 cdef inline double halve_step_until_residual_falls(flow_t* f, int32_t island, double bound) noexcept nogil:
@@ -506,17 +500,6 @@ cdef inline void form_kept_matrix(flow_t* f) noexcept nogil:
     f.has_matrix = f.deadline == NULL or not f.deadline.passed
 
 
-cdef inline bint is_island_inactive(flow_t* f, int32_t island, double* impulse) noexcept nogil:
-    """Return whether no row of the island acts; its impulse is then the zero impulse, which solves it."""
-    cdef int32_t a, k
-    if f.p.islands == NULL or f.p.islands.reference[2 * f.p.islands.label[first_block_of_run(f, f.iptr[island])]] >= 0.0:
-        return False
-    for a in range(f.iptr[island], f.iptr[island + 1]):
-        for k in range(first_row_of_run(f, a), end_row_of_run(f, a)):
-            impulse[k] = clip_zero_to_row_bounds(&f.p, k)
-    return True
-
-
 cdef inline bint is_zero_island_impulse(const flow_t* f, int32_t island) noexcept nogil:
     """Return whether the island's impulse `lam` is the zero impulse, which is 0 within all bounds."""
     cdef int32_t a, k
@@ -531,12 +514,16 @@ cdef inline bint is_zero_island_impulse(const flow_t* f, int32_t island) noexcep
 
 cdef inline int32_t solve_island(flow_t* f, int32_t island, double* impulse) noexcept nogil:
     """Solve one island from `impulse`, or continue a paused island, into `impulse`; return the outcome."""
-    cdef int32_t end
+    cdef int32_t end, a, k
     cdef bint waits = f.paused.island == island
     f.island = island
     if not waits:
         choose_island_unknowns(f, island)
-        if is_island_inactive(f, island, impulse):
+        a = f.p.islands.label[first_block_of_run(f, f.iptr[island])] if f.p.islands != NULL else -1
+        if a >= 0 and not f.p.islands.reference[2 * a] >= 0.0:
+            for a in range(f.iptr[island], f.iptr[island + 1]):         # No row acts: the zero impulse is the solution.
+                for k in range(first_row_of_run(f, a), end_row_of_run(f, a)):
+                    impulse[k] = clip_zero_to_row_bounds(&f.p, k)
             return REACHED
         restart_island_from_impulse(f, island, impulse)
         copy_rows(f, island, impulse, f.start)

@@ -19,7 +19,7 @@ from libc.string cimport memcpy, memset
 
 from lavender_ext.core.deadline cimport entry_cost, has_passed
 from lavender_ext.core.dot cimport dot
-from lavender_ext.factor.linear cimport (CHOLESKY, LU, analyse_dense, analyse_tree, factor_linear_system_matrix,
+from lavender_ext.factor.linear cimport (CHOLESKY, LU, TREE, analyse_dense, factor_linear_system_matrix,
                                          solve_linear_system, linear_t)
 from lavender_ext.factor.tiles cimport combine_rows, gemm_subtract_nt
 from lavender_ext.velocity_newton.flow cimport end_block_of_run, first_block_of_run, form_column_of_a, flow_t, multiply_y
@@ -259,15 +259,6 @@ cdef inline void solve_row_step(flow_t* f) noexcept nogil:
 # -- N -----------------------------------------------------------------------------------------------------------
 
 
-cdef inline void set_identity(const flow_t* f, int32_t island, bint square) noexcept nogil:
-    """Set N = I."""
-    cdef int32_t a, size = f.cptr[island + 1] - f.cptr[island], n, step = size + 1 if square else 1
-    n = 0 if square else f.lptr[f.cptr[island + 1]] - f.lptr[f.cptr[island]]
-    memset(f.normal, 0, (<ssize_t>size * size if square else n + size) * sizeof(double))
-    for a in range(size):
-        f.normal[n + <ssize_t>a * step] = 1.0
-
-
 cdef inline void form_normal_matrix(flow_t* f, int32_t island, bint square, bint updates) noexcept nogil:
     """Form N with the present V, or the matrix over rows; `updates`: add Y^T dV Y of the change of V to the last N."""
     cdef int32_t a, b, i, n, nc, size = f.cptr[island + 1] - f.cptr[island], end, last
@@ -280,8 +271,11 @@ cdef inline void form_normal_matrix(flow_t* f, int32_t island, bint square, bint
     if updates:
         store_v(f, island, True)
         v = f.factored_v
-    else:
-        set_identity(f, island, square)
+    else:                                               # N = I
+        n = 0 if square else f.lptr[f.cptr[island + 1]] - f.lptr[f.cptr[island]]
+        memset(f.normal, 0, (<ssize_t>size * size if square else n + size) * sizeof(double))
+        for a in range(size):
+            f.normal[n + <ssize_t>a * (size + 1 if square else 1)] = 1.0
     for a in range(f.iptr[island], f.iptr[island + 1]):
         end = f.run[2 * a + 1]
         for b in range(f.run[2 * a], end):
@@ -320,7 +314,8 @@ cdef inline bint factor_normal_matrix(flow_t* f, int32_t island, bint square) no
     else:
         values = lptr[size] - lptr[0]
         memcpy(f.factor, f.normal, (values + size) * sizeof(double))
-        analyse_tree(n, size, lptr, f.lidx, f.factor - lptr[0], f.factor + values)
+        n.kind, n.n, n.lptr, n.lidx = TREE, size, lptr, f.lidx         # L^T D L of entries left of the diagonal, and this
+        n.matrix, n.diagonal = f.factor - lptr[0], f.factor + values
         for a in range(size):
             n.scale[a] = n.diagonal[a]
     n.deadline = f.deadline
