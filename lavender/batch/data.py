@@ -205,7 +205,10 @@ class Batch(Sequence[Problem]):
         """Store the cones of all worlds or of each world, and the offsets of each world's blocks and rows in them."""
         at, sizes = self.at, self.at["rows"]
         if not isinstance(cones, Cones):
-            cones = _concatenate_cones(cones, len(self))
+            parts = check_sequence("cones", cones, f"Cones, one for each of {len(self)} worlds,")
+            if len(parts) != len(self) or not all(isinstance(c, Cones) for c in parts):
+                raise InputError(f"cones has {len(parts)} entries; a Cones, or one for each world, is needed")
+            cones = Cones._concatenate(parts)
         self.cones = cones
         if cones.has_round and self.friction != "cone":
             raise InputError(
@@ -432,13 +435,3 @@ def _flatten(
         length = 1 + sum((k - 1) * stride // size for k, stride in zip(x.shape, x.strides, strict=True))
         flat = np.lib.stride_tricks.as_strided(x, (length if x.size else 0,), (size,), writeable=False)
     return flat, np.arange(n) * (x.strides[0] // size), x.strides[1] // size if is_matrix else shape[-1]
-
-
-def _concatenate_cones(cones: Any, n: int) -> Cones:
-    """Concatenate the blocks of n worlds."""
-    cones_of_worlds = check_sequence("cones", cones, f"Cones, one for each of {n} worlds,")
-    if len(cones_of_worlds) != n or not all(isinstance(c, Cones) for c in cones_of_worlds):
-        raise InputError(
-            f"cones has {len(cones_of_worlds)} entries; a Cones, or one for each world, is needed"
-        )
-    return Cones._concatenate(cones_of_worlds)

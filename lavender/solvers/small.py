@@ -82,11 +82,7 @@ def _make_call(problem: Problem) -> Small | None:
     data = problem.metric
     if len(data.empty) or data.relative_at_zero < 0.0:
         return None
-    if bounded or count == 1:
-        return Small(data, problem.csr_data if bounded else data)
-    # Newton's method factors over the bodies if these have fewer unknowns than there are rows, otherwise over A.
-    bodies = problem.rows is not None and problem.m > 6 * problem.rows.n_bodies
-    return Small(data, data if bodies else problem.csr_data, True)
+    return Small(data, problem.csr_data if bounded else data, count > 1)
 
 
 def call_uses_pivots(problem: Problem) -> bool:
@@ -129,9 +125,9 @@ class SmallCall:
         call = Call(self.limits, DECISIONS, self.pivots, self.hands_over, get_small_call)
         object.__setattr__(self, "call", call)
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the name only, because `call` cannot be pickled; a copy is the call of that name."""
-        return _named_call, (self.name,)
+    def __reduce__(self) -> str:
+        """Return the name of the module's variable, because `call` cannot be pickled; a copy is the variable."""
+        return self.name.upper()
 
     def cost_limit(self, problem: Problem, kernel: Any) -> float:
         """Return the largest accepted cost [ns] of the call over J and M; 0 if the call is never made."""
@@ -244,7 +240,3 @@ NEWTON = SmallCall("newton", make_limits(inf), False)
 def estimate_velocity_newton_cost(problem: Problem, work: float) -> float:
     """Estimate the cost [ns] of Newton's method over velocities, with `work` multiply-adds to factorise all islands."""
     return float(NEWTON.call.cost(problem.metric, work, 1)[0])
-
-
-def _named_call(name: str) -> SmallCall:
-    return {call.name: call for call in (AUTO, DIRECT, NEWTON)}[name]

@@ -148,7 +148,7 @@ cdef class Small:
     data : Data
         Problem for the judge. It must hold the residual of the zero impulse.
     over : Data
-        Problem to solve; for bounded rows A in compressed rows.
+        For bounded rows A in compressed rows, which is solved; else `data`.
     by_island : bool
         Whether to solve the islands one by one, which the judge has labelled; there are several, with friction.
     """
@@ -496,8 +496,6 @@ cdef class Worlds:
 
     def set_from_arrays(self, arrays, strides, pattern, Blocks blocks, int law, double asymmetry):
         """Set the worlds from arrays with checked shapes and types. Their values are checked when a world is converted."""
-        cdef const double[::1] wide
-        cdef const float[::1] narrow
         cdef const int32_t[::1] ptr, col
         cdef int32_t i
         self.w.mass_ptr = NULL
@@ -510,16 +508,8 @@ cdef class Worlds:
         self.width = count_lanes()
         self.references += [blocks, pattern, *arrays]
         for i in range(N_ARRAYS):
-            self.w.array[i] = NULL
+            self.w.array[i] = NULL if arrays[i] is None else (<ndarray>arrays[i]).data
             self.w.narrow[i] = arrays[i] is not None and arrays[i].itemsize == sizeof(float)
-            if arrays[i] is None or not len(arrays[i]):
-                continue
-            if self.w.narrow[i]:
-                narrow = arrays[i]
-                self.w.array[i] = &narrow[0]
-            else:
-                wide = arrays[i]
-                self.w.array[i] = &wide[0]
         self.order_worlds()
 
     cdef void order_worlds(self):

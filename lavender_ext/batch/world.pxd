@@ -96,49 +96,26 @@ cdef inline const double* convert_matrix_to_float64(const worlds_t* w, int32_t w
     return out
 
 
-cdef inline int32_t drop_zeros_of_triangle(const int32_t* row_ptr, const int32_t* col, const double* x, int32_t n, int32_t* ptr,
-                                           int32_t* idx, double* val) noexcept nogil:
-    """Copy a lower triangle (n, n) in compressed rows, except off-diagonal zeros, and return the number of copied entries."""
-    cdef int32_t i, k, q = 0
-    ptr[0] = 0
-    for i in range(n):
-        k = row_ptr[i]
-        q += thin(row_ptr[i + 1] - k - 1, x + k, col + k, idx + q, val + q)
-        idx[q] = i
-        val[q] = x[row_ptr[i + 1] - 1]
-        q += 1
-        ptr[i + 1] = q
-    return q
-
-
-cdef inline void compute_factor_pattern(int32_t n, int64_t capacity, const int32_t* ptr, const int32_t* idx,
-                                        int32_t* t) noexcept nogil:
-    """Compute the pattern of L in t (5 n + 1 + capacity): row pointers (n + 1), parents (n), columns (capacity), then scratch."""
-    cdef int32_t* scratch = t + 2 * n + 1 + capacity
-    find_tree_factor_pattern(n, ptr, idx, <int32_t>capacity, t, t + 2 * n + 1, t + n + 1, scratch, scratch + n, scratch + 2 * n)
-
-
-cdef inline void bind_factor_pattern(const int32_t* t, int32_t n, generalized_t* g) noexcept nogil:
-    """Point the pattern of g at t, which `compute_factor_pattern` has filled."""
-    g.lptr, g.parent, g.lidx = t, t + n + 1, t + 2 * n + 1
-
-
 cdef inline bint find_factor_pattern(worker_scratch_t* d, int32_t n, const int32_t* ptr, const int32_t* idx,
                                      generalized_t* g) noexcept nogil:
     """Bind the pattern of L, reusing the previous world's if M has the same pattern; return False without memory."""
     cdef int64_t capacity = <int64_t>n * (n + 1) // 2
     cdef int32_t* t
+    cdef int32_t* scratch
     if not grow_workspace_to(&d.tree, 6 * <int64_t>n + 2 + 2 * capacity, 0):
         return False
-    bind_factor_pattern(d.tree.index, n, g)
-    t = d.tree.index + 5 * n + 1 + capacity                 # pattern of M
+    t = d.tree.index
+    g.lptr, g.parent, g.lidx = t, t + n + 1, t + 2 * n + 1
+    scratch = t + 2 * n + 1 + capacity
+    t = scratch + 3 * n                                     # pattern of M
     if d.n_tree == n and memcmp(t, ptr, (n + 1) * sizeof(int32_t)) == 0 \
             and memcmp(t + n + 1, idx, ptr[n] * sizeof(int32_t)) == 0:
         return True
     d.n_tree = n
     memcpy(t, ptr, (n + 1) * sizeof(int32_t))
     memcpy(t + n + 1, idx, ptr[n] * sizeof(int32_t))
-    compute_factor_pattern(n, capacity, ptr, idx, d.tree.index)
+    find_tree_factor_pattern(n, ptr, idx, <int32_t>capacity, <int32_t*>g.lptr, <int32_t*>g.lidx, <int32_t*>g.parent, scratch,
+                             scratch + n, scratch + 2 * n)
     return True
 
 
@@ -146,16 +123,18 @@ cdef inline int32_t convert_generalized_world(const worlds_t* w, int64_t i, work
                                               generalized_t* g) noexcept nogil:
     """Convert world i of J and M to p and g, in the worker's scratch d; return READY, BAD or LEFT."""
     cdef const int64_t* at = w.at + i * PLACES
-    cdef int32_t m = <int32_t>at[ROWS], n = <int32_t>at[VELOCITIES], k = <int32_t>at[BLOCKS], j, entries
-    cdef int64_t all = <int64_t>m * n, half = <int64_t>n * (n + 1) // 2, row = w.jac_row_stride
-    cdef int64_t numbers = all + 2 * half + 4 * n + 2 * m + k + 1 + THIN_PADDING, wide = all if m > n else <int64_t>n * n
+    cdef const blocks_t* all = &w.blocks
+    cdef int32_t m = <int32_t>at[ROWS], n = <int32_t>at[VELOCITIES], k = <int32_t>at[BLOCKS], j, entries, q
+    cdef int32_t first = <int32_t>at[CONE_ROW], block = <int32_t>at[BLOCK]
+    cdef int64_t full = <int64_t>m * n, half = <int64_t>n * (n + 1) // 2, row = w.jac_row_stride
+    cdef int64_t numbers = full + 2 * half + 4 * n + 2 * m + k + 1 + THIN_PADDING, wide = full if m > n else <int64_t>n * n
     cdef const double* a
     cdef int32_t* ptr
     cdef int32_t* idx
     cdef double* x
     cdef double* b
     if (n >= MIN_REORDERED_VELOCITIES
-            or not grow_workspace_to(&d.workspace, m + 1 + all + n + 1 + half + k + 1 + THIN_PADDING, numbers + wide)):
+            or not grow_workspace_to(&d.workspace, m + 1 + full + n + 1 + half + k + 1 + THIN_PADDING, numbers + wide)):
         return LEFT
     # J in compressed rows
     ptr, x = d.workspace.index, d.workspace.real
@@ -166,14 +145,20 @@ cdef inline int32_t convert_generalized_world(const worlds_t* w, int64_t i, work
     if has_invalid_number(x, entries):
         return BAD
     # lower triangle of M in compressed rows
-    ptr, x = idx + all, x + all
+    ptr, x = idx + full, x + full
     idx = ptr + n + 1
     if w.mass_ptr != NULL:
         row = entries = w.mass_ptr[n]
         a = convert_matrix_to_float64(w, 1, at[MASS], 1, entries, &row, d.workspace.real + numbers)
         if has_invalid_number(a, entries):
             return BAD
-        entries = drop_zeros_of_triangle(w.mass_ptr, w.mass_col, a, n, ptr, idx, x)
+        ptr[0] = entries = 0
+        for j in range(n):                              # without zeros off the diagonal
+            q = w.mass_ptr[j]
+            entries += thin(w.mass_ptr[j + 1] - q - 1, a + q, w.mass_col + q, idx + entries, x + entries)
+            idx[entries], x[entries] = j, a[w.mass_ptr[j + 1] - 1]
+            entries += 1
+            ptr[j + 1] = entries
     else:
         row = w.mass_row
         a = convert_matrix_to_float64(w, 1, at[MASS], n, n, &row, d.workspace.real + numbers)
@@ -200,28 +185,19 @@ cdef inline int32_t convert_generalized_world(const worlds_t* w, int64_t i, work
         b[j] -= multiply_jacobian_row(g, j, d.free)
     if find_invalid_magnitude(g.compliance, m) >= 0 or has_invalid_number(d.free, n) or not is_valid_rhs(b, m):
         return BAD
-    return convert_world_blocks(w, at, p, b, idx + half, x + n + 2 * m)
-
-
-cdef inline int32_t convert_world_blocks(const worlds_t* w, const int64_t* at, blocks_t* p, const double* b, int32_t* ptr,
-                                         double* mu) noexcept nogil:
-    """Bind the blocks of a world to p, with rows numbered from 0; return READY or BAD.
-
-    A mu that is given per world replaces that of the blocks.
-    """
-    cdef const blocks_t* all = &w.blocks
-    cdef int32_t k, first = <int32_t>at[CONE_ROW], block = <int32_t>at[BLOCK]
+    # blocks, with rows numbered from 0; a mu that is given per world replaces that of the blocks
+    ptr, x = idx + half, x + n + 2 * m
     p[0] = all[0]
-    p.n_rows, p.n_blocks = <int32_t>at[ROWS], <int32_t>at[BLOCKS]
-    for k in range(p.n_blocks + 1):
-        ptr[k] = all.ptr[block + k] - first
+    p.n_rows, p.n_blocks = m, k
+    for j in range(k + 1):
+        ptr[j] = all.ptr[block + j] - first
     p.b, p.ptr, p.lower, p.upper = b, ptr, all.lower + first, all.upper + first
     p.kind, p.mu = all.kind + block, all.mu + block
     p.patch_radius, p.rolling = all.patch_radius + block, all.rolling + block
     if w.array[5] != NULL:
-        convert_entries_to_float64(w, 5, at[MU], p.n_blocks, mu)
-        p.mu = mu
-    for k in range(p.n_blocks):
-        if find_friction_fault(p, p.kind[k], k) != NO_FAULT:
+        convert_entries_to_float64(w, 5, at[MU], k, x)
+        p.mu = x
+    for j in range(k):
+        if find_friction_fault(p, p.kind[j], j) != NO_FAULT:
             return BAD
     return READY

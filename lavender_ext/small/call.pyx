@@ -59,7 +59,7 @@ cdef bint are_all_rows_bounded(const blocks_t* p) noexcept nogil:
 cdef bint derive_small_problem(task_t* j, workspace_t* workspace) noexcept nogil:
     """Compute the remaining fields of a small problem in `workspace`, which must stay allocated; return False without memory.
 
-    Both views and the residual of the zero impulse are given.
+    The views and the residual of the zero impulse are given.
     """
     cdef const blocks_t* p = &j.v.p
     cdef int32_t band[2]
@@ -76,7 +76,7 @@ cdef bint derive_small_problem(task_t* j, workspace_t* workspace) noexcept nogil
         if not grow_workspace_to(workspace, 0, n):
             return False
         memset(workspace.real, 0, n * sizeof(double))
-        prepare_exact_blocks(&j.over, workspace.index, workspace.real)
+        prepare_exact_blocks(&j.v, workspace.index, workspace.real)
         j.at, j.prepared = workspace.index, workspace.real
     return True
 
@@ -190,23 +190,13 @@ cdef bint solve_by_pivoting(task_t* j, bint follows, workspace_t* workspaces) no
     return ended
 
 
-cdef bint solve_by_sweeps(task_t* j, const small_rules_t* rules, workspace_t* workspaces) noexcept nogil:
-    """Solve contacts as one subproblem; j.counts as in `solve_subproblem`."""
-    cdef workspace_t* r = &workspaces[WORK]
-    if not grow_workspace_to(r, j.v.p.n_blocks, subproblem_work_size(j.v.p.n_rows, j.v.r.n_bodies if j.v.r != NULL else 0)):
-        return False
-    j.counts[SUBPROBLEMS] = 1
-    return (solve_subproblem(j, j.lam, rules, rules.call_sweeps, &workspaces[MORE], r.real, r.index, j.counts)
-            or has_passed(j.deadline, 0.0))
-
-
 cdef bint solve_by_islands(task_t* j, const small_rules_t* rules, workspace_t* workspaces) except -1 nogil:
     """Solve contacts island by island from lam, until one is above tol; j.counts as in `solve_subproblem`."""
-    cdef const blocks_t* p = &j.over.p
+    cdef const blocks_t* p = &j.v.p
     cdef const islands_t* islands = j.v.p.islands
-    cdef const csr_t* a = j.over.a
+    cdef const csr_t* a = j.v.a
     cdef workspace_t* r = &workspaces[WORK]
-    cdef int32_t i, c, q, rows, sweeps, m = 0, k = 0, n_bodies = j.over.r.n_bodies if a == NULL else 0
+    cdef int32_t i, c, q, rows, sweeps, m = 0, k = 0, n_bodies = j.v.r.n_bodies if a == NULL else 0
     cdef int64_t entries = 0, count, numbers, integers, work
     cdef double unchecked = 0.0
     cdef int32_t before[N_COUNTS]
@@ -241,9 +231,9 @@ cdef bint solve_by_islands(task_t* j, const small_rules_t* rules, workspace_t* w
     for i in range(islands.n):
         # copy of the island
         block, k, x = islands.order + islands.ptr[i], islands.ptr[i + 1] - islands.ptr[i], &two[i % 2]
-        copy_island(x, &j.over, j.lam, block, k, &z, make_arena(arena.real + arena.n_real + (i % 2) * numbers,
+        copy_island(x, &j.v, j.lam, block, k, &z, make_arena(arena.real + arena.n_real + (i % 2) * numbers,
                                                                 arena.index + arena.n_index + (i % 2) * integers))
-        m = x.s.over.p.n_rows
+        m = x.s.v.p.n_rows
         # solution
         if i > 0 and are_islands_identical(x, &two[1 - i % 2]):
             memcpy(x.s.lam, two[1 - i % 2].s.lam, m * sizeof(double))
@@ -269,7 +259,7 @@ cdef bint solve_by_islands(task_t* j, const small_rules_t* rules, workspace_t* w
         # result
         for c in range(k):
             q = block[c]
-            memcpy(j.lam + p.ptr[q], x.s.lam + x.s.over.p.ptr[c], (p.ptr[q + 1] - p.ptr[q]) * sizeof(double))
+            memcpy(j.lam + p.ptr[q], x.s.lam + x.s.v.p.ptr[c], (p.ptr[q + 1] - p.ptr[q]) * sizeof(double))
             memset(z.place + p.ptr[q], 255, (p.ptr[q + 1] - p.ptr[q]) * sizeof(int32_t))
         if not good:
             break
@@ -286,13 +276,14 @@ cdef int32_t solve_small(task_t* j, const small_rules_t* rules, workspace_t* wor
     cdef int64_t size = max(count_start_scratch(&j.v), j.v.p.n_rows + count_task_scratch(j))
     cdef int32_t m = j.v.p.n_rows
     cdef double residual = j.zero_residual[2]
+    cdef workspace_t* work = &workspaces[WORK]
     cdef double* zero
-    cdef bint is_zero
+    cdef bint is_zero, is_solved
     memset(j.counts, 0, sizeof(j.counts))
-    if not grow_workspace_to(&workspaces[WORK], 0, size):
+    if not grow_workspace_to(work, 0, size):
         return RESULT_FAILED
     # start
-    zero = workspaces[WORK].real
+    zero = work.real
     set_zero_impulse(&j.v.p, zero, j.slack_error)
     if j.cold:
         memcpy(j.lam, zero, m * sizeof(double))
@@ -309,11 +300,17 @@ cdef int32_t solve_small(task_t* j, const small_rules_t* rules, workspace_t* wor
             return RESULT_IS_START
         if not residual <= (rules.warm_residual if j.pivots else 1.0):
             memcpy(j.lam, zero, m * sizeof(double))
-    # solution
-    if not (solve_by_pivoting(j, rules.follows, workspaces) if j.pivots
-            else solve_by_islands(j, rules, workspaces) if j.solves_islands else solve_by_sweeps(j, rules, workspaces)):
+    # solution; contacts are one subproblem unless islands are solved one by one
+    if j.pivots:
+        is_solved = solve_by_pivoting(j, rules.follows, workspaces)
+    elif j.solves_islands:
+        is_solved = solve_by_islands(j, rules, workspaces)
+    else:
+        j.counts[SUBPROBLEMS] = 1
+        is_solved = grow_workspace_to(work, j.v.p.n_blocks, subproblem_work_size(m, j.v.r.n_bodies if j.v.r != NULL else 0)) \
+            and (solve_subproblem(j, j.lam, rules, rules.call_sweeps, &workspaces[MORE], work.real, work.index, j.counts)
+                 or has_passed(j.deadline, 0.0))
+    if not is_solved or not grow_workspace_to(work, 0, size):
         return RESULT_FAILED
-    if not grow_workspace_to(&workspaces[WORK], 0, size):
-        return RESULT_FAILED
-    judge_task_within_bounds(j, workspaces[WORK].real)
+    judge_task_within_bounds(j, work.real)
     return RESULT_SOLVED if j.pivots or j.relative <= j.tol or has_passed(j.deadline, 0.0) else RESULT_FAILED

@@ -52,7 +52,7 @@ cdef inline int64_t subproblem_work_size(int64_t m, int64_t n_bodies) noexcept n
 
 cdef inline void bind_subproblem_arrays(subproblem_run_t* t, double* work, int32_t* order, uint64_t* rng) noexcept nogil:
     """Bind the arrays to work (`subproblem_work_size`) and order (k)."""
-    cdef const view_t* v = &t.j.over
+    cdef const view_t* v = &t.j.v
     cdef int64_t m = v.p.n_rows, n = v.r.n_bodies if v.r != NULL else 0
     cdef int32_t i
     t.swept, t.w, t.error, t.scratch = work, work + m, work + 2 * m, work + 3 * m
@@ -73,7 +73,7 @@ cdef inline void bind_subproblem_arrays(subproblem_run_t* t, double* work, int32
 
 cdef inline double judge_subproblem_impulse(subproblem_run_t* t, const double* lam) noexcept nogil:
     """Return the relative residual of lam (m) [N s], relative to the subproblem's zero impulse."""
-    cdef const view_t* v = &t.j.over
+    cdef const view_t* v = &t.j.v
     cdef score_t score = make_empty_score()
     judge_view(v, lam, t.w, t.error, t.scratch, False, &score)
     return relative_residual_of_score(&score, t.w, v.p.n_rows, t.j.zero_residual[0], t.j.zero_residual[1])
@@ -101,21 +101,6 @@ cdef inline double run_sweeps(subproblem_run_t* t, double now, int32_t max_sweep
     return now
 
 
-cdef inline double run_newton(subproblem_run_t* t, int32_t budget, workspace_t* memory, int32_t* factorisations) noexcept nogil:
-    """Run up to `budget` steps of Newton's method from `lam`, and return the relative residual."""
-    cdef task_t* j = t.j
-    cdef options_t options = options_t(NEWTON, budget, 0, 0, has_wide(), j.tol, j.zero_residual[0], j.zero_residual[1], INFINITY,
-                                       0.0, j.deadline, NULL)
-    cdef info_t info = info_t(0, 0, 0, 0, 0.0, NULL, NULL)
-    cdef workspace_t r
-    if (lav_analyse(&j.over, &options, &r, memory, grow_workspace_to) != NEEDS_WORKSPACE
-            or lav_start(&j.over, &options, &r, j.lam, memory, grow_workspace_to) != MORE):
-        return INFINITY
-    lav_step(&j.over, &options, &r, budget, j.lam, &info)
-    factorisations[0] = info.factorisations
-    return judge_subproblem_impulse(t, j.lam)
-
-
 cdef inline bint solve_subproblem(task_t* j, const double* start, const small_rules_t* rules, int32_t max_sweeps, workspace_t* more,
                                   double* work, int32_t* order, int32_t* counts) noexcept nogil:
     """Solve a subproblem from `start` (m) [N s], which may be `lam`, into `lam`; return whether its residual is at most tol.
@@ -126,16 +111,20 @@ cdef inline bint solve_subproblem(task_t* j, const double* start, const small_ru
     cdef score_t score_at_zero = make_empty_score()
     cdef subproblem_run_t t
     cdef uint64_t rng
-    cdef int32_t m = j.over.p.n_rows, factorisations = 0
+    cdef int32_t m = j.v.p.n_rows
+    cdef options_t options = options_t(NEWTON, rules.call_factorisations, 0, 0, has_wide(), j.tol, 0.0, 0.0, INFINITY, 0.0,
+                                       j.deadline, NULL)
+    cdef info_t info = info_t(0, 0, 0, 0, 0.0, NULL, NULL)
+    cdef workspace_t r
     cdef double now
     t.j = j
     bind_subproblem_arrays(&t, work, order, &rng)
     memcpy(t.swept, start, m * sizeof(double))
     # reference: the residual of the zero impulse
-    set_zero_impulse(&j.over.p, j.lam, t.w)
+    set_zero_impulse(&j.v.p, j.lam, t.w)
     if j.zero_residual[2] < 0.0:
-        judge_view(&j.over, j.lam, t.w, t.error, t.scratch, False, &score_at_zero)
-        find_reference(&j.over.p, j.lam, t.w, t.error, j.zero_residual)
+        judge_view(&j.v, j.lam, t.w, t.error, t.scratch, False, &score_at_zero)
+        find_reference(&j.v.p, j.lam, t.w, t.error, j.zero_residual)
         if j.zero_residual[2] <= j.tol:
             return True                                 # the zero impulse is a solution
     # residual of the start
@@ -143,20 +132,25 @@ cdef inline bint solve_subproblem(task_t* j, const double* start, const small_ru
     now = j.zero_residual[2]
     if memcmp(t.swept, j.lam, m * sizeof(double)) != 0:
         now = judge_subproblem_impulse(&t, t.swept)
-    # sweeps, then Newton's method
+    # sweeps
     now = run_sweeps(&t, now, max_sweeps, rules.call_extrapolation,
-                     SWEEP_NS_PER_ROW * m + j.over.a.indptr[m] if j.over.a != NULL
+                     SWEEP_NS_PER_ROW * m + j.v.a.indptr[m] if j.v.a != NULL
                      else (SWEEP_NS_PER_ROW + SWEEP_NS_PER_BODY_ROW) * m)
     if now <= j.tol or now < 1.0:
         memcpy(j.lam, t.swept, m * sizeof(double))
+    # Newton's method
     if now > j.tol and not has_passed(j.deadline, 0.0):
         counts[FACTORISED] += 1
-        now = run_newton(&t, rules.call_factorisations, more, &factorisations)
+        options.e0, options.v0, now = j.zero_residual[0], j.zero_residual[1], INFINITY
+        if lav_analyse(&j.v, &options, &r, more, grow_workspace_to) == NEEDS_WORKSPACE \
+                and lav_start(&j.v, &options, &r, j.lam, more, grow_workspace_to) == MORE:
+            lav_step(&j.v, &options, &r, options.budget, j.lam, &info)
+            now = judge_subproblem_impulse(&t, j.lam)
     # counters
     counts[SWEEPS] += t.c.iterations
     counts[UNDONE_SWEEPS] += <int32_t>t.c.control[UNDONE]
-    counts[FACTORISATIONS] += factorisations
-    counts[LONGEST] = max(counts[LONGEST], t.c.iterations + factorisations)
+    counts[FACTORISATIONS] += info.factorisations
+    counts[LONGEST] = max(counts[LONGEST], t.c.iterations + info.factorisations)
     # after the deadline the better of both iterates is the result
     if (now > j.tol and has_passed(j.deadline, 0.0)
             and not judge_subproblem_impulse(&t, j.lam) <= judge_subproblem_impulse(&t, t.swept)):

@@ -37,28 +37,11 @@ cdef inline const double* gather(arena_t* arena, const double* x, int32_t width,
     return out
 
 
-cdef inline void copy_island_matrix(island_t* x, const csr_t* a, const island_index_t* z, arena_t* arena) noexcept nogil:
-    """Copy the entries of A between the island's rows; other entries are zeros of immovable bodies."""
-    cdef int32_t i, q, m = x.s.over.p.n_rows, count = 0
-    cdef int32_t* indptr = take_integers(arena, m + 1)
-    cdef int32_t* indices = take_integers(arena, 0)
-    cdef double* data = take_doubles(arena, 0)
-    for i in range(m):
-        indptr[i] = count
-        for q in range(a.indptr[z.row[i]], a.indptr[z.row[i] + 1]):
-            if z.place[a.indices[q]] >= 0:
-                indices[count], data[count] = z.place[a.indices[q]], a.data[q]
-                count += 1
-    indptr[m] = count
-    x.s.a.indptr, x.s.a.indices, x.s.a.data = indptr, take_integers(arena, count), take_doubles(arena, count)
-    x.s.over.a = &x.s.a
-
-
 cdef inline void copy_island_bodies(island_t* x, const blocks_t* p, const rows_t* r, const int32_t* block,
                                     const island_index_t* z, arena_t* arena) noexcept nogil:
     """Copy the island's joints, contacts and bodies, which are numbered in the order of appearance."""
     cdef rows_t* y = &x.s.r
-    cdef int32_t i, body, n = 0, k = x.s.over.p.n_blocks, m = x.s.over.p.n_rows, kj = x.s.split, mj = x.s.over.p.ptr[kj], c = k - kj
+    cdef int32_t i, body, n = 0, k = x.s.v.p.n_blocks, m = x.s.v.p.n_rows, kj = x.s.split, mj = x.s.v.p.ptr[kj], c = k - kj
     cdef int32_t* pair = take_integers(arena, 2 * k)
     for i in range(2 * k):
         body = get_block_bodies(r, block[i // 2])[i % 2]
@@ -80,15 +63,18 @@ cdef inline void copy_island_bodies(island_t* x, const blocks_t* p, const rows_t
     for i in range(mj, m):
         z.row[i] -= p.ptr[r.n_joints]
     y.inv_inertia_arm = gather(arena, r.inv_inertia_arm, 6, z.row + mj, m - mj)
-    x.s.over.r = y
+    x.s.v.r = y
 
 
 cdef inline void copy_island(island_t* x, const view_t* v, const double* lam, const int32_t* block, int32_t k,
                              const island_index_t* z, arena_t arena) noexcept nogil:
     """Copy the island of k blocks out of a problem over A or bodies, with its start out of lam, to an arena."""
     cdef const blocks_t* p = &v.p
-    cdef blocks_t* own = &x.s.over.p
-    cdef int32_t i, q, m = 0
+    cdef blocks_t* own = &x.s.v.p
+    cdef const csr_t* a = v.a
+    cdef int32_t i, q, m = 0, count = 0
+    cdef int32_t* indices
+    cdef double* data
     cdef int32_t* ptr = take_integers(&arena, k + 1)
     cdef int32_t* kind = take_integers(&arena, k)
     x.numbers, x.integers = arena.real, arena.index
@@ -107,11 +93,20 @@ cdef inline void copy_island(island_t* x, const view_t* v, const double* lam, co
     own.b, own.d = gather(&arena, p.b, 1, z.row, m), gather(&arena, p.d, 1, z.row, m)
     own.nu, own.step = gather(&arena, p.nu, 1, z.row, m), gather(&arena, p.step, 1, z.row, m)
     x.start = <double*>gather(&arena, lam, 1, z.row, m)
-    x.s.over.a = x.s.over.r = x.s.over.g = NULL
+    x.s.v.a = x.s.v.r = x.s.v.g = NULL
     if v.r != NULL:
         copy_island_bodies(x, p, v.r, block, z, &arena)
-    else:
-        copy_island_matrix(x, v.a, z, &arena)
+    else:                                               # A between the island's rows; other entries are zeros of immovable bodies
+        x.s.v.a, ptr = &x.s.a, take_integers(&arena, m + 1)
+        indices, data = take_integers(&arena, 0), take_doubles(&arena, 0)
+        for i in range(m):
+            ptr[i] = count
+            for q in range(a.indptr[z.row[i]], a.indptr[z.row[i] + 1]):
+                if z.place[a.indices[q]] >= 0:
+                    indices[count], data[count] = z.place[a.indices[q]], a.data[q]
+                    count += 1
+        ptr[m] = count
+        x.s.a = csr_t(ptr, take_integers(&arena, count), take_doubles(&arena, count))
     x.n_numbers, x.n_integers = arena.n_real, arena.n_index
     x.s.lam = take_doubles(&arena, m)
 

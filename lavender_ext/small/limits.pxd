@@ -34,12 +34,6 @@ cdef struct limits_t:           # from `make_limits` of lavender/solvers/small.p
     double lanes                # 1: contacts that lanes solve (batch/lanes.pxd) are solved so
 
 
-cdef inline double estimate_newton_step_cost(const blocks_t* p, const generalized_t* g, const limits_t* l,
-                                             double work) noexcept nogil:
-    """Return the cost [ns] of one step with one factorisation of every island, `work` multiply-adds in total."""
-    return l.entry * (2.0 * g.pval[g.n_panels] + 4.0 * p.n_rows) + l.work * work
-
-
 cdef inline bint has_only_free_rows(const blocks_t* p) noexcept nogil:
     """Return whether every row is free (unbounded)."""
     cdef int32_t i, k
@@ -50,16 +44,6 @@ cdef inline bint has_only_free_rows(const blocks_t* p) noexcept nogil:
     return True
 
 
-cdef inline double estimate_row_cost(const blocks_t* p, const limits_t* l) noexcept nogil:
-    """Return the cost [ns] of the projections of all rows and of their derivatives in one step."""
-    cdef int32_t i, n
-    cdef double cost = 0.0
-    for i in range(p.n_blocks):
-        n = p.ptr[i + 1] - p.ptr[i]
-        cost += (l.row if n == 1 or has_independent_rows(p, i) else l.contact_row) * n
-    return cost
-
-
 cdef struct newton_cost_t:      # the cost (1) as a linear function of w
     double fixed                # ns
     double per_work             # ns per multiply-add
@@ -67,17 +51,12 @@ cdef struct newton_cost_t:      # the cost (1) as a linear function of w
 
 cdef inline newton_cost_t estimate_newton_cost_terms(const blocks_t* p, const generalized_t* g, const limits_t* l) noexcept nogil:
     """Return the terms of the estimated cost of Newton's method, (1), with w multiply-adds per factorisation."""
-    cdef double count = 1.0 if has_only_free_rows(p) else l.count
-    return newton_cost_t(count * (estimate_row_cost(p, l) + estimate_newton_step_cost(p, g, l, 0.0)), count * l.work)
-
-
-cdef inline bint are_rows_short(const generalized_t* g, double columns) noexcept nogil:
-    """Return whether no row couples more than `columns` velocities."""
-    cdef int32_t b
-    for b in range(g.n_panels):
-        if g.pcol[b + 1] - g.pcol[b] > columns:
-            return False
-    return True
+    cdef double count = 1.0 if has_only_free_rows(p) else l.count, cost = 0.0
+    cdef int32_t i, n
+    for i in range(p.n_blocks):                         # projections of the rows and their derivatives
+        n = p.ptr[i + 1] - p.ptr[i]
+        cost += (l.row if n == 1 or has_independent_rows(p, i) else l.contact_row) * n
+    return newton_cost_t(count * (cost + l.entry * (2.0 * g.pval[g.n_panels] + 4.0 * p.n_rows)), count * l.work)
 
 
 cdef inline double max_newton_cost(const blocks_t* p, const generalized_t* g, const limits_t* l, int32_t islands,
@@ -85,7 +64,10 @@ cdef inline double max_newton_cost(const blocks_t* p, const generalized_t* g, co
     """Return the permitted cost [ns], 0 if Newton's method must not run; with a rigid row at most the estimated cost of sweeps."""
     cdef double max_rows = l.coulomb_rows if p.law == COULOMB else INFINITY if soft else l.cone_rows
     cdef double each
-    if islands * max_rows < p.n_rows < l.dense * g.n and has_friction(p) and are_rows_short(g, l.columns):
+    cdef int32_t b, columns = 0                         # of the row that couples the largest number of velocities
+    for b in range(g.n_panels):
+        columns = max(columns, g.pcol[b + 1] - g.pcol[b])
+    if islands * max_rows < p.n_rows < l.dense * g.n and has_friction(p) and columns <= l.columns:
         return 0.0
     if soft:
         return l.max_cost

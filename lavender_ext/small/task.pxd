@@ -45,7 +45,7 @@ cdef struct small_rules_t:      # numbers of lavender/solvers/decisions.py by th
 
 cdef struct task_t:             # one problem, its start and its result
     view_t v                    # problem that the judge reads
-    view_t over                 # problem that is solved, without J and M; for bounded rows, A in compressed rows
+    view_t over                 # bounded rows without J and M: A in compressed rows, which is solved
     csr_t a                     # A, the bodies, or J and M, unless `v` points into a `Data`
     rows_t r
     generalized_t g
