@@ -27,19 +27,19 @@ from typing import Any
 import numpy as np
 
 from lavender.audit.engine_scenes import CLAIM_ENGINES, step_scene
-from lavender.audit.environment import get_environment_data, is_environment, iterate_environment
+from lavender.audit.environment import is_environment, iterate_environment, make_environment_runs
 from lavender.audit.pieces import NOT_JUDGED, Judging, Piece, Prediction, judge_steps
 from lavender.audit.result import Audit
 from lavender.audit.simulated_worlds import (
     ENGINES,
     SPREADS,
+    STEP_FIELDS,
     Divergence,
     Frame,
     Runs,
     count_engine_warnings,
     iterate_frames,
     simulate_world,
-    split_state_vector,
 )
 from lavender.base.arrays import check_float, check_int
 from lavender.base.errors import InputError, check_name
@@ -152,8 +152,7 @@ def audit(
         for name in (name for name, is_default in own.items() if not is_default):
             raise InputError(f"{name} has no effect with an environment, which steps itself: leave it out")
         episodes = DEFAULT_JOINT_WORLDS if worlds is None else worlds
-        env_model, _ = get_environment_data(model)
-        runs = Runs.of_environment(model, env_model, episodes, steps, seed)
+        runs = make_environment_runs(model, episodes, steps, seed)
         pieces = _audit_environment(model, policy, runs, judging)
         return _collect(Audit.with_size(runs, engine, **common), pieces, judging, watch)
     if policy is not None:
@@ -172,10 +171,9 @@ def audit(
             stepped, engine=engine, name=str(model), threshold=threshold, max_velocity_error=limit, keep=keep,
             total=steps, seed=seed, watch=watch,
         )  # fmt: skip
-    default_worlds = 1 if engine == "mujoco" else DEFAULT_JOINT_WORLDS
+    default_worlds = MAX_DEFAULT_WORLDS if engine == "mujoco" else DEFAULT_JOINT_WORLDS
     n = default_worlds if worlds is None else worlds
-    runs = Runs.of_model(model, n, steps, control=control, seed=seed).with_start_states(states)
-    runs = runs.with_other_model(against)
+    runs = Runs.of_model(model, n, steps, states=states, against=against, control=control, seed=seed)
     if engine == "mujoco":
         more = (keep_contact_states, workers, backend, watch, common)
         return _audit_model(runs, judging, worlds, spread, *more)
@@ -231,25 +229,25 @@ def audit_steps(
 
 
 def _audit_model(
-    one: Runs, judging: Judging, worlds: int | None, spread: float | None, keep_contact_states: bool,
+    runs: Runs, judging: Judging, worlds: int | None, spread: float | None, keep_contact_states: bool,
     workers: int, backend: str, watch: Callable[[Event], None] | None, common: dict[str, Any],
 ) -> Audit:  # fmt: skip
     """Audit a model of MuJoCo: time its first world, choose the spread, and judge all worlds in worker processes."""
     processes = count_processes(workers)
     # Raise the error of an unsupported model once and before any worker starts.
-    from_mujoco_many(one.model, np.concatenate([one.model.qpos0, np.zeros(one.model.nv)])[None])
-    timed = one if worlds is None else replace(one, steps=min(TIMED_STEPS, one.steps))
+    from_mujoco_many(runs.model, np.concatenate([runs.model.qpos0, np.zeros(runs.model.nv)])[None])
+    timed = runs if worlds is None else replace(runs, steps=min(TIMED_STEPS, runs.steps))
     if watch is not None:
         watch(Event(0, 0, f"judging one world: {format_count(timed.steps, 'step')}", ""))
     begin = perf_counter()
     audit_worlds(timed, judging, [0])
-    duration = (perf_counter() - begin) / timed.steps * one.steps
+    duration = (perf_counter() - begin) / timed.steps * runs.steps
     if worlds is None:
         expected = int(DEFAULT_DURATION * processes / max(duration, 1e-6))
         worlds = max(1, min(MAX_DEFAULT_WORLDS, expected))
     if workers == -1 and backend == "loky" and duration * worlds < MIN_DURATION_OF_WORKERS:
         workers = 1
-    runs = replace(one, worlds=worlds).choose_spread(spread, watch)
+    runs = runs.with_worlds(worlds).choose_spread(spread, watch)
     if keep_contact_states:
         share = min(1.0, MAX_CONTACT_STATES / (worlds * runs.steps))
         judging = judging._replace(contact_share=share)
@@ -260,11 +258,9 @@ def _audit_model(
         raise InputError(
             "no step was judged, because workers were lost; give fewer workers (--workers), which need less memory"
         )
-    first_lost = {d.world: d.step for d in result.divergences}
+    last = {d.world: d.step - DIVERGENCE_MARGIN for d in result.divergences}
     states = sorted(result.contact_states, key=lambda entry: entry[:2])
-    result.contact_states[:] = [
-        s for s in states if s.step < first_lost.get(s.world, np.inf) - DIVERGENCE_MARGIN
-    ]
+    result.contact_states[:] = [s for s in states if s.step < last.get(s.world, np.inf)]
     return result
 
 
@@ -328,7 +324,7 @@ def judge_states(
 
     `after` (n, nv) are the velocities after the steps, with which the predicted ones are compared.
     """
-    judge, version = copy.copy(model), import_mujoco().__version__
+    judge, mj = copy.copy(model), import_mujoco()
     judge.opt.noslip_iterations = 0
     for i in range(0, len(states), MAX_PROBLEMS_IN_MEMORY):
         part = slice(i, i + MAX_PROBLEMS_IN_MEMORY)
@@ -338,12 +334,11 @@ def judge_states(
         batch, impulse = from_mujoco_many(judge, states[part], errors="status", velocity=velocity)
 
         def state_of(k: int, vectors: Any = states[part]) -> dict[str, Any]:
-            own = {
-                VECTOR: vectors[k].copy(),
-                "model": np.array(hash_model(judge)),
-                "mujoco": np.array(version),
-            }
-            return split_state_vector(judge, vectors[k]) | own
+            data = mj.MjData(judge)
+            mj.mj_setState(judge, data, vectors[k], mj.mjtState.mjSTATE_INTEGRATION)
+            state = {name: np.array(getattr(data, name)) for name in STEP_FIELDS}
+            origin = {"model": np.array(hash_model(judge)), "mujoco": np.array(mj.__version__)}
+            return state | {VECTOR: vectors[k].copy()} | origin
 
         assert impulse is not None and batch.contact_counts is not None
         frame = Frame(batch, impulse, {}, batch.row_counts, batch.contact_counts)

@@ -26,15 +26,16 @@ def is_environment(source: Any) -> bool:
     return all(hasattr(source, name) for name in ("reset", "step", "unwrapped"))
 
 
-def get_environment_data(env: Any) -> tuple[Any, Any]:
-    """Return the model and the data of MuJoCo of an environment."""
+def make_environment_runs(env: Any, episodes: int, steps: int, seed: int) -> Runs:
+    """Make the runs of an environment, which steps itself."""
     model, data = (getattr(env.unwrapped, name, None) for name in ("model", "data"))
     if type(model).__name__ != "MjModel" or type(data).__name__ != "MjData":
         raise InputError(
             f"{type(env.unwrapped).__name__} has no model and data of MuJoCo as env.unwrapped.model and .data; "
             "record the steps of your own loop by lavender.io.Recorder"
         )
-    return model, data
+    name = getattr(getattr(env, "spec", None), "id", None) or type(env.unwrapped).__name__
+    return Runs(name, model, episodes, steps, seed=seed, spread=0.0)
 
 
 @contextlib.contextmanager

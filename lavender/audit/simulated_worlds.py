@@ -93,7 +93,9 @@ class Runs:
         check_float("spread", self.spread, low=0.0)
 
     @classmethod
-    def of_model(cls, source: Any, worlds: int, steps: int, **more: Any) -> Runs:
+    def of_model(
+        cls, source: Any, worlds: int, steps: int, *, states: Any = None, against: Any = None, **more: Any
+    ) -> Runs:
         """Make the runs of a model, without sleep.
 
         Parameters
@@ -101,19 +103,33 @@ class Runs:
         source : path of a model (MJCF, .mjb) or mujoco.MjModel
         worlds, steps, more
             See `Runs`.
+        states : any source of `read_states`, optional
+            States in which the worlds start; default: the model's own.
+        against : path or mujoco.MjModel, optional
+            Another model that solves the same steps.
         """
         mj, model = load_model(source)
         notes = (SLEEP_NOTE,) if can_sleep(mj, model) else ()
         runs = cls(name_model(source), without_sleep(mj, model), worlds, steps, notes=notes, **more)
         make_controller(model, runs.control, runs.seed)
-        return runs
+        if states is not None:
+            starts = read_states(mj, runs.model, states)
+            runs = replace(runs, starts=starts, notes=(*notes, *starts.notes)).with_worlds(worlds)
+        if against is None:
+            return runs
+        _, other = load_model(against)
+        sizes = [mj.mj_stateSize(m, mj.mjtState.mjSTATE_INTEGRATION) for m in (model, other)]
+        if sizes[0] != sizes[1] or model.nv != other.nv:
+            raise InputError(
+                f"against names {name_model(against)}, a state of which has {sizes[1]} numbers, and a state of "
+                f"{runs.name} {sizes[0]}; a model with the same state is needed, such as one with other options"
+            )
+        return replace(runs, against=(name_model(against), without_sleep(mj, other)))
 
-    @classmethod
-    def of_environment(cls, env: Any, model: Any, episodes: int, steps: int, seed: int) -> Runs:
-        """Make the runs of an environment, which steps itself."""
-        spec = getattr(env, "spec", None)
-        name = getattr(spec, "id", None) or type(env.unwrapped).__name__
-        return cls(name, model, episodes, steps, seed=seed, spread=0.0)
+    def with_worlds(self, worlds: int) -> Runs:
+        """Return these runs with another number of worlds, and as many of the start states, evenly spaced."""
+        starts = None if self.starts is None else self.starts.select_evenly(worlds)
+        return replace(self, worlds=worlds, starts=starts)
 
     @property
     def mj(self) -> Any:
@@ -131,26 +147,6 @@ class Runs:
         ignored = [name for name, is_used in names.items() if is_used and engine == "mjx"]
         note = f"MJX does not simulate these settings of the model: {', '.join(ignored)}."
         return replace(self, notes=(*self.notes, note)) if ignored else self
-
-    def with_start_states(self, states: Any) -> Runs:
-        """Return these runs with start states from any source of `read_states`; None keeps the model's own."""
-        if states is None:
-            return self
-        starts = read_states(self.mj, self.model, states)
-        return replace(self, starts=starts.select_evenly(self.worlds), notes=(*self.notes, *starts.notes))
-
-    def with_other_model(self, source: Any) -> Runs:
-        """Return these runs with another model that solves the same steps; None for none."""
-        if source is None:
-            return self
-        mj, model = load_model(source)
-        sizes = [mj.mj_stateSize(m, mj.mjtState.mjSTATE_INTEGRATION) for m in (self.model, model)]
-        if sizes[0] != sizes[1] or self.model.nv != model.nv:
-            raise InputError(
-                f"against names {name_model(source)}, a state of which has {sizes[1]} numbers, and a state of "
-                f"{self.name} {sizes[0]}; a model with the same state is needed, such as one with other options"
-            )
-        return replace(self, against=(name_model(source), without_sleep(mj, model)))
 
     @property
     def n_exact_worlds(self) -> int:
@@ -211,11 +207,9 @@ def can_any_geoms_collide(mj: Any, model: Any) -> bool:
         return True
     bit_masks = np.stack([model.geom_contype, model.geom_conaffinity], axis=1)
     kinds, counts = np.unique(bit_masks, axis=0, return_counts=True)
-    return any(
-        (a[0] & b[1] or b[0] & a[1]) and (i != j or counts[i] > 1)
-        for i, a in enumerate(kinds.tolist())
-        for j, b in enumerate(kinds.tolist())
-    )
+    matches = kinds[:, :1] & kinds[:, 1]
+    matches |= matches.T
+    return bool(np.any(matches[~np.eye(len(kinds), dtype=bool)]) or np.any(np.diag(matches)[counts > 1]))
 
 
 class Divergence(NamedTuple):
@@ -325,14 +319,6 @@ def _find_cause_of_reset(
     if not smooth <= mj.mjMAXVAL:
         return Divergence(world, step, "acceleration without constraints", True)
     return Divergence(world, step, "acceleration", False)
-
-
-def split_state_vector(model: Any, state: FloatArray) -> dict[str, FloatArray]:
-    """Convert a state vector to a dict by the names of MjData."""
-    mj = import_mujoco()
-    data = mj.MjData(model)
-    mj.mj_setState(model, data, state, mj.mjtState.mjSTATE_INTEGRATION)
-    return {name: np.array(getattr(data, name)) for name in STEP_FIELDS}
 
 
 def iterate_frames(engine: str, runs: Runs, njmax: int | None = None) -> Iterator[Frame]:

@@ -212,11 +212,14 @@ KEYFRAMES = """<keyframe><key qpos="0 0 .099 1 0 0 0  0 0 .5 1 0 0 0  0" ctrl=".
   <key qpos="0 0 2 1 0 0 0  0 0 3 1 0 0 0  0"/></keyframe></mujoco>"""
 
 
-def test_audit_from_keyframes_starts_worlds_in_them(tmp_path):
+def test_audit_from_keyframes_starts_worlds_in_them(tmp_path, monkeypatch):
     (tmp_path / "keyed.xml").write_text(BOXES.format(options="").replace("</mujoco>", KEYFRAMES))
     found = audit(tmp_path / "keyed.xml", worlds=2, steps=1, workers=1, states="keyframes")
     assert found.contacts[:, 0].tolist() == [4, 0]
     assert len(audit(tmp_path / "keyed.xml", worlds=1, steps=1, workers=1, states="keyframes").runs.starts) == 1
+    monkeypatch.setattr(module, "MAX_DEFAULT_WORLDS", 2)
+    found = audit(tmp_path / "keyed.xml", steps=1, workers=1, states="keyframes")
+    assert found.contacts[:, 0].tolist() == [4, 0]
 
 
 NV, NQ = 13, 15

@@ -88,7 +88,7 @@ def tune(
         error_limit = check_float("max_velocity_error", error_limit, low=0.0)
     if check_int("steps", steps, 1, None) % horizon:
         raise InputError(f"steps is {steps} and horizon is {horizon}; steps must be a multiple of horizon")
-    runs = Runs.of_model(model, worlds, steps, control=control, seed=seed).with_start_states(states)
+    runs = Runs.of_model(model, worlds, steps, states=states, control=control, seed=seed)
     # Raise the error of an unsupported model here, before any world is simulated.
     from_mujoco_many(runs.model, np.zeros((0, runs.model.nq + runs.model.nv)))
     if watch is not None:
