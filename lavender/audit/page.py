@@ -16,7 +16,7 @@ from lavender.base.lazy_import import pandas as pd
 from lavender.io.stored import format_json
 from lavender.judge.residuals import AT_FLOOR, UNCONVERGED, VERDICTS, WRONG
 from lavender.report import drawing
-from lavender.report.page import Page, fold_table, make_table
+from lavender.report.page import DEFAULT_ERROR_LIMIT, Page, fold_table, make_shares, make_table
 from lavender.report.render import print_table, write_files
 from lavender.report.text import (
     format_count,
@@ -72,9 +72,8 @@ class ResultPage:
         page.warnings = [*page.warnings, *([STOPPED_NOTE] if self.is_stopped else [])]
         page.footer = [*filter(None, [self.provenance]), *page.footer]
         numbers = format_json(self.numbers, indent=1) + "\n"
-        return (
-            write_files(Path(folder), {"index.html": page.render(), "numbers.json": numbers}) / "index.html"
-        )
+        files = {"index.html": page.render(), "numbers.json": numbers}
+        return write_files(Path(folder), files) / "index.html"
 
     def print_short(self, console: Console) -> None:
         """Print the head of the page and the tables."""
@@ -120,24 +119,18 @@ def make_audit_page(audit: Any, folder: Path | None) -> Page:
         states = audit.folder / "states.npz"
         code = [f"lavender tune {model} --max-velocity-error {counts.limit:g} --states {states}"]
     starts = f"seed {runs.seed}, start velocities ± {runs.spread:g} m/s"
-    footer = [
-        f"{starts}. Files: records.npz (every step), numbers.json, states.npz, worst/, figures/ (PDF, SVG, PNG)."
-    ]
+    files = "records.npz (every step), numbers.json, states.npz, worst/, figures/ (PDF, SVG, PNG)"
+    footer = [f"{starts}. Files: {files}."]
     return Page("lavender audit", source, counts.verdict, counts.sentences, code, mark=counts.mark,
                 is_bad=counts.is_bad, warnings=audit.advice, blocks=blocks, footer=footer)  # fmt: skip
 
 
 class AuditCounts:
-    """Counts, sentences, figures and tables of an audit, compared with a limit.
-
-    Parameters
-    ----------
-    audit : Audit
-        `DEFAULT_ERROR_LIMIT` is compared with if it has no limit of its own.
-    """
+    """Counts, sentences, figures and tables of an `Audit`, compared with its limit or the default of pages."""
 
     def __init__(self, audit: Any) -> None:
-        self.audit, self.limit = audit, audit.shown_limit
+        self.audit = audit
+        self.limit = DEFAULT_ERROR_LIMIT if audit.error_limit is None else audit.error_limit
         self.errors = np.where(audit.is_judged, audit.numbers[0], np.nan)
         at_floor = audit.verdict == VERDICTS.index(AT_FLOOR)
         self.sizes = np.where(at_floor, 0.0, self.errors)  # Steps at their floor never count.
@@ -204,9 +197,8 @@ class AuditCounts:
     @property
     def sentences(self) -> list[str]:
         """When and where, then the cause."""
-        return [
-            *filter(None, (self._describe_place(), self._describe_cause(), self.audit.compare_in_words()))
-        ]
+        texts = self._describe_place(), self._describe_cause(), self.audit.compare_in_words()
+        return [*filter(None, texts)]
 
     def _describe_place(self) -> str:
         """Return the worst step and row, the worlds above the limit, and whether errors grow with time."""
@@ -226,9 +218,8 @@ class AuditCounts:
         if not all(map(len, known)):
             return text
         early, late = (float(np.quantile(part, 0.99, method="higher")) for part in known)
-        trend = (
-            "Growing" if late > TREND_RATIO * early else "Falling" if late < early / TREND_RATIO else "Steady"
-        )
+        falling = "Falling" if late < early / TREND_RATIO else "Steady"
+        trend = "Growing" if late > TREND_RATIO * early else falling
         return (
             f"{text} {trend} with time: the error that 1 % of the steps exceed is {format_speed(early)} in steps "
             f"{quarter} to {2 * quarter - 1} and {format_speed(late)} in the last {quarter}."
@@ -252,15 +243,11 @@ class AuditCounts:
                 these = "All these" if n == self.above else f"{format_number(n)} of these"
                 texts.append(f"Cause: the solver. {these} solves stopped before convergence.")
             if n_wrong := int((self.is_above & wrong).sum()):
-                count = format_count(n_wrong, "answer")
-                texts.append(
-                    f"{count} of the engine {'is' if n_wrong == 1 else 'are'} no solution of its own problem."
-                )
+                count = f"{format_count(n_wrong, 'answer')} of the engine {'is' if n_wrong == 1 else 'are'}"
+                texts.append(f"{count} no solution of its own problem.")
         elif n := int((stopped | wrong).sum()):
-            share = format_percent(n, self.n, 1)
-            texts.append(
-                f"{format_count(n, 'solve')} ({share}) stopped before convergence, all within the limit."
-            )
+            count = f"{format_count(n, 'solve')} ({format_percent(n, self.n, 1)})"
+            texts.append(f"{count} stopped before convergence, all within the limit.")
         elif self.n:
             texts.append("Every solve converged.")
         if audit.converged is not None:
@@ -293,28 +280,22 @@ class AuditCounts:
         q = compute_quantiles(self.errors, list(QUANTILE_LINES.values()))
 
         def fill(axes: Any, strip: Any) -> str:
-            labels = drawing.mark_errors(
-                axes, low, float(np.nanmax(q)) if np.isfinite(q).any() else 0.0, self.limit
-            )
+            high = float(np.nanmax(q)) if np.isfinite(q).any() else 0.0
+            labels = drawing.mark_errors(axes, low, high, self.limit)
+            last = dict(zip(QUANTILE_LINES, map(float, q[:, -1]), strict=True))
             axes.set_xlim(0, steps)
             for i, alpha in enumerate((0.38, 0.24, 0.12)):
                 axes.fill_between(x, q[i], q[i + 1], step="post", color=drawing.BLUE, alpha=alpha, lw=0)
             for i, width in ((0, 1.2), (3, 0.7)):
                 axes.step(x, q[i], where="post", color=drawing.BLUE, lw=width)
-            labels += [
-                drawing.Label(y, name, drawing.BLUE)
-                for name, y in zip(QUANTILE_LINES, q[:, -1], strict=True)
-                if y == y
-            ]
+            labels += [drawing.Label(y, name, drawing.BLUE) for name, y in last.items() if y == y]
             if audit.against is not None:
                 other = np.where(audit.against.is_judged, audit.against.numbers[0], np.nan)
-                for y, name in zip(compute_quantiles(other, [0.99, 1.0]), ("99 %", "worst"), strict=True):
-                    axes.step(
-                        x, y, where="post", color=drawing.PINK, lw=1.0, ls="-" if name == "worst" else "--"
-                    )
-                    labels += (
-                        [drawing.Label(y[-1], f"against, {name}", drawing.PINK)] if y[-1] == y[-1] else []
-                    )
+                for quantile, name, dash in ((0.99, "99 %", "--"), (1.0, "worst", "-")):
+                    (y,) = compute_quantiles(other, [quantile])
+                    axes.step(x, y, where="post", color=drawing.PINK, lw=1.0, ls=dash)
+                    if y[-1] == y[-1]:
+                        labels.append(drawing.Label(y[-1], f"against, {name}", drawing.PINK))
             axes.set_ylabel("velocity error [m/s]")
             drawing.label_ends(axes, labels)
             order = np.argsort(-np.nan_to_num(self.sizes).max(axis=1), kind="stable")
@@ -330,9 +311,7 @@ class AuditCounts:
             if self.largest:
                 style = {"ms": 6, "color": drawing.INK, "mfc": "none", "mew": 1.2, "clip_on": False}
                 strip.plot([self.step + 0.5], [max(worlds / 60.0, 0.5)], "v", **style)
-            ends = ", ".join(
-                f"{name} {format_speed(float(y))}" for name, y in zip(QUANTILE_LINES, q[:, -1], strict=True)
-            )
+            ends = ", ".join(f"{name} {format_speed(y)}" for name, y in last.items())
             return (
                 f"Velocity error against step of {worlds} worlds; in the last steps: {ends}. {self.verdict}"
             )
@@ -351,21 +330,12 @@ class AuditCounts:
         if lost := int((self.audit.verdict == len(VERDICTS)).sum()):
             classes.append(("not judged", lost))
         total = max(self.n + lost, 1)
-        bar = [
-            (f"{100.0 * n / total:.2f}", color)
-            for (_, n), color in zip(classes, CLASS_COLORS, strict=False)
-            if n
-        ]
-        rows: list[Any] = []
-        for i, (name, n) in enumerate(classes):
-            swatch = markupsafe.Markup('<span class="swatch" style="background:{}"></span> {}').format(
-                CLASS_COLORS[i], name
-            )
+        parts = []
+        for i, ((name, n), color) in enumerate(zip(classes, CLASS_COLORS, strict=False)):
             css = "bad" if i >= 3 and n else "q" if i < 2 else ""
-            rows.append([(swatch, css, ""), (format_number(n), css, ""), (format_percent(n, total), css, "")])
-        alt = "Shares of the steps: " + ", ".join(f"{name} {format_percent(n, total)}" for name, n in classes)
+            parts.append((name, color, n / total, [format_number(n), format_percent(n, total)], css))
         small = f"{format_number(self.n)} steps by the error of their worst row"
-        return [make_table(rows, title="How wrong", small=small, classes="full"), {"bar": bar, "alt": alt}]
+        return make_shares(parts, "Shares of the steps: ", title="How wrong", small=small)
 
     def make_rows_table(self) -> list[Any]:
         """Make the table of the rows with the largest errors, on a logarithmic scale with the limit."""
@@ -442,8 +412,6 @@ class StepSizes:
         """The contents of `table` for numbers.json."""
         numbers: dict[str, Any] = {"can_touch": self.can_touch, "min_contact_share": MIN_CONTACT_SHARE}
         for name, x in (("rows", self.rows), ("contacts", self.contacts)):
-            values = (
-                (float(np.median(x)), int(x.max()), float(np.mean(x > 0))) if len(x) else (None, None, None)
-            )
-            numbers[name] = dict(zip(("median", "maximum", "share"), values, strict=True))
+            found = (float(np.median(x)), int(x.max()), float(np.mean(x > 0))) if len(x) else (None,) * 3
+            numbers[name] = dict(zip(("median", "maximum", "share"), found, strict=True))
         return numbers

@@ -36,21 +36,6 @@ class Judging(NamedTuple):
     contact_share: float = 0.0
 
 
-class LostDigits(NamedTuple):
-    """Steps with forces that have lost digits, because R is far below the diagonal of J M^-1 J^T."""
-
-    steps: int = 0
-    digits: float = 0.0  # Largest number of digits.
-    # Steps with an acceleration that is exact to `acceleration_error`, which the integrator moves by the forces.
-    moved_by_forces: int = 0
-    acceleration_error: float = 0.0  # [m/s] Largest velocity error of the accelerations of these steps.
-
-    def merge(self, other: LostDigits) -> LostDigits:
-        """Return the union of two sets of steps."""
-        (a, b, c, d), (e, f, g, h) = self, other
-        return LostDigits(a + e, max(b, f), c + g, max(d, h))
-
-
 class Prediction(NamedTuple):
     """Comparison of velocities after steps with those that the judged answers predict."""
 
@@ -117,7 +102,9 @@ class Piece(NamedTuple):
     engine_warnings: Mapping[str, int] = MappingProxyType({})
     contact_states: Sequence[StepState] = ()
     n_dropped: int = 0  # Number of constraint rows for which the engine had no memory.
-    lost_digits: LostDigits = LostDigits()
+    # For each step with forces that have lost digits, because R is far below the diagonal of J M^-1 J^T: the number of
+    # digits, and the velocity error of the acceleration [m/s] if the integrator moves the step by the forces, else nan.
+    lost_digits: Sequence[tuple[float, float]] = ()
     prediction: Prediction = Prediction()
     against: Piece | None = None  # Results of the other model on the same states.
 
@@ -139,10 +126,9 @@ def judge_steps(
     `world` and `step` are the numbers of the steps, and `state_of(i)` returns the state before step i.
     """
     batch = frame.batch
-    residuals = residual_many(
-        batch, frame.impulse, precision=judging.precision, threshold=judging.threshold, errors="status"
-    )
-    r, verdicts = residuals, residuals.verdict
+    options: Any = {"precision": judging.precision, "threshold": judging.threshold}
+    r = residual_many(batch, frame.impulse, **options, errors="status")
+    verdicts = r.verdict
     numbers = np.array([r.velocity_error, r.impulse_error, r.relative, r.roundoff_floor])
     verdict = np.full(len(verdicts), NOT_JUDGED, np.int8)
     measured = np.isfinite(numbers[0])
@@ -151,7 +137,7 @@ def judge_steps(
     numbers[:, verdict == NOT_JUDGED] = np.nan
     rows, contacts = (np.where(verdict == NOT_JUDGED, 0, x) for x in (frame.rows, frame.contacts))
     unconverged = np.flatnonzero(np.isin(verdict, [VERDICTS.index(UNCONVERGED), VERDICTS.index(WRONG)]))
-    judged = {int(i): residuals[int(i)] for i in unconverged}
+    judged = {int(i): r[int(i)] for i in unconverged}
     order = unconverged[np.argsort(-numbers[0, unconverged], kind="stable")]
     if judging.keep is None:
         order = order[np.sort(np.unique(world[order], return_index=True)[1])]
@@ -163,14 +149,10 @@ def judge_steps(
     with_contact = np.flatnonzero(contacts > 0)
     n = min(len(with_contact), int(np.ceil(judging.contact_share * len(world))))
     chosen = with_contact[np.arange(n) * len(with_contact) // max(n, 1)]
-    without_digits = residuals.without_digits.values()
-    by_forces = [x.acceleration_error for x in without_digits if np.isfinite(x.acceleration_error)]
-    digits = max((x.lost_digits for x in without_digits), default=0.0)
-    lost = LostDigits(len(without_digits), digits, len(by_forces), max(by_forces, default=0.0))
     return Piece(
         world, step, numbers, verdict=verdict, rows=rows, contacts=contacts, worst=worst,
         where=[(i, CONTACT_NUMBER.sub(r"\1 ", one.worst_label).strip()) for i, one in judged.items()],
         contact_states=[StepState(int(world[i]), int(step[i]), state_of(i)) for i in chosen.tolist()],
         converged=frame.converged, n_dropped=frame.n_dropped,
-        lost_digits=lost,
+        lost_digits=[(x.lost_digits, x.acceleration_error) for x in r.without_digits.values()],
     )  # fmt: skip

@@ -18,7 +18,6 @@ from lavender.audit.pieces import (
     N_WORST_WORLDS,
     NOT_JUDGED,
     WORST_ROW_ERRORS,
-    LostDigits,
     Piece,
     Prediction,
     StepState,
@@ -31,7 +30,6 @@ from lavender.base.lazy_import import pandas as pd
 from lavender.io.npz import write_npz
 from lavender.io.stored import prepare_step_folder, write_arrays
 from lavender.judge.residuals import AT_FLOOR, CLOSE, DEFAULT_THRESHOLD, UNCONVERGED, WRONG
-from lavender.report.page import DEFAULT_ERROR_LIMIT
 from lavender.report.text import format_count, format_percent, format_size, format_speed, split_row_unit
 
 QUANTILES = (0.5, 0.9, 0.99, 0.999, 1.0)
@@ -77,7 +75,7 @@ class Audit:
     # States before steps with contact, if the audit keeps them; in the order of worlds and steps.
     contact_states: list[StepState] = field(default_factory=list)
     n_dropped: int = 0  # Number of constraint rows for which the engine had no memory.
-    lost_digits: LostDigits = field(default_factory=LostDigits)
+    lost_digits: list[tuple[float, float]] = field(default_factory=list)  # See `Piece`.
     prediction: Prediction = field(default_factory=Prediction)
     against: Audit | None = None  # Result of another model on the same states.
     provenance: dict[str, Any] = field(default_factory=dict)  # Result of `describe_provenance`.
@@ -130,7 +128,7 @@ class Audit:
         self.engine_warnings.update(piece.engine_warnings)
         self.divergences[:] = sorted([*self.divergences, *piece.divergences])
         self.n_dropped += piece.n_dropped
-        self.lost_digits = self.lost_digits.merge(piece.lost_digits)
+        self.lost_digits.extend(piece.lost_digits)
         self.prediction = self.prediction.merge(piece.prediction)
         if self.against is not None and piece.against is not None:
             self.against.add_piece(piece.against, keep)
@@ -218,11 +216,6 @@ class Audit:
     # -- sentences -----------------------------------------------------------------------------------------
 
     @property
-    def shown_limit(self) -> float:
-        """Velocity error with which the page compares [m/s, rad/s]: `error_limit`, or else the default of all pages."""
-        return DEFAULT_ERROR_LIMIT if self.error_limit is None else self.error_limit
-
-    @property
     def headline(self) -> list[str]:
         """Result in sentences: the size of the error, when and where, and the cause."""
         counts = AuditCounts(self)
@@ -249,23 +242,27 @@ class Audit:
                 f"{world}, step {step}: the model or the state was changed within the step, for example by a callback, "
                 "or MuJoCo has a term that is unknown here. Verdicts of these steps do not count."
             )
-        lost = self.lost_digits
-        if lost.steps:
+        lost = self._count_lost_digits()
+        if lost["steps"]:
             text = (
-                f"In {format_count(lost.steps, 'step')} the forces lose up to {lost.digits:.0f} of their digits, "
+                f"In {format_count(lost['steps'], 'step')} the forces lose up to {lost['digits']:.0f} of their digits, "
                 "because R of a row is far below the diagonal of J M^-1 J^T."
             )
-            if lost.moved_by_forces:
-                text += (
-                    f" The acceleration is exact to {format_size(lost.acceleration_error)} m/s; the steps, which use "
-                    "the forces, are not."
-                )
+            if lost["moved_by_forces"]:
+                exact = f"The acceleration is exact to {format_size(lost['acceleration_error'])} m/s"
+                text += f" {exact}; the steps, which use the forces, are not."
             lines.append(text)
         if self.engine_warnings:
             counted = self.engine_warnings.most_common()
             texts = "; ".join(f"{text} ({format_count(n, 'time')})" for text, n in counted)
             lines.append(f"MuJoCo's own warnings: {texts}.")
         return [*lines, *self.notes]
+
+    def _count_lost_digits(self) -> dict[str, Any]:
+        """Count the steps with forces that have lost digits; `acceleration_error` is the largest one [m/s]."""
+        errors = [error for _, error in self.lost_digits if np.isfinite(error)]
+        return {"steps": len(self.lost_digits), "digits": max((n for n, _ in self.lost_digits), default=0.0),
+                "moved_by_forces": len(errors), "acceleration_error": max(errors, default=0.0)}  # fmt: skip
 
     def compare_in_words(self) -> str:
         """Return a sentence with the counts of the other model on the same states; empty without one."""
@@ -286,21 +283,18 @@ class Audit:
     @property
     def errors(self) -> pd.DataFrame:
         """Quantiles of the errors over all steps judged, and over unconverged and wrong ones."""
-        return _tabulate_quantiles(
-            {
-                "velocity [m/s]": self.numbers[0][self.is_judged],
-                "impulse [N s]": self.numbers[1][self.is_judged],
-                "velocity, unconverged [m/s]": self.numbers[0][self.is_unconverged],
-            }
-        )
+        return _tabulate_quantiles({
+            "velocity [m/s]": self.numbers[0][self.is_judged], "impulse [N s]": self.numbers[1][self.is_judged],
+            "velocity, unconverged [m/s]": self.numbers[0][self.is_unconverged],
+        })  # fmt: skip
 
     @property
     def worst_rows(self) -> pd.DataFrame:
         """The worst rows of steps that stopped before convergence or are wrong, most frequent first."""
-        ranked = sorted(self.where.items(), key=lambda entry: -entry[1][0])
-        rows = [
-            (row, n, format_speed(x, unit)) for name, (n, x) in ranked for row, unit in [split_row_unit(name)]
-        ]
+        rows = []
+        for name, (n, x) in sorted(self.where.items(), key=lambda entry: -entry[1][0]):
+            row, unit = split_row_unit(name)
+            rows.append((row, n, format_speed(x, unit)))
         return pd.DataFrame(rows, columns=["worst row", "steps", "largest error"])
 
     @property
@@ -406,7 +400,7 @@ class Audit:
             "divergences": divergences, **self.judged_sizes.as_dict,
             "engine_warnings": dict(self.engine_warnings), "stopped": self.is_stopped,
             "provenance": self.provenance,
-            "prediction": self.prediction._asdict(), "lost_digits": self.lost_digits._asdict(),
+            "prediction": self.prediction._asdict(), "lost_digits": self._count_lost_digits(),
         }  # fmt: skip
         if self.converged is not None:
             totals["claims"] = self.claim_counts

@@ -112,33 +112,17 @@ class Remedy:
 
 @dataclass(frozen=True, eq=False)
 class SlipExplanation:
-    """Slip of contacts in each variant of one step; `str()` gives the table and the sentences.
+    """Slip of contacts in each variant of one step; `str()` gives the table and the sentences."""
 
-    Parameters
-    ----------
-    contacts : tuple of str
-        Names of the chosen contacts.
-    variants : tuple of SlipVariant
-        In the order of replacement.
-    speeds_before : (contacts,) m/s, optional
-        Sliding speed before the step, if it is known.
-    friction_use : (contacts,), optional
-        Friction force of the engine's answer divided by mu times the normal force, if it is known.
-    remedies : tuple of Remedy
-        Settings that were simulated, if the model is known and this is its state with the fastest contact.
-    n_states : int
-        Number of states from which the settings were simulated.
-    state : int
-        Index of the state among the given ones.
-    """
-
-    contacts: tuple[str, ...]
-    variants: tuple[SlipVariant, ...]
-    speeds_before: FloatArray | None = None
+    contacts: tuple[str, ...]  # Names of the chosen contacts.
+    variants: tuple[SlipVariant, ...]  # In the order of replacement.
+    speeds_before: FloatArray | None = None  # (contacts,) m/s: sliding speed before the step, if it is known.
+    # (contacts,): friction force of the engine's answer divided by mu times the normal force, if it is known.
     friction_use: FloatArray | None = None
+    # Settings that were simulated, if the model is known and this is its state with the fastest contact.
     remedies: tuple[Remedy, ...] = ()
-    n_states: int = 0
-    state: int = 0
+    n_states: int = 0  # Number of states from which the settings were simulated.
+    state: int = 0  # Index of the state among the given ones.
 
     def __str__(self) -> str:
         from lavender.report.render import format_cells
@@ -150,12 +134,11 @@ class SlipExplanation:
         """Part of each contact's slip (contacts,) [m/s] by its cause."""
         following = [v.velocity for v in self.variants[1:]]
         zero = tuple(np.zeros_like(v) for v in self.variants[-1].velocity)
-        return {
-            CAUSES[variant.name]: np.array(
-                [np.linalg.norm(a - b) for a, b in zip(variant.velocity, after, strict=True)]
-            )
-            for variant, after in zip(self.variants, [*following, zero], strict=True)
-        }
+        parts = {}
+        for variant, after in zip(self.variants, [*following, zero], strict=True):
+            changes = [np.linalg.norm(a - b) for a, b in zip(variant.velocity, after, strict=True)]
+            parts[CAUSES[variant.name]] = np.array(changes)
+        return parts
 
     @property
     def slips(self) -> pd.DataFrame:
@@ -201,9 +184,8 @@ class SlipExplanation:
             drawn: set[bytes] = set()
             for remedy in self.remedies:
                 finite = np.array(remedy.speeds)[np.isfinite(remedy.speeds)]
-                if (
-                    len(finite) and finite.tobytes() not in drawn
-                ):  # Settings without an effect have the same line.
+                # Settings without an effect have the same line.
+                if len(finite) and finite.tobytes() not in drawn:
                     style = style_line(len(drawn)) | {"marker": ""}
                     drawn.add(finite.tobytes())
                     axes.plot(remedy.speeds, **style)
@@ -214,9 +196,8 @@ class SlipExplanation:
             axes.set_xlabel("step")
             axes.set_ylabel("slip [m/s]")
             label_ends(axes, labels)
-            return "Slip over time. " + "; ".join(
-                f"{label.text}: {label.y:.2g} m/s at the end" for label in labels
-            )
+            ends = (f"{label.text}: {label.y:.2g} m/s at the end" for label in labels)
+            return f"Slip over time. {'; '.join(ends)}"
 
         note = f"Means over {self.n_states} states. Steps without contact are gaps."
         margins = fit_margins([shorten(remedy.setting) for remedy in self.remedies])
@@ -281,10 +262,8 @@ class SlipExplanation:
             r.setting: f"; {r.kept} of {self.n_states} states keep contact, and {now.kept} as it is"
             for r in helpful if r.kept < now.kept
         }  # fmt: skip
-        return [
-            head,
-            *(f"  {r.setting}: {format_size(get_slip(r))} m/s{lost.get(r.setting, '')}" for r in helpful),
-        ]
+        lines = [f"  {r.setting}: {format_size(get_slip(r))} m/s{lost.get(r.setting, '')}" for r in helpful]
+        return [head, *lines]
 
 
 def explain_slip(
@@ -357,22 +336,22 @@ def explain_slip(
             variants.append(replace(last, name=name, note=note))
             return np.zeros(0) if start is None else start
         solution = solve(changed, impulse=start, tol=tol)
-        failed = "" if solution.residual.relative <= max(tol, solution.residual.roundoff_floor) else (
-            f"not solved: {solution.status.name}"
-        )  # fmt: skip
+        is_solved = solution.residual.relative <= max(tol, solution.residual.roundoff_floor)
+        failed = "" if is_solved else f"not solved: {solution.status.name}"
         own = slip(changed, solution.impulse)
         variants.append(SlipVariant(name, own, solution.residual.relative, failed))
         return solution.impulse
 
     start = solve_and_add_variant("solved", problem, answer)
-    own_disk = measured if disk is not None else _as_disk(problem)
+    own_disk = measured
+    if disk is None and problem.cones.has_box:
+        own_disk = replace(problem, cones=problem.cones.shaped("disk"))
     same = start if own_disk.m == problem.m else None
     start = solve_and_add_variant("disk", own_disk, same, "cones are round" if own_disk is problem else "")
     hard, has_soft_friction = _replace_soft_friction(own_disk, surface)
     start = solve_and_add_variant("hard", hard, start, "" if has_soft_friction else "friction rows are hard")
-    law_note = "the law is Coulomb's" if hard.friction == "coulomb" else (
-        UNDEFINED_LAW if hard.cones.has_round else ""
-    )  # fmt: skip
+    law_note = UNDEFINED_LAW if hard.cones.has_round else ""
+    law_note = "the law is Coulomb's" if hard.friction == "coulomb" else law_note
     rigid = hard if law_note else hard.relaxed("coulomb")
     start = solve_and_add_variant("coulomb", rigid, start, law_note)
     names = tuple(measured.block_name(k) for k in blocks)
@@ -413,13 +392,6 @@ def _choose_contacts(problem: Problem, contacts: Any) -> list[int]:
             known = f"give one of the blocks {sliding[:20]}"
             raise InputError(f"contacts names {entry!r}, which is not a contact with tangents; {known}")
     return list(dict.fromkeys(chosen))
-
-
-def _as_disk(problem: Problem) -> Problem:
-    """Return the problem with disks in place of boxes, or the same object if it has no boxes."""
-    if not problem.cones.has_box:
-        return problem
-    return replace(problem, cones=problem.cones.shaped("disk"))
 
 
 def _compute_free_row_velocities(problem: Problem) -> FloatArray:

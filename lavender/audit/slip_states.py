@@ -35,7 +35,7 @@ from lavender.io import mujoco as adapter
 from lavender.io.mujoco_memory import import_mujoco
 from lavender.io.start_states import name_model, read_states, without_sleep
 from lavender.problem import Problem
-from lavender.report.page import Page, make_table, tabulate_frame
+from lavender.report.page import Page, make_shares, tabulate_frame
 from lavender.report.runner import Event
 from lavender.report.text import format_count, format_speed
 
@@ -71,15 +71,11 @@ class SlipOfStates:
     def notes(self) -> list[str]:
         """Sentences about states that do not fit the model, and that are left out because they diverge."""
         notes = [self.misfit] if self.misfit else []
-        if not self.diverged:
-            return notes
-        n, first = len(self.diverged), self.diverged[0]
-        are = "is" if n == 1 else "are"
-        left_out = f"{format_count(n, 'state')} of {self.n_states} {are} left out, the first is state {first}"
-        return [
-            *notes,
-            f"{left_out}: MuJoCo restarts the simulation, which diverges up to the explained step.",
-        ]
+        if n := len(self.diverged):
+            left_out = f"{format_count(n, 'state')} of {self.n_states} {'is' if n == 1 else 'are'} left out"
+            why = "MuJoCo restarts the simulation, which diverges up to the explained step"
+            notes.append(f"{left_out}, the first is state {self.diverged[0]}: {why}.")
+        return notes
 
     @property
     def page(self) -> ResultPage:
@@ -105,26 +101,20 @@ class SlipOfStates:
             )
         blocks: list[Any] = []
         if folder is not None:
-            parts = {cause: float(first[cause]) for cause in CAUSES.values()}
-            total = sum(parts.values()) or 1.0
-            colors = [f"var(--s{i})" for i in range(len(parts))]
-            shares = (f"{100.0 * x / total:.1f}" for x in parts.values())
-            bar = list(zip(shares, colors, strict=True))
-            swatch = markupsafe.Markup('<span class="swatch" style="background:{}"></span> {}')
-            named = zip(parts.items(), colors, strict=True)
-            rows: list[Any] = [[swatch.format(color, cause), format_speed(x)] for (cause, x), color in named]
-            alt = ", ".join(f"{cause} {format_speed(x)}" for cause, x in parts.items())
-            title = "Causes of this slip"
-            causes = [make_table(rows, title=title, classes="full"), {"bar": bar, "alt": alt}]
+            total = float(first[list(CAUSES.values())].sum()) or 1.0
+            parts = [
+                (cause, f"var(--s{i})", float(first[cause]) / total, [format_speed(first[cause])], "")
+                for i, cause in enumerate(CAUSES.values())
+            ]
+            causes = make_shares(parts, title="Causes of this slip")
             drawn = [markupsafe.Markup(worst.draw_slip(folder))] if worst.remedies else []
             blocks = [{"pair": [drawn or causes, causes if drawn else []]}]
             blocks.append(tabulate_frame(self.table, title="Slip of each pair of geoms"))
             if worst.remedies:
                 blocks.append(tabulate_frame(worst.remedies_table, title="Settings simulated"))
         n = len(self.explanations)
-        source = (
-            f"lavender slip · {self.provenance.get('model', '')} · {format_count(n, 'state')} with contact"
-        )
+        model = self.provenance.get("model", "")
+        source = f"lavender slip · {model} · {format_count(n, 'state')} with contact"
         head, *settings = worst.advice or [""]
         advice = f"{head} {'; '.join(map(str.strip, settings))}." if settings else head
         sentences = [" ".join(worst.sentences), *filter(None, [advice])]
@@ -226,9 +216,15 @@ def _explain_state(mj: Any, model: Any, data: Any, entries: list[str]) -> SlipEx
     )
     chosen = [blocks[names.index(name)] for name in explanation.contacts]
     slips = compute_slip(measured, chosen, data.qvel, surface)
-    use = [_compute_friction_use(mj, model, data, name) for name in explanation.contacts]
+    # Friction force divided by mu times the normal force; nan without a normal force.
+    use, force = np.full(len(chosen), np.nan), np.empty(6)
+    for i, name in enumerate(explanation.contacts):
+        k = int(name.split()[1])
+        mj.mj_contactForce(model, data, k, force)
+        if force[0] > 0.0:
+            use[i] = np.hypot(*(force[1:3] / data.contact[k].friction[:2])) / force[0]
     speeds = np.array([np.linalg.norm(v) for v in slips])
-    return replace(explanation, speeds_before=speeds, friction_use=np.array(use))
+    return replace(explanation, speeds_before=speeds, friction_use=use)
 
 
 def _simulate_remedies(
@@ -272,15 +268,6 @@ def _find_fastest(explanation: SlipExplanation) -> tuple[float, str]:
     return max(zip(slips["speed"], slips["contact"].map(get_geoms), strict=True))
 
 
-def _compute_friction_use(mj: Any, model: Any, data: Any, name: str) -> float:
-    """Return the friction force of a contact divided by mu times its normal force; nan without a normal force."""
-    k, force = int(name.split()[1]), np.empty(6)
-    mj.mj_contactForce(model, data, k, force)
-    return (
-        float(np.hypot(*(force[1:3] / data.contact[k].friction[:2]))) / force[0] if force[0] > 0.0 else np.nan
-    )
-
-
 def _read_step(mj: Any, model: Any, data: Any) -> tuple[Problem, Problem | None, FloatArray]:
     """Return a step's problem, the one with disks if cones are pyramids, and velocities of the surfaces."""
     problem, disk, final = adapter.from_mujoco(model, data), None, data
@@ -313,10 +300,8 @@ def _change_settings(mj: Any, model: Any, geoms: str) -> Iterator[tuple[str, Any
     ]
     if get_option_value(mj, model, "cone") == "pyramidal":
         options += [{"cone": "elliptic", **x} for x in ({}, *options[1:])]
-    settings = {
-        s.option_line: s for s in (MujocoSetting.from_options(mj, model, **x) for x in options) if s.options
-    }
-    yield from ((line, setting.apply_to(mj, model)) for line, setting in settings.items())
+    settings = dict.fromkeys(MujocoSetting.from_options(mj, model, **x) for x in options)
+    yield from ((s.option_line, s.apply_to(mj, model)) for s in settings if s.options)
     shortest = 2.0 * model.opt.timestep  # MuJoCo uses no shorter time constant.
     if model.geom_solref[:, 0].max(initial=0.0) > shortest:  # Negative values are stiffnesses.
         changed = copy.deepcopy(model)

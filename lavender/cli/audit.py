@@ -9,7 +9,6 @@ from typing import Any
 
 import click
 
-from lavender.base.errors import InputError
 from lavender.base.exits import EXIT_UNMET
 from lavender.cli.completion import complete_file_or_word
 from lavender.cli.measuring import show_page, show_progress
@@ -76,10 +75,7 @@ def audit(
     from lavender.audit.audit import audit as run
     from lavender.report.text import format_count
 
-    limit, engine = options["max_velocity_error"], options["engine"]
-    if limit is not None and not limit >= 0.0:
-        raise InputError(f"--max-velocity-error is {limit}; a velocity error in m/s is needed")
-    reject_options_without_effect(context, other_engine=engine != "mujoco")
+    reject_options_without_effect(context, other_engine=options["engine"] != "mujoco")
     check_writable(out, folder=True)
     limit_to_one_thread()
     with show_progress(quiet) as watch:

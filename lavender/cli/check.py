@@ -37,7 +37,7 @@ NARROW_CHECK_OMITS = (
 @click.argument(
     "files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...", shell_complete=complete_case_or_file
 )
-@click.option("--solvers", type=ListType(str), shell_complete=complete_solver,
+@click.option("--solvers", type=ListType(click.STRING), shell_complete=complete_solver,
               help="Solvers by name; default: all that accept the problem.")  # fmt: skip
 @click.option("--reference", default="osqp", show_default=True, shell_complete=complete_solver,
               help="Reference solver, with which the others are compared.")  # fmt: skip
@@ -93,9 +93,7 @@ def check(
     check_time_limit(time_limit)
     for item in report.resolve_sources(files):
         with errors(item):
-            comparison = cross_check(
-                item.problem, solvers=solvers, reference=reference, tol=tol, time_limit=time_limit
-            )
+            comparison = cross_check(item.problem, solvers, reference, tol=tol, time_limit=time_limit)
             stored = item.judge_stored_answer(precision, threshold)
             if item.name != item.problem.name:  # The description begins with the problem's own name.
                 show(item.name, style="bold")

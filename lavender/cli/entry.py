@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import warnings
 from collections.abc import Sequence
-from typing import Any
 
 import click
 
@@ -43,10 +42,9 @@ class Commands(click.Group):
         limit = formatter.width - 6 - width
         for heading, names in COMMAND_GROUPS.items():
             commands = [(name, self.get_command(ctx, name)) for name in names]
+            rows = [(name.ljust(width), c.get_short_help_str(limit)) for name, c in commands if c]
             with formatter.section(heading):
-                formatter.write_dl(
-                    [(name.ljust(width), c.get_short_help_str(limit)) for name, c in commands if c]
-                )
+                formatter.write_dl(rows)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Import and return a command; an unknown name raises UnknownName."""
@@ -71,10 +69,12 @@ def main(args: Sequence[str] | None = None) -> None:
     """Run the command line. An error of lavender is printed as one line and exits with 2, Ctrl-C exits with 130."""
     try:
         with warnings.catch_warnings():
-            warnings.showwarning = _show_warning
-            code = cli.main(
-                args=None if args is None else list(args), prog_name="lavender", standalone_mode=False
+            # Print a warning as one line, without the line of source that issued it.
+            warnings.showwarning = lambda message, *place, **more: print_escaped(
+                f"lavender: warning: {message}", err=True
             )
+            words = None if args is None else list(args)
+            code = cli.main(words, prog_name="lavender", standalone_mode=False)
     except LavenderError as error:
         print_escaped(f"lavender: {error}", err=True)
         code = EXIT_BAD_INPUT
@@ -85,8 +85,3 @@ def main(args: Sequence[str] | None = None) -> None:
         click.echo("lavender: stopped", err=True)
         code = EXIT_INTERRUPTED
     raise SystemExit(code if isinstance(code, int) else 0)
-
-
-def _show_warning(message: Warning | str, *place: Any, **more: Any) -> None:
-    """Print a warning as one line, without the line of source that issued it."""
-    print_escaped(f"lavender: warning: {message}", err=True)

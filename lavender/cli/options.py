@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
@@ -32,36 +33,20 @@ FILE = click.Path(dir_okay=False, path_type=Path)
 FOLDER = click.Path(file_okay=False, path_type=Path)
 Option = tuple[tuple[str, ...], dict[str, Any]]  # Positional (names) and keyword arguments of `click.option`.
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+NUMBER = re.compile(r"[\d.]+(e[-+]?\d+)?", re.IGNORECASE)  # Matches a word of a list of numbers.
 
 
 class ListType(_ParamType):
-    """Option type: numbers or words, separated by commas or blanks."""
+    """Option type: values of another type, separated by commas or blanks."""
 
-    def __init__(self, kind: type) -> None:
+    def __init__(self, kind: _ParamType) -> None:
         self.kind = kind
-        self.name = "a,b,..." if kind is str else "x,x,..."
+        self.name = "x,x,..." if kind in (click.INT, click.FLOAT) else "a,b,..."
 
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[Any, ...]:
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return the values as a tuple."""
-        if not isinstance(value, str):
-            return tuple(value)
-        try:
-            return tuple(self.kind(word) for word in value.replace(",", " ").split())
-        except ValueError:
-            return self.fail(
-                f"{value!r} is not a list of {'whole ' if self.kind is int else ''}numbers", param, ctx
-            )
-
-
-def _is_number(word: str) -> bool:
-    """Return whether a word is a number."""
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
+        words = value.replace(",", " ").split() if isinstance(value, str) else value
+        return tuple(self.kind.convert(word, param, ctx) for word in words)
 
 
 def _is_solver(word: str) -> bool:
@@ -75,15 +60,15 @@ class ListCommand(click.Command):
     """Command that takes lists with blanks, `--budgets 4 8`, as well as with commas, `--budgets 4,8`."""
 
     #: Options with lists: whether a word after the first one belongs to the list.
-    TESTS: Mapping[str, Callable[[str], bool]] = {
-        **dict.fromkeys(("--tolerances", "--budgets", "--time-budgets"), _is_number),
+    TESTS: Mapping[str, Callable[[str], Any]] = {
+        **dict.fromkeys(("--tolerances", "--budgets", "--time-budgets"), NUMBER.fullmatch),
         "--solvers": _is_solver,
     }
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Join the words of each list by commas, then parse as click does."""
         joined: list[str] = []
-        belongs: Callable[[str], bool] | None = None
+        belongs: Callable[[str], Any] | None = None
         for i, word in enumerate(args):
             if belongs and args[i - 1] not in self.TESTS and not word.startswith("-") and belongs(word):
                 joined[-1] += f",{word}"
@@ -160,16 +145,6 @@ def reject_options_without_effect(context: click.Context, **conditions: Any) -> 
                 raise InputError(f"{parameter.opts[0]} has no effect {words}: leave it out")
 
 
-def describe_solvers(solvers: Sequence[str] | None) -> dict[str, bool]:
-    """Return the conditions of `OPTIONS_WITHOUT_EFFECT` that depend on the named solvers."""
-    from lavender.solvers import registry
-
-    specs = [registry.get(name) for name in solvers or ()]
-    return {
-        "without_budgets": bool(specs) and not any(s.resumable and not s.exact for s in specs),
-    }
-
-
 #: Option of commands that judge solutions of an engine.
 precision_option = click.option(
     "--precision", type=click.Choice(["float64", "float32"]),
@@ -226,11 +201,11 @@ OPTIONS_WITHOUT_EFFECT: dict[str, tuple[str, tuple[str, ...]]] = {
 
 #: Options of the commands that measure, as fields of `lavender.report.Plan`.
 PLAN_OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
-    ("--solvers", {"type": ListType(str), "shell_complete": complete_solver,
+    ("--solvers", {"type": ListType(click.STRING), "shell_complete": complete_solver,
                    "help": "Solvers by name; default: all that are installed."}),
-    ("--tolerances", {"type": ListType(float), "default": "1e-3,1e-6,1e-9", "show_default": True,
+    ("--tolerances", {"type": ListType(click.FLOAT), "default": "1e-3,1e-6,1e-9", "show_default": True,
                   "help": "Relative residuals to reach."}),
-    ("--budgets", {"type": ListType(int), "default": "4,8,16,32,64", "show_default": True,
+    ("--budgets", {"type": ListType(click.INT), "default": "4,8,16,32,64", "show_default": True,
                    "help": "Numbers of iterations to run exactly."}),
     ("--repeats", {"type": int, "default": 3, "show_default": True,
                    "help": "Repetitions of each solve; minimum and median are recorded."}),

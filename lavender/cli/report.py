@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import click
 
-from lavender.base.arrays import check_choice, check_float
+from lavender.base.arrays import check_float
 from lavender.base.errors import InputError
 from lavender.base.exits import EXIT_INTERRUPTED, EXIT_UNMET
 from lavender.cli.completion import complete_case_or_file
@@ -19,7 +18,6 @@ from lavender.cli.options import (
     RECORDING_NAMES,
     ListCommand,
     ListType,
-    describe_solvers,
     exit_after_interrupt,
     limit_option,
     make_console,
@@ -31,6 +29,7 @@ from lavender.cli.options import (
 )
 from lavender.io.start_states import MODEL_SUFFIXES
 from lavender.io.stored import check_writable
+from lavender.report.drawing import FILE_KINDS
 
 
 @click.command(cls=ListCommand)
@@ -51,7 +50,7 @@ from lavender.io.stored import check_writable
 @click.option("--backend", default="loky", show_default=True,
               help="The same with the workers of a backend of joblib, such as dask.")  # fmt: skip
 @click.option("--compare", type=PATH, help="Compare with earlier records (.jsonl, or their folder).")
-@click.option("--time-budgets", type=ListType(float), default=(), metavar="S,S,...",
+@click.option("--time-budgets", type=ListType(click.FLOAT), default=(), metavar="S,S,...",
               help="Times in seconds for which the report lists the best solver; default: three decades about the "
               "fastest.")  # fmt: skip
 @click.option("--sweeps", is_flag=True,
@@ -63,9 +62,9 @@ from lavender.io.stored import check_writable
 @click.option("--no-reuse", is_flag=True, help="Repeat runs that the folder already holds.")
 @click.option("--no-figures", is_flag=True,
               help="Write no figures; they take the largest part of the time of writing.")  # fmt: skip
-@click.option("--figure-kinds", type=ListType(str), default="pdf,svg,png", show_default=True,
+@click.option("--figure-kinds", type=ListType(click.Choice(FILE_KINDS)), default="pdf,svg,png", show_default=True,
               help="Formats of the figures in OUT/figures.")  # fmt: skip
-@click.option("--columns", type=ListType(str), default=(), metavar="A,B,...",
+@click.option("--columns", type=ListType(click.STRING), default=(), metavar="A,B,...",
               help="Columns of OUT/tables/solvers.tex: solved, a tolerance such as 1e-6, ratio, slowest, accepted, "
               "false; default: solved and all tolerances.")  # fmt: skip
 @quiet_option
@@ -85,33 +84,31 @@ def report(
     where it stopped.
 
     Exit code 1: a file cannot be read (the others are reported), a step could not be recorded, or nothing was measured.
-    Exit code 2: a file does not exist, or another report is writing to the folder.
+    Exit code 2: a file does not exist.
     """
     reject_options_without_effect(context, is_list=listed)
     if listed:
         _list_suite()
         return
-    from lavender.report.drawing import FILE_KINDS
     from lavender.report.page import check_columns
     from lavender.report.store import read, select_solvers
     from lavender.report.text import format_count
+    from lavender.solvers import registry
 
-    for limit in options["time_budgets"]:
-        if not (math.isfinite(limit) and limit > 0.0):
-            raise InputError(f"time budget {limit} is not positive; a positive number of seconds is needed")
+    for seconds in options["time_budgets"]:
+        check_float("time_budgets", seconds, above=0.0)
     if options["max_velocity_error"] is not None:
         check_float("max_velocity_error", options["max_velocity_error"], above=0.0)
     check_columns(options["columns"])
-    for kind in options["figure_kinds"]:
-        check_choice("figure-kinds", kind, FILE_KINDS)
     shows_records = any(f.endswith(".jsonl") for f in files)
+    # Records may contain solvers that are not installed.
+    specs = [] if shows_records else [registry.get(name) for name in options["solvers"] or ()]
     has_model = any(Path(f).suffix.lower() in MODEL_SUFFIXES for f in files)
     reject_options_without_effect(
         context, shows_records=shows_records, is_campaign=not shows_records and is_campaign(context),
         sweeps=options["sweeps"], without_model=not has_model,
         without_random=has_model and context.params["control"] != "random",
-        # Records may contain solvers that are not installed.
-        **describe_solvers(None if shows_records else options["solvers"]),
+        without_budgets=bool(specs) and not any(s.resumable and not s.exact for s in specs),
     )  # fmt: skip
     check_writable(out, folder=True)
     used_folders: set[Path] = set()

@@ -69,9 +69,8 @@ def run(
     reject_options_without_effect(context, without_record=record is None)
     if plot is not None:
         plot = check_figure_path(plot)
-    files = {
-        name: path for name, path in (("trace", trace), ("figure", plot), ("film", film)) if path is not None
-    }
+    outputs = {"trace": trace, "figure": plot, "film": film}
+    files = {name: path for name, path in outputs.items() if path is not None}
     for path in files.values():
         check_writable(path)
     if film is not None and film.suffix.lower() != ".gif":

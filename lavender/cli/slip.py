@@ -17,7 +17,7 @@ from lavender.io.stored import check_writable
 @click.argument("model", metavar="MODEL.xml|MODEL.mjb", type=FILE)
 @click.option("--states", metavar="FILE.npz|keyframes", shell_complete=complete_file_or_word("keyframes"),
               help="States to explain, such as states.npz of an audit; default: the initial state.")  # fmt: skip
-@click.option("--steps", type=int, default=1, show_default=True,
+@click.option("--steps", type=click.IntRange(min=1), default=1, show_default=True,
               help="Steps simulated from each state, with its controls; the last one is explained.")  # fmt: skip
 @click.option("--contact", "contacts", multiple=True, metavar="GEOM",
               help="Contacts of geoms whose names contain this; may be repeated. Default: all.")  # fmt: skip
@@ -38,12 +38,10 @@ def slip(
     """
     from lavender.audit.provenance import format_provenance
     from lavender.audit.slip_states import explain_slip_of_states
-    from lavender.base.arrays import check_int
     from lavender.io.start_states import can_sleep, load_model
     from lavender.report.render import print_table
     from lavender.report.text import format_count
 
-    steps = check_int("steps", steps, 1)
     if out is not None:
         check_writable(out, folder=True)
     limit_to_one_thread()

@@ -69,7 +69,16 @@ def solve(file: str, solver: str, tol: float, output: Path | None, as_json: bool
         results = _collect_results(item.problem, solution, SAVED_RESIDUAL_FIELDS)
         write_arrays(output, results | {"status": solution.status.name, "solver": solution.solver.name})
     if as_json:
-        click.echo(format_json(_describe_solution(item.name, item.problem, solution), indent=1))
+        law = item.problem.law if item.problem.qp is None else "program"
+        judged = {} if item.problem.qp is not None else {
+            "verdict": solution.residual.verdict, "worst_row": solution.residual.worst_label,
+        }  # fmt: skip
+        results = {
+            "case": item.name, "law": law, "rows": item.problem.m, "solver": solution.solver.name,
+            "status": solution.status.name, "success": solution.success, **judged,
+            **_collect_results(item.problem, solution, ("relative", "energy", "velocity", "roundoff_floor")),
+        }  # fmt: skip
+        click.echo(format_json(results, indent=1))
     else:
         start = "zero impulses" if item.problem.guess is None else "the stored impulses"
         kind = f"{item.problem.law}, {item.problem.m} rows, starts from {start}"
@@ -100,15 +109,3 @@ def _collect_results(problem: Problem, solution: Solution, names: Sequence[str])
     found = {name: getattr(answer, name) for name in ("x", "y", "z", "z_box", "error", "objective")}
     del results["impulse"], results["slack"]
     return results | {name: value for name, value in found.items() if value is not None}
-
-
-def _describe_solution(name: str, problem: Problem, solution: Solution) -> dict[str, Any]:
-    """Return the contents of `--json`: the claim of the solver and the numbers of the judge."""
-    judged = {} if problem.qp is not None else {
-        "verdict": solution.residual.verdict, "worst_row": solution.residual.worst_label,
-    }  # fmt: skip
-    return {
-        "case": name, "law": problem.law if problem.qp is None else "program", "rows": problem.m,
-        "solver": solution.solver.name, "status": solution.status.name, "success": solution.success, **judged,
-        **_collect_results(problem, solution, ("relative", "energy", "velocity", "roundoff_floor")),
-    }  # fmt: skip

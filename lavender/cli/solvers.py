@@ -102,6 +102,5 @@ def _list_solvers() -> None:
     console = make_console()
     print_table(console, pd.DataFrame(rows), optional=("reads",))
     console.print()
-    print_table(
-        console, pd.DataFrame(CAPABILITIES, columns=["field", "capability", "meaning"]).drop(columns="field")
-    )
+    words = [word_and_meaning for _, *word_and_meaning in CAPABILITIES]
+    print_table(console, pd.DataFrame(words, columns=["capability", "meaning"]))

@@ -199,9 +199,8 @@ def _diagnose_problems(files: tuple[str, ...], as_json: bool) -> None:
                 print_escaped(f"{item.name}: {diagnostic}")
     suspect = sum(map(bool, diagnostics.values()))
     if as_json:
-        click.echo(
-            json.dumps({name: list(map(asdict, entries)) for name, entries in diagnostics.items()}, indent=2)
-        )
+        entries = {name: list(map(asdict, some)) for name, some in diagnostics.items()}
+        click.echo(json.dumps(entries, indent=2))
     else:
         click.echo(f"{len(diagnostics)} problems checked, {suspect or 'none'} with diagnostics")
     errors.exit(suspect)

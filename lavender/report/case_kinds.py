@@ -60,13 +60,22 @@ class ContactCase:
 
     def judge(self, solution: Solution) -> Row:
         """Return the errors of an answer, by the names of columns."""
-        r, impulse = solution.residual, solution.impulse
-        is_known = self.problem.matrix is None and bool(np.isfinite(impulse).all())
+        r, impulse, problem = solution.residual, solution.impulse, self.problem
+        change = gain = math.nan
+        if problem.matrix is None and np.isfinite(impulse).all():
+            change = problem.energy_change(impulse)
+            if not ((problem.cones.lower > 0.0).any() or (problem.cones.upper < 0.0).any()):
+                # The part of the change beyond the work of the targets, 0 within its rounding. With A lambda = w + b it
+                # is lambda.(w - b) / 2 - lambda.diag(compliance) lambda / 2, which is not positive at a solution if the
+                # bounds of all rows contain 0.
+                soft = 0.0 if problem.compliance is None else problem.compliance * impulse
+                gain = 0.5 * float(impulse @ (r.slack - problem.b - soft))
+                rounding = float(np.abs(impulse) @ (np.abs(r.slack) + 2.0 * np.abs(problem.b)))
+                gain = gain if gain > ENERGY_ROUNDING * rounding else 0.0
         return {
             "relative": float(r.relative), "error_energy": float(r.energy), "velocity": float(r.velocity),
             "roundoff_floor": float(r.roundoff_floor), "worst_row": int(r.worst_row), "worst_name": r.worst_label,
-            "energy_change": self.problem.energy_change(impulse) if is_known else math.nan,
-            "energy_gain": compute_energy_gain(self.problem, impulse, r.slack) if is_known else math.nan,
+            "energy_change": change, "energy_gain": gain,
         }  # fmt: skip
 
     def judge_impulse(self, impulse: FloatArray) -> float:
@@ -208,9 +217,8 @@ class ProgramCase(ContactCase):
         qp = self.problem.qp
         n = len(qp.q)
         P, J = (sp.csr_array((x[2], x[1], x[0]), (len(x[0]) - 1, n)) for x in (qp.hessian, qp.jacobian))
-        (x, lam, r, s, broken, r_terms, s_terms), other = (
-            _measure_point(qp, P, J, solution.impulse) for solution in (one, two)
-        )
+        points = (_measure_point(qp, P, J, solution.impulse) for solution in (one, two))
+        (x, lam, r, s, broken, r_terms, s_terms), other = points
         delta = x - other[0]
         square = float(delta @ (P @ delta))
         allowed = (
@@ -235,20 +243,6 @@ class ProgramCase(ContactCase):
 def make_case(problem: Problem) -> ContactCase:
     """Return the case of a problem, of its kind."""
     return ContactCase(problem) if problem.qp is None else ProgramCase(problem)
-
-
-def compute_energy_gain(problem: Problem, impulse: FloatArray, slack: FloatArray) -> float:
-    """Return the part [J] of the energy change beyond the work of the targets; 0 within its rounding.
-
-    With A lambda = w + b it is lambda.(w - b) / 2 - lambda.diag(compliance) lambda / 2, which is not positive at a
-    solution if the bounds of all rows contain 0, and NaN otherwise.
-    """
-    if (problem.cones.lower > 0.0).any() or (problem.cones.upper < 0.0).any():
-        return math.nan
-    soft = 0.0 if problem.compliance is None else problem.compliance * impulse
-    gain = 0.5 * float(impulse @ (slack - problem.b - soft))
-    rounding = float(np.abs(impulse) @ (np.abs(slack) + 2.0 * np.abs(problem.b)))
-    return gain if gain > ENERGY_ROUNDING * rounding else 0.0
 
 
 def _measure_point(qp: Any, P: Any, J: Any, impulse: FloatArray) -> tuple[Any, ...]:

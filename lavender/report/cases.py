@@ -74,11 +74,9 @@ class Item:
 
 def is_path(word: Source) -> bool:
     """Return whether `word` names a file or folder, which need not exist, and not a case of the suite."""
-    if isinstance(word, Path):
-        return True
-    return isinstance(word, str) and (
-        "/" in word or os.sep in word or Path(word).suffix.lower() in SUFFIXES or Path(word).exists()
-    )
+    if not isinstance(word, str):
+        return isinstance(word, Path)
+    return "/" in word or os.sep in word or Path(word).suffix.lower() in SUFFIXES or Path(word).exists()
 
 
 Source = str | Path | Problem | Case | Item
@@ -175,9 +173,7 @@ def list_steps_in_folder(folder: str | Path) -> list[Item]:
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise InputError(
-            f"{folder} is not a folder; a sequence is a folder of problem files, one for each step"
-        )
+        raise InputError(f"{folder} is not a folder; a folder of problem files is needed, one for each step")
     paths, name = _list_problem_files(folder), folder.resolve().name
     if len(paths) < 2:
         n = f"{len(paths)} problem files ({', '.join(SUFFIXES)})"
@@ -196,8 +192,7 @@ def list_steps_in_folder(folder: str | Path) -> list[Item]:
     elif len(series) > 1:
         reason = f"files are named {series[0]}N and {series[1]}N"
     if reason:
-        advice = "move each recording into a separate folder"
-        raise InputError(f"{folder} holds steps of more than one recording ({reason}): {advice}")
+        raise InputError(f"{folder} holds steps of more than one recording: {reason}")
     n_worlds = len({line.get("world", 0) for line in lines.values()})
     groups: dict[str, list[Item]] = {}
     for path in paths:
@@ -274,11 +269,10 @@ def _holds_recorded_steps(folder: Path) -> bool:
         return False
     try:
         first, second = (_make_item_of_file(path).problem.key for path in paths[:2])
-        return (
-            first is not None and second is not None and bool(np.isin(second, first).any() or not second.size)
-        )
     except Exception:  # The error is reported when the case is run.
         return False
+    has_keys = first is not None and second is not None
+    return has_keys and bool(np.isin(second, first).any() or not second.size)
 
 
 def _list_recorded_steps(folder: Path, items: list[Item]) -> list[Item]:
@@ -342,9 +336,7 @@ def _make_item_of_file(path: Path) -> Item:
                 f"{path} holds the state before a recorded step; its problem is {path.parent.parent / path.name}"
             )
         if not path.exists() and (reason := _read_unrecorded_steps(path.parent).get(path)):
-            raise InputError(
-                f"{path} was not written, as its step was not recorded ({reason}): choose another"
-            )
+            raise InputError(f"{path} was not written, as its step was not recorded ({reason})")
         return io.load(path)
 
     return Item(path.stem, str(path), load, load_stored=partial(io.load_solution, path))

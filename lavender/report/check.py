@@ -89,23 +89,12 @@ class CrossCheckRow:
 
 @dataclass(frozen=True, repr=False)
 class CrossCheck:
-    """Result of `cross_check`; iterates over its rows, and `str()` gives a plain-text table.
-
-    Parameters
-    ----------
-    problem : Problem
-    tol : float
-    reference : str or None
-        Name of the solver of the reference; None without one.
-    reference_note : str
-        Quality of the reference, or the reason why there is none.
-    rows : tuple of CrossCheckRow
-    """
+    """Result of `cross_check`; iterates over its rows, and `str()` gives a plain-text table."""
 
     problem: Problem
     tol: float
-    reference: str | None
-    reference_note: str
+    reference: str | None  # Name of the solver of the reference; None without one.
+    reference_note: str  # Quality of the reference, or the reason why there is none.
     rows: tuple[CrossCheckRow, ...]
 
     def __iter__(self) -> Iterator[CrossCheckRow]:
@@ -297,9 +286,8 @@ def solve_reference(
         # A reference may use 100 times the solver's default number of iterations.
         budget = 100 * spec.max_iter if spec.resumable else None
         try:
-            solution = raise_if_interrupted(
-                run_solver(name, tol=0.1 * REFERENCE_MAX_RESIDUAL, max_iter=budget)
-            )
+            solution = run_solver(name, tol=0.1 * REFERENCE_MAX_RESIDUAL, max_iter=budget)
+            raise_if_interrupted(solution)
         except Exception as error:
             if spec.builtin and not isinstance(error, LavenderError):
                 raise
@@ -320,9 +308,8 @@ def compare_with_reference(
 ) -> CrossCheckRow:
     """Compare one solver's solution with the optimum and build its row."""
     case = make_case(problem)
-    note = "; ".join(
-        filter(None, (solution.solver.form and f"{solution.solver.form} form", solution.message))
-    )
+    form = solution.solver.form and f"{solution.solver.form} form"
+    note = "; ".join(filter(None, (form, solution.message)))
     judged = case.judge(solution)
     fields: dict[str, Any] = {name: judged[name] for name in ("relative", "roundoff_floor", "velocity")} | {
         "status": solution.status.name, "time": solution.setup_time + solution.solve_time, "solution": solution,

@@ -56,10 +56,8 @@ def run_self_test() -> dict[str, str]:
     gallery = [name for name, build in SCENES.items() if build.__module__ == "lavender.sim.scene.gallery"]
     positions = [simulate_positions(name, 5) for name in sorted(gallery) if name != "pile"]
     results["gallery, 5 steps"] = np.concatenate(positions)
-    return {
-        name: hashlib.sha256(np.ascontiguousarray(x).tobytes()).hexdigest()[:16]
-        for name, x in results.items()
-    }
+    hashes = {name: hashlib.sha256(np.ascontiguousarray(x).tobytes()) for name, x in results.items()}
+    return {name: digest.hexdigest()[:16] for name, digest in hashes.items()}
 
 
 def collect_installation_facts() -> dict[str, Any]:
@@ -69,10 +67,8 @@ def collect_installation_facts() -> dict[str, Any]:
     """
     start_time = perf_counter()
     backends = {name: reason for name, reason in known().items() if specs()[name].external}
-    parts = {
-        n: "same" if h == HASHES.get(n) else f"{HASHES.get(n)} expected, {h} found"
-        for n, h in run_self_test().items()
-    }
+    hashes = {n: (HASHES.get(n), h) for n, h in run_self_test().items()}
+    parts = {n: "same" if x == h else f"{x} expected, {h} found" for n, (x, h) in hashes.items()}
     installed = {
         name: ", ".join(f"{p} {v}" for p, v in get_versions(get(name).requires, base=()).items())
         for name, reason in backends.items() if not reason

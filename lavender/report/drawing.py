@@ -39,10 +39,8 @@ STYLE: Any = {
 FILE_KINDS = ("pdf", "svg", "png")
 MARKERS = "osD^vP"
 MAX_LABEL_LENGTH = 28  # [characters] Longer labels are cut.
-ERROR_COLORS = (
-    *((0.5, 0.5, 0.5, 0.09), (0.12, 0.47, 0.75, 0.28), (0.12, 0.47, 0.75, 0.58), (0.12, 0.47, 0.75, 1.0)),
-    *((0.91, 0.47, 0.16, 1.0), (0.66, 0.22, 0.0, 1.0)),
-)
+ERROR_COLORS = ((0.5, 0.5, 0.5, 0.09), (0.12, 0.47, 0.75, 0.28), (0.12, 0.47, 0.75, 0.58), (0.12, 0.47, 0.75, 1.0),
+                (0.91, 0.47, 0.16, 1.0), (0.66, 0.22, 0.0, 1.0))  # fmt: skip
 
 
 class FigureFolder(NamedTuple):
@@ -64,9 +62,8 @@ class Label(NamedTuple):
 def fit_margins(texts: Sequence[str], offset: float = 0.03, left_margin: float = 0.13) -> dict[str, float]:
     """Return margins of a figure of `WIDTH` with the longest of some labels at the right of its axes."""
     longest = min(max(map(len, texts), default=0), MAX_LABEL_LENGTH)
-    width = max(
-        0.0165 * longest, 0.025 + 0.0155 * longest
-    )  # Bold letters widen short labels relatively more.
+    # Bold letters widen short labels relatively more.
+    width = max(0.0165 * longest, 0.025 + 0.0155 * longest)
     return {"left": left_margin, "right": 1.0 - offset - width, "top": 0.95, "bottom": 0.15}
 
 
@@ -122,9 +119,8 @@ def draw_figure(
 
 def _adapt_svg(svg: str, name: str, description: str) -> str:
     """Make an SVG part of a page: its theme and fonts, two decimals, no metadata, and ids that no other figure has."""
-    svg = re.sub(
-        r"<metadata>.*?</metadata>|<!--.*?-->|\n\s*(?=<)", "", svg[svg.index("<svg") :], flags=re.DOTALL
-    )
+    unused = r"<metadata>.*?</metadata>|<!--.*?-->|\n\s*(?=<)"
+    svg = re.sub(unused, "", svg[svg.index("<svg") :], flags=re.DOTALL)
     for color, variable in THEME.items():
         svg = svg.replace(color, variable)
     ids = {old: f"{name}-{i}" for i, old in enumerate(dict.fromkeys(re.findall(r'(?<= id=")[^"]+', svg)))}
@@ -133,9 +129,8 @@ def _adapt_svg(svg: str, name: str, description: str) -> str:
     def adapt_tag(match: re.Match[str]) -> str:
         """Round the numbers of a tag and replace its ids and font."""
         tag = re.sub(r"(\d\.\d\d)\d+", r"\1", match[0])
-        tag = re.sub(
-            r"font: ([\d.]+)px '?DejaVu Sans'?[^;\"]*", r"font: \1px system-ui,'DejaVu Sans',sans-serif", tag
-        )
+        font = r"font: \1px system-ui,'DejaVu Sans',sans-serif"
+        tag = re.sub(r"font: ([\d.]+)px '?DejaVu Sans'?[^;\"]*", font, tag)
         tag = re.sub(r' id="([^"]+)"', lambda m: f' id="{ids[m[1]]}"' if m[1] in used else "", tag)
         return re.sub(r'(url\(#|href="#)([^)"]+)', lambda m: m[1] + ids.get(m[2], m[2]), tag)
 
@@ -212,8 +207,6 @@ def draw_error_strip(
     axes.spines[["left", "bottom"]].set_visible(False)
     names = [f"≤ {format_speed(x)}" for x in edges] + ["more"]
     for i, (color, name) in enumerate(zip(ERROR_COLORS, names, strict=True)):
-        y = 0.96 - 0.135 * i
-        axes.plot(
-            [1.03], [y], "s", ms=7, transform=axes.transAxes, mfc=color, mec=QUIET, mew=0.4, clip_on=False
-        )
+        y, style = 0.96 - 0.135 * i, {"ms": 7, "mfc": color, "mec": QUIET, "mew": 0.4}
+        axes.plot([1.03], [y], "s", transform=axes.transAxes, clip_on=False, **style)
         write_label(axes, 1.06, y, name, fontsize=8.2, color=QUIET)

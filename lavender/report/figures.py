@@ -13,10 +13,8 @@ from lavender.report.tables import ENGINE_NAME, Contents, format_size, is_plug_i
 from lavender.report.text import format_count, format_power, format_residual, format_speed, format_time
 
 MAX_LINES = 6  # Largest number of solvers in a figure, without `ALWAYS_DRAWN`, plug-ins and the engine.
-ALWAYS_DRAWN = (
-    "pgs",
-    "osqp",
-)  # Most engines sweep as pgs does, and osqp is the most used solver of other packages.
+# Most engines sweep as pgs does, and osqp is the most used solver of other packages.
+ALWAYS_DRAWN = ("pgs", "osqp")
 FIGURE_SIZE = (4.9, 3.3)  # [inches]
 
 
@@ -49,13 +47,11 @@ def draw_time_to_accuracy(report: Contents, names: Sequence[str], folder: drawin
         axes.yaxis.set_minor_formatter(lambda t, _: format_time(t) if f"{t:e}"[0] in "25" else "")
         axes.grid(True, axis="y")
         drawing.label_ends(axes, labels)
-        return "Mean time. " + "; ".join(
-            f"{name}: "
-            + ", ".join(
-                f"{format_time(t)} to {format_power(x)}" for t, x in zip(own, tolerances, strict=True)
-            )
-            for name, own in times.items()
-        )
+        texts = []
+        for name, own in times.items():
+            parts = (f"{format_time(t)} to {format_power(x)}" for t, x in zip(own, tolerances, strict=True))
+            texts.append(f"{name}: {', '.join(parts)}")
+        return f"Mean time. {'; '.join(texts)}"
 
     n, limit = len(report.subject), format_time(report.time_limit)
     note = f"Mean time over {format_count(n, 'problem')}, unsolved ones at {limit} (tables/solvers.csv)."
@@ -137,30 +133,28 @@ def draw_error_against_time(
         axes.set_xscale("log")
         axes.set_xlim(points[:, 0].min() / 1.3, points[:, 0].max() * 1.3)
         drawing.mark_errors(axes, low, float(points[:, 1].max()), limit)
-        drawing.write_label(
-            axes, 1.02, 0.035, f"below {format_power(low)}", fontsize=8.2, color=drawing.QUIET
-        )
+        small = {"fontsize": 8.2, "color": drawing.QUIET}
+        drawing.write_label(axes, 1.02, 0.035, f"below {format_power(low)}", **small)
         place = axes.transAxes.inverted().transform(axes.transData.transform((1.0, 1.35 * limit)))[1]
         text = f"to reach: {format_power(limit)}" if is_program else f"limit {format_speed(limit)}"
         drawing.write_label(axes, 0.015, place, text, color=drawing.ORANGE, va="bottom", fontsize=8.2)
         for i, (name, own) in enumerate(lines.items()):
-            style = drawing.style_line(i) | (
-                {"marker": "*", "markersize": 12, "color": drawing.INK} if name == ENGINE_NAME else {}
-            )
+            style = drawing.style_line(i)
+            if name == ENGINE_NAME:
+                style |= {"marker": "*", "markersize": 12, "color": drawing.INK}
             axes.plot(own[:, 0], np.where(own[:, 1] < low, low / 2.0, own[:, 1]), **style)
         axes.xaxis.set_major_formatter(lambda t, _: format_time(t))
         axes.minorticks_off()
         axes.set_xlabel("time of a call")
         axes.set_ylabel("error of the program" if is_program else "largest velocity error [m/s]")
         axes.grid(True, axis="x")
-        drawing.write_label(axes, 1.04, 1.0, "time of the last run", fontsize=8.2, color=drawing.QUIET)
+        drawing.write_label(axes, 1.04, 1.0, "time of the last run", **small)
         order = sorted(lines, key=lambda name: lines[name][-1, 0])
         for k, name in enumerate(order):
             style, y = drawing.style_line(list(lines).index(name)), 0.93 - 0.07 * k
             mark = "*" if name == ENGINE_NAME else style["marker"]
-            axes.plot(
-                [1.06], [y], mark, ms=4.5, color=style["color"], transform=axes.transAxes, clip_on=False
-            )
+            place = {"transform": axes.transAxes, "clip_on": False}
+            axes.plot([1.06], [y], mark, ms=4.5, color=style["color"], **place)
             weight = "bold" if name == next(iter(lines)) else "normal"
             text = f"{name} {format_time(lines[name][-1, 0])}"
             drawing.write_label(axes, 1.1, y, text, color=style["color"], weight=weight)

@@ -56,6 +56,22 @@ HOW_TO_READ = (
 )
 
 
+#: Tables of runs: name, title, function that makes it, and the meaning of its numbers.
+RUN_SECTIONS: tuple[tuple[str, str, Callable[[Contents], pd.DataFrame], str], ...] = (
+    ("solvers", "Solvers", tables.tabulate_solvers, "Ranked to the middle tolerance."),
+    ("structures", "By structure and size", tables.tabulate_structures,
+     ("The solver that solves the largest number of problems to each tolerance, then the fastest, with its mean time. "
+      "In a time: the smallest residual at the 90th percentile. Solvers after ≈ tie.")),
+    ("costs", "Time against rows", tables.tabulate_costs,
+     "Time to the middle tolerance as a power of the number of rows."),
+    ("sequences", "Sequences", tables.tabulate_sequences,
+     "All steps, cold and with the impulses of the step before (carried)."),
+    ("sweeps", "Sweeps", tables.tabulate_sweeps,
+     "Largest errors over the steps after the first, after a fixed number of sweeps."),
+    ("runs", "Every time and residual", tables.tabulate_runs, ""),
+)  # fmt: skip
+
+
 class Section(NamedTuple):
     """A table of a report with its title and the meaning of its numbers."""
 
@@ -107,12 +123,10 @@ class Report(Contents):
                 f"{format_residual(best['relative'])}, by {best['solver']}."
             )
         row, n = self.ranking.loc[self.first], len(self.subject)
-        solved = (
-            f"all {named}" if row["solved"] == n > 1 else named if n == 1 else f"{row['solved']} of {named}"
-        )
-        text = (
-            f"{'Stopped early; so far, use' if self.is_stopped else 'Use'} {self.first}: it solves {solved}"
-        )
+        some = f"all {named}" if row["solved"] == n else f"{row['solved']} of {named}"
+        solved = named if n == 1 else some
+        use = "Stopped early; so far, use" if self.is_stopped else "Use"
+        text = f"{use} {self.first}: it solves {solved}"
         if self.is_campaign:
             return f"{text} {target} (no times were measured)."
         time = format_time(row["mean"])
@@ -172,13 +186,11 @@ class Report(Contents):
         missed = missed[missed > 0]
         limit = "" if self.is_campaign else f" in {format_time(self.time_limit)}"
         if not len(missed):
-            return (
-                f"Every solver solves each problem that it accepts{limit}." if len(self.ranking) > 1 else ""
-            )
-        own = self.ranking.loc[self.first]
+            several = len(self.ranking) > 1
+            return f"Every solver solves each problem that it accepts{limit}." if several else ""
         text = ", ".join(f"{n} by {name}" for name, n in missed.head(6).items())
         text += f" and {len(missed) - 6} more solvers" if len(missed) > 6 else ""
-        if own["solved"] < len(self.subject):
+        if self.ranking.loc[self.first, "solved"] < len(self.subject):
             unsolved = self.get_times(self.tolerance)[self.subject].loc[self.first]
             text += f". {self.first} misses {_join(unsolved.index[unsolved.isna()])}"
         return f"Not solved{limit}: {text}."
@@ -234,16 +246,14 @@ class Report(Contents):
     def alarms(self) -> list[str]:
         """Sentences on contradicted claims and on solvers that died."""
         failures = tables.select_failures(self) if len(self.frame) else self.frame
-        failures = failures.astype(
-            dict.fromkeys(("solver", "case", "status", "message", "status_conflict"), str)
-        )
+        texts = ("solver", "case", "status", "message", "status_conflict")
+        failures = failures.astype(dict.fromkeys(texts, str))
         false = failures[failures["status_conflict"] != ""]
         # Each solver that died is named once, plug-ins first. A backend that was killed at its time limit is not named.
         died = failures[failures["status"].str.startswith(tables.DEATHS)].drop_duplicates("solver")
         own = died["solver"].map(is_plug_in).astype(bool)
-        died = died[own | (died["status"] != "KILLED")].sort_values(
-            "solver", key=lambda s: ~s.map(is_plug_in)
-        )
+        died = died[own | (died["status"] != "KILLED")]
+        died = died.sort_values("solver", key=lambda solvers: ~solvers.map(is_plug_in))
         crashed = [f"{r.solver} on {r.case}: {r.status}: {r.message}" for r in died.itertuples()]
         false_claims = [
             f"{r.solver} on {r.case}: {r.status_conflict.partition('; observed')[0]}"
@@ -255,28 +265,33 @@ class Report(Contents):
     def warnings(self) -> list[str]:
         """Sentences on a busy machine, missing times, cases that are left out, and possible mistakes in data."""
         shows_times = self.busy and not self.is_campaign and not self.is_sweep_study
+        left_out = [f"{r.case}: {r.reason}" for r in self.skips[self.skips["solver"] == ""].itertuples()]
+        # A sentence for each solver with impulses that add energy beyond the work of the targets.
+        gains = self.frame[self.frame["energy_gain"] > 0.0]
+        worst = gains.loc[gains.groupby("solver", observed=True)["energy_gain"].idxmax()]
+        counts = gains["solver"].value_counts()
+        energy_gains = [
+            f"{r.solver} in {format_count(counts[r.solver], 'run')}, at most {r.energy_gain:.2g} J ({r.case})"
+            for r in worst.sort_values("energy_gain", ascending=False).itertuples()
+        ]
         return [
             *([f"{self.busy} The times are invalid; measure again with --no-reuse."] if shows_times else []),
             *(["Error and robustness without times: runs end by iterations."] if self.is_campaign else []),
-            *_limit(
-                "left out",
-                [f"{r.case}: {r.reason}" for r in self.skips[self.skips["solver"] == ""].itertuples()],
-            ),
-            *_limit("gains energy", list_energy_gains(self)),
+            *_limit("left out", left_out),
+            *_limit("gains energy", energy_gains),
             *_limit("suspicious", [f"{case}: {reason}" for case, reason in list_diagnostics(self)]),
         ]
 
     @property
     def is_sweep_study(self) -> bool:
         """Whether the report has only fixed numbers of sweeps, on steps in sequence."""
-        return bool(
-            len(self.frame) and (self.frame["mode"] == "budget").all() and len(tables.tabulate_sweeps(self))
-        )
+        has_budgets_only = len(self.frame) and (self.frame["mode"] == "budget").all()
+        return bool(has_budgets_only and len(tables.tabulate_sweeps(self)))
 
     @cached_property
     def sweeps(self) -> SweepStudy:
         """The sentences and blocks of a study of sweeps."""
-        return SweepStudy(self, self.error_limit)
+        return SweepStudy(self)
 
     @cached_property
     def sections(self) -> dict[str, Section]:
@@ -287,28 +302,9 @@ class Report(Contents):
             title = f"Against {escape_unprintable(str(self.earlier.attrs.get('source', 'earlier runs')))}"
             note = f"{changes.attrs['compared']} times compared, on problems with the same numbers in both."
             sections["changes"] = Section(title, changes, note)
-        if len(self.frame):
-            sections |= {
-                "solvers": Section("Solvers", tables.tabulate_solvers(self), "Ranked to the middle tolerance."),
-                "structures": Section("By structure and size", tables.tabulate_structures(self), (
-                    "The solver that solves the largest number of problems to each tolerance, then the fastest, with "
-                    "its mean time. In a time: the smallest residual at the 90th percentile. Solvers after ≈ tie."
-                )),
-                "costs": Section("Time against rows", tables.tabulate_costs(self), (
-                    "Time to the middle tolerance as a power of the number of rows."
-                )),
-                "sequences": Section("Sequences", tables.tabulate_sequences(self), (
-                    "All steps, cold and with the impulses of the step before (carried)."
-                )),
-                "sweeps": Section("Sweeps", tables.tabulate_sweeps(self), (
-                    "Largest errors over the steps after the first, after a fixed number of sweeps."
-                )),
-            }  # fmt: skip
-            if self.is_campaign:
-                sections = {
-                    name: some for name, some in sections.items() if name not in ("structures", "costs")
-                }
-            sections["runs"] = Section("Every time and residual", tables.tabulate_runs(self))
+        for name, title, tabulate, note in RUN_SECTIONS if len(self.frame) else ():
+            if not (self.is_campaign and name in ("structures", "costs")):
+                sections[name] = Section(title, tabulate(self), note)
         skips = self.skips.groupby("reason", sort=False).agg(
             solvers=("solver", lambda x: _join(dict.fromkeys(s for s in x if s), 99)),
             cases=("case", lambda x: _join(dict.fromkeys(x), 4)),
@@ -340,9 +336,8 @@ class Report(Contents):
             hidden = ("form", "floor [-]", "iterations", "worst row")
             few = [c for c in runs if c not in hidden and not c.endswith("median [s]")]
             sections = sections | {"runs": sections["runs"]._replace(frame=runs[few])}
-        folded = [
-            fold_table(*sections[name], is_grouped=name == "runs") for name in order if name in sections
-        ]
+        shown = [name for name in order if name in sections]
+        folded = [fold_table(*sections[name], is_grouped=name == "runs") for name in shown]
         machine = fold_table("Machine, versions, settings", self.describe_run())
         notes = {"folded": [{"note": HOW_TO_READ}], "title": "How to read this page", "open": False}
         return Page(
@@ -374,20 +369,15 @@ class Report(Contents):
             if len(self.subject) > MAX_CASES and not self.is_campaign:
                 single = self.cases.loc[self.subject].sort_values(["law", "rows"]).head(MAX_MATRIX_ROWS)
                 every = [(LAW_TITLES.get(law, law), case, [case]) for case, law in single["law"].items()]
-                blocks.append(
-                    {"folded": [self._make_matrix(every)], "title": "Every problem × solver", "open": False}
-                )
+                matrix = [self._make_matrix(every)]
+                blocks.append({"folded": matrix, "title": "Every problem × solver", "open": False})
         return blocks
 
     def _make_league(self) -> dict[str, Any]:
         """Make the table of the first ten solvers, all plug-ins and the engine."""
         ranking, rows = self.ranking, list[Any]()
-        shown = [
-            i
-            for i, name in enumerate(ranking.index)
-            if i < MAX_SOLVERS or name == ENGINE_NAME or is_plug_in(name)
-        ]
-        shown = ranking.iloc[shown]
+        always = [name == ENGINE_NAME or is_plug_in(name) for name in ranking.index]
+        shown = ranking[(np.arange(len(ranking)) < MAX_SOLVERS) | np.array(always, bool)]
         n = int(ranking["cases"].iloc[0]) if len(ranking) else 0
         means = shown["mean"].clip(lower=1e-9)
         low, high = np.log10(means.min()) - 0.03, np.log10(means.max()) + 0.03
@@ -404,11 +394,8 @@ class Report(Contents):
                 place = 100.0 * (np.log10(max(row["mean"], 1e-9)) - low) / (high - low)
                 dot = Markup(f'<span class="dot"><i style="left:{place:.1f}%"></i></span>')
                 cells += [(format_time(row["mean"]), css, ""), (f"{ratio:.1f}", css, ""), (dot, "bar", "")]
-            cells += (
-                [(f"{row['false']} ✗" if row["false"] else "0", "bad" * bool(row["false"]), "")]
-                if has_false
-                else []
-            )
+            if has_false:
+                cells.append((f"{row['false']} ✗" if row["false"] else "0", "bad" * bool(row["false"]), ""))
             rows.append([*cells, (", ".join(notes), "text q wide" + " bad" * bool(missed), "")])
         heads: list[Any] = ["solver", "solved"]
         heads += [] if self.is_campaign else [f"{'mean ' * (n > 1)}time", "× best", ("", "bar", "")]
@@ -458,24 +445,18 @@ class Report(Contents):
                 rows.append({"group": title, "span": len(order) + 2})
                 group = title
             cases = list(cases)
-            fastest = (
-                format_time(best[cases].mean()) if best[cases].notna().any() and not self.is_campaign else "–"
-            )
+            has_time = best[cases].notna().any() and not self.is_campaign
+            fastest = format_time(best[cases].mean()) if has_time else "–"
             facts = self.cases.loc[cases[0]]
-            cells: list[Any] = [
-                (label, "", f"{label}, {tables.format_size(facts)}, {facts['structure']}"),
-                (fastest, "b", ""),
-            ]
+            about = f"{label}, {tables.format_size(facts)}, {facts['structure']}"
+            cells: list[Any] = [(label, "", about), (fastest, "b", "")]
             for solver in order:
                 is_accepted = accepted.loc[solver, cases]
                 if not is_accepted.any():
                     cells.append(("·", "cn", ""))
                     continue
-                own, missed = (
-                    ratios.loc[solver, cases],
-                    int((is_accepted & times.loc[solver, cases].isna()).sum()),
-                )
-                ratio = own.median()
+                missed = int((is_accepted & times.loc[solver, cases].isna()).sum())
+                ratio = ratios.loc[solver, cases].median()
                 if missed:
                     run = best_runs.loc[(solver, cases[0])] if (solver, cases[0]) in best_runs.index else None
                     why = f"{solver}: {missed} of {len(cases)} not solved"
@@ -488,20 +469,16 @@ class Report(Contents):
                     text = "1" if ratio < 1.05 else f"{ratio:.1f}" if ratio < 9.95 else f"{ratio:.0f}"
                     text = "✓" if self.is_campaign else text if ratio < 999.5 else ">999"
                     mean = "" if self.is_campaign else format_time(times.loc[solver, cases].mean())
-                    cells.append(
-                        (text, f"c{np.searchsorted(RATIO_EDGES, ratio)}", f"{solver} {mean}".strip())
-                    )
+                    color = f"c{np.searchsorted(RATIO_EDGES, ratio)}"
+                    cells.append((text, color, f"{solver} {mean}".strip()))
             rows.append(cells)
         solved = times.notna().sum(axis=1)
         foot = ["solved", ("", "b", ""), *(str(solved[name]) for name in order)]
         limit = "" if self.is_campaign else f" in {format_time(self.time_limit)}"
         key = [("1", "c0"), ("to 2", "c1"), ("to 5", "c2"), ("to 20", "c3"), ("slower", "c4"), ("✗", "cx"),
                (f"not solved{limit}; · not accepted", ""), ("Columns: best first.", "wide")]  # fmt: skip
-        heads = [
-            "",
-            ("fastest", "b", ""),
-            *((Markup("<span>{}</span>").format(name), "", "") for name in order),
-        ]
+        names = ((Markup("<span>{}</span>").format(name), "", "") for name in order)
+        heads = ["", ("fastest", "b", ""), *names]
         return make_table(
             rows, heads, foot=foot, key=key, classes="matrix ratios",
             title="Time on each problem, as a multiple of the fastest solver",
@@ -581,7 +558,10 @@ def write(
     if "solvers" in report.sections and len(report.ranked_runs):
         files["tables/matrix.csv"] = lambda: tables.tabulate_matrix(report)
         files["tables/solvers.tex"] = lambda: make_latex_table(report)
-        files["tables/lavender.bib"] = make_bibtex_entry(report)
+        files["tables/lavender.bib"] = (  # The entry of BibTeX that cites the version which made the report.
+            f"@software{{lavender, author = {{{{{AUTHOR}}}}}, title = {{{{{TITLE}}}}}, "
+            f"version = {{{report.machine['lavender']}}}, year = {{{report.machine['started'][:4]}}}}}\n"
+        )
     files["summary.md"] = lambda: summarise(report)
     drawn = FigureFolder(folder / "figures", report.figure_kinds)
     files["index.html"] = lambda: report.make_page(drawn, figures).render()
@@ -602,9 +582,8 @@ def make_latex_table(report: Report) -> str:
     }  # fmt: skip
     if times:
         known |= {"ratio": table[middle] / table[middle].min(), "slowest": 1e3 * table["slowest [s]"]}
-    columns = [x if x in PAPER_COLUMNS else format_tol(float(x)) for x in report.columns] or [
-        "solved",
-        *times,
+    columns = [
+        x if x in PAPER_COLUMNS else format_tol(float(x)) for x in report.columns or ("solved", *times)
     ]
     check_columns(columns, list(known))
     heads = {"false": "false claims", "ratio": r"$\times$ best", "slowest": "slowest [ms]"} | {
@@ -629,15 +608,6 @@ def make_latex_table(report: Report) -> str:
                           caption=caption)  # fmt: skip
 
 
-def make_bibtex_entry(report: Report) -> str:
-    """Return the entry of BibTeX that cites the version which made the report."""
-    run = report.machine
-    return (
-        f"@software{{lavender, author = {{{{{AUTHOR}}}}}, title = {{{{{TITLE}}}}}, version = {{{run['lavender']}}}, "
-        f"year = {{{run['started'][:4]}}}}}\n"
-    )
-
-
 def _escape_latex(text: str) -> str:
     """Escape the characters that LaTeX reads as commands."""
     return re.sub(r"([&%$#_{}])", r"\\\1", text.replace("\\", "/")).replace("~", "-").replace("^", "-")
@@ -660,10 +630,8 @@ def summarise(report: Report) -> str:
 
 def print_report(report: Report, console: Console, complete: bool = False) -> None:
     """Print the sentences, the first solvers or the sweeps, and warnings; `complete` prints every table."""
-    page = Page(
-        "", "", report.verdict, report.sentences, report.code, alarms=report.alarms, warnings=report.warnings
-    )
-    page.print_head(console)
+    head = report.verdict, report.sentences, report.code
+    Page("", "", *head, alarms=report.alarms, warnings=report.warnings).print_head(console)
     short = ["changes", "sweeps" if report.is_sweep_study else "solvers"]
     for name, section in report.sections.items():
         if not complete and name not in short:
@@ -696,15 +664,6 @@ def _limit(kind: str, texts: Sequence[str], most: int = 1) -> Iterator[str]:
     for i, text in enumerate(texts[:most], 1):
         place = f" ({i} of {len(texts)})" if most > 1 else f", the first of {len(texts)}"
         yield f"{kind}{place * (len(texts) > 1)}: {text}"
-
-
-def list_energy_gains(report: Report) -> list[str]:
-    """Return a sentence for each solver with impulses that add energy beyond the work of the targets."""
-    gains = report.frame[report.frame["energy_gain"] > 0.0]
-    worst = gains.loc[gains.groupby("solver", observed=True)["energy_gain"].idxmax()]
-    counts = gains["solver"].value_counts()
-    return [f"{r.solver} in {format_count(counts[r.solver], 'run')}, at most {r.energy_gain:.2g} J ({r.case})"
-            for r in worst.sort_values("energy_gain", ascending=False).itertuples()]  # fmt: skip
 
 
 def list_diagnostics(report: Report) -> list[tuple[str, str]]:

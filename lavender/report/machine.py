@@ -123,13 +123,26 @@ def describe_build() -> dict[str, str]:
     """Describe the build: commit of a checkout, hashes of kernels and solvers, compiler, flags, BLAS."""
     package = Path(__file__).resolve().parents[1]
     library = Path(str(serial.__file__))
-    found = {"commit": commit} if (commit := get_commit(package.parent)) else {}
+    found = {}
+    if (package.parent / ".git").exists():
+        # The commit of a checkout, marked if files differ from it.
+        command = ["git", "--no-optional-locks", "-C", str(package.parent), "describe", "--always", "--dirty"]
+        with contextlib.suppress(OSError, subprocess.SubprocessError):
+            described = subprocess.run(
+                [*command, "--abbrev=12", "--exclude=*"], capture_output=True, encoding="utf-8", errors="replace",
+                timeout=10, check=True,
+            )  # fmt: skip
+            found["commit"] = described.stdout.strip()
     kernels = hashlib.sha256()
     for path in sorted(library.parents[1].rglob(f"*{library.suffix}")):
         kernels.update(path.read_bytes())
     found["kernels"] = kernels.hexdigest()[:12]
     found["solvers"] = hash_solver_sources()
-    found |= read_compiler_versions(library.read_bytes())
+    content = library.read_bytes()  # A compiled module names its compiler and Cython's version.
+    if compiler := re.search(rb"GCC: \([^)\x00]*\) [\d.]+|clang version [\d.]+|MSVC [\d.]+", content):
+        found["compiler"] = compiler[0].decode()
+    if cython := re.search(rb"_cython_(\d+)_(\d+)_(\d+)", content):
+        found["cython"] = ".".join(part.decode() for part in cython.groups())
     flags = sysconfig.get_config_var("CFLAGS")
     found |= {"python_flags": " ".join(str(flags).split())} if flags else {}
     require_packages("the description of the machine", "threadpoolctl")
@@ -150,29 +163,3 @@ def hash_solver_sources() -> str:
             if found is not None and found.origin is not None:
                 sources.update(name.encode() + Path(found.origin).read_bytes())
     return sources.hexdigest()[:12]
-
-
-def get_commit(root: Path) -> str:
-    """Return the commit of a checkout, marked if files differ from it; empty if it is not a checkout."""
-    if not (root / ".git").exists():
-        return ""
-    with contextlib.suppress(OSError, subprocess.SubprocessError):
-        described = subprocess.run(
-            ["git", "--no-optional-locks", "-C", str(root),
-             "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"],
-            capture_output=True, encoding="utf-8", errors="replace", timeout=10, check=True,
-        )  # fmt: skip
-        return described.stdout.strip()
-    return ""
-
-
-def read_compiler_versions(library: bytes) -> dict[str, str]:
-    """Return the compiler and the Cython version that a compiled module names, if it names them."""
-    found = {}
-    compiler = re.search(rb"GCC: \([^)\x00]*\) [\d.]+|clang version [\d.]+|MSVC [\d.]+", library)
-    if compiler:
-        found["compiler"] = compiler[0].decode()
-    cython = re.search(rb"_cython_(\d+)_(\d+)_(\d+)", library)
-    if cython:
-        found["cython"] = ".".join(part.decode() for part in cython.groups())
-    return found

@@ -16,29 +16,23 @@ Every text but `Markup` is escaped.
 
 from __future__ import annotations
 
-import functools
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from lavender.base.errors import InputError, require_packages
+from lavender.base.lazy_import import markupsafe
 from lavender.base.lazy_import import pandas as pd
 from lavender.report.render import format_cells, list_number_heads
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-DEFAULT_ERROR_LIMIT = (
-    1e-3  # [m/s, rad/s on angular rows] Pages compare with this velocity error if none is given.
-)
-PAPER_COLUMNS = (
-    "solved",
-    "ratio",
-    "slowest",
-    "accepted",
-    "false",
-)  # Of the LaTeX table, which may have tolerances, too.
+# [m/s, rad/s on angular rows] Pages compare with this velocity error if none is given.
+DEFAULT_ERROR_LIMIT = 1e-3
+# Columns of the LaTeX table, which may have tolerances, too.
+PAPER_COLUMNS = ("solved", "ratio", "slowest", "accepted", "false")
 MAX_ROWS = 500  # Largest number of rows of a table on a page; files have all rows.
 
 
@@ -61,7 +55,14 @@ class Page:
 
     def render(self) -> str:
         """Return the page as HTML."""
-        return str(_get_template().render(page=self))
+        require_packages("a page of results", "jinja2")
+        import jinja2
+
+        environment = jinja2.Environment(
+            loader=jinja2.PackageLoader("lavender.report"), autoescape=True, undefined=jinja2.StrictUndefined,
+            trim_blocks=True, lstrip_blocks=True,
+        )  # fmt: skip
+        return environment.get_template("page.html.j2").render(page=self)
 
     def print_head(self, console: Console) -> None:
         """Print the verdict, the sentences, the lines to copy and the warnings."""
@@ -92,6 +93,23 @@ def make_table(
             "classes": classes, "foot": foot}  # fmt: skip
 
 
+def make_shares(
+    parts: Sequence[tuple[str, str, float, Sequence[str], str]], alt: str = "", **more: Any
+) -> list[dict[str, Any]]:
+    """Make the blocks of a table of parts and a stacked bar of their shares.
+
+    `parts` are (name, colour, share of 1, cells, classes); `alt` begins the description of the bar.
+    """
+    swatch = markupsafe.Markup('<span class="swatch" style="background:{}"></span> {}')
+    rows = [
+        [(text, css, "") for text in (swatch.format(color, name), *cells)]
+        for name, color, _, cells, css in parts
+    ]
+    bar = [(f"{100.0 * share:.2f}", color) for _, color, share, _, _ in parts if share]
+    alt += ", ".join(f"{name} {cells[-1]}" for name, _, _, cells, _ in parts)
+    return [make_table(rows, classes="full", **more), {"bar": bar, "alt": alt}]
+
+
 def tabulate_frame(frame: pd.DataFrame, is_grouped: bool = False, **more: Any) -> dict[str, Any]:
     """Make the block of a table with the first `MAX_ROWS` rows of a frame, as `format_cells` writes them.
 
@@ -119,16 +137,3 @@ def fold_table(
     more = f" The first {MAX_ROWS} of {len(frame)} rows; the file has all." if len(frame) > MAX_ROWS else ""
     table = tabulate_frame(frame, is_grouped, note=f"{note}{more}".strip())
     return {"folded": [table], "title": title, "open": is_open}
-
-
-@functools.cache
-def _get_template() -> Any:
-    """Compile the template, once."""
-    require_packages("a page of results", "jinja2")
-    import jinja2
-
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("lavender.report"), autoescape=True, undefined=jinja2.StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    return environment.get_template("page.html.j2")

@@ -37,7 +37,6 @@ from lavender.report.store import (
     describe_target,
     get_key,
     make_lines,
-    open_store,
 )
 from lavender.report.timing import (
     CampaignPlan,
@@ -164,7 +163,9 @@ def run(
     this = machine.describe_run({**asdict(plan), "solvers": names}, packages)
     backend, cluster = connect_backend(backend) if spread else ("", contextlib.nullcontext())
     # The limit of threads covers the description of cases, which uses BLAS.
-    with cluster, open_store(store) as kept, limit_to_one_thread():
+    opened: contextlib.AbstractContextManager[Store | None]
+    opened = contextlib.nullcontext(store) if store is None or isinstance(store, Store) else Store(store)
+    with cluster, opened as kept, limit_to_one_thread():
         runner = Runner(this, plan, names, kept, watch, reuse)
         runner.out = runner.out if into is None else into
         runner.measure_items(items, workers, backend)
@@ -206,8 +207,7 @@ class Runner:
     def report_progress(self, case: str, solver: str, row: Row | None = None, reused: bool = False) -> None:
         """Call `watch` with the number of pairs that are done."""
         if self.watch is not None:
-            event = Event(done=self.done, total=self.total, case=case, solver=solver, row=row, reused=reused)
-            self.watch(replace(event, phase="measuring"))
+            self.watch(Event(self.done, self.total, case, solver, row, reused, phase="measuring"))
 
     def measure_items(self, items: list[Item], workers: int = 1, backend: str = "") -> None:
         """Measure every case and sequence; by the workers of a joblib backend if one is named."""
@@ -324,13 +324,10 @@ class Runner:
             for item, task in zip(problems[:made], tasks, strict=False):
                 before = self.measure_step(item, task, spec, before)[1]
         while made < len(tasks) and spent <= limit:
-            is_quick = (
-                row and row["times"] and max(row["times"]) < UNGUARDED_TIME_RATIO * self.plan.time_limit
-            )
-            how = {"repeats": repeats, "is_guarded": not is_quick}
-            row, before = self.measure_step(
-                problems[made], tasks[made], spec, before, made % stride == 0, **how
-            )
+            longest = max(row["times"], default=math.inf) if row else math.inf
+            how = {"repeats": repeats, "is_guarded": longest >= UNGUARDED_TIME_RATIO * self.plan.time_limit}
+            item, task = problems[made], tasks[made]
+            row, before = self.measure_step(item, task, spec, before, made % stride == 0, **how)
             self.add_row(row)
             self.report_progress(row["case"], spec.name, row)
             spent, made = spent + _get_elapsed_time(row), made + 1

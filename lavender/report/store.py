@@ -28,9 +28,7 @@ from lavender.report.text import format_tolerance
 
 Row: TypeAlias = dict[str, Any]  # Content of one line.
 KINDS = ("machine", "case", "run", "skip")
-ERROR = (
-    "ERROR"  # A run whose solver raised an exception has this status; other runs have a status of `Status`.
-)
+ERROR = "ERROR"  # Status of a run whose solver raised an exception; other runs have a status of `Status`.
 #: Columns that are equal in two lines about the same measurement; the later line counts.
 KEY = ("run", "case", "sha", "solver", "start", "mode", "tol", "max_iter", "time_limit")
 #: Columns of runs with their defaults, which are the values of a run without an answer and determine the types.
@@ -114,10 +112,7 @@ class Store:
         InputError
             The disk is full; earlier rows are stored.
         """
-        plain = (str, int, bool)
-        line = json.dumps(
-            {k: v if type(v) in plain else to_jsonable(v) for k, v in row.items()}, allow_nan=False
-        )
+        line = json.dumps(to_jsonable(row), allow_nan=False)
         try:
             self.file.write(line + "\n")
             self.file.flush()
@@ -127,21 +122,12 @@ class Store:
                 "again; it continues after the last record"
             ) from None
 
-    def close(self) -> None:
-        """Close the file. Errors of the disk are ignored here: `add` has raised them."""
-        with contextlib.suppress(OSError):
-            self.file.close()
-
     def __enter__(self) -> Store:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
-
-
-def open_store(store: Store | str | Path | None) -> contextlib.AbstractContextManager[Store | None]:
-    """Return a context manager of a store, which opens the store of a path and closes it at the end."""
-    return contextlib.nullcontext(store) if store is None or isinstance(store, Store) else Store(store)
+        with contextlib.suppress(OSError):  # `add` has raised errors of the disk.
+            self.file.close()
 
 
 def make_lines(rows: Iterable[Row], source: str = "", dropped: int = 0) -> pd.DataFrame:
@@ -254,9 +240,8 @@ def select_skips(lines: pd.DataFrame) -> pd.DataFrame:
 
     `sequence` is the sequence of a step that did not load.
     """
-    skips = convert_columns(lines, "skip", SKIP_COLUMNS).drop_duplicates(
-        ["run", "case", "solver"], keep="last"
-    )
+    skips = convert_columns(lines, "skip", SKIP_COLUMNS)
+    skips = skips.drop_duplicates(["run", "case", "solver"], keep="last")
     loaded = convert_columns(lines, "case", {"run": "", "case": ""})
     last = dict(zip(zip(loaded["run"], loaded["case"], strict=True), loaded.index, strict=True))
     is_open = [bool(r.solver) or last.get((r.run, r.case), -1) < r.Index for r in skips.itertuples()]

@@ -15,23 +15,15 @@ from lavender.report.text import format_count, format_percent, format_speed, for
 
 EQUAL_RATIO = 1.1  # Solvers are one line if their errors differ by less at every number of sweeps.
 MAX_SWEEP_COLUMNS = 400  # Columns of the strip of steps; a column of more steps has their largest error.
-SWEEPS_SHOWN_RATIO = (
-    1e-4  # Errors below this fraction of the limit lie in the strip at the bottom of the figure.
-)
+# Errors below this fraction of the limit lie in the strip at the bottom of the figure.
+SWEEPS_SHOWN_RATIO = 1e-4
 
 
 class SweepStudy:
-    """Errors of fixed numbers of sweeps on the steps of sequences, without the first step of each.
+    """Errors of fixed numbers of sweeps on the steps of sequences, without the first step of each."""
 
-    Parameters
-    ----------
-    report : Contents
-    limit : float, m/s
-        Velocity error up to which a number of sweeps is enough; in rad/s on angular rows.
-    """
-
-    def __init__(self, report: Contents, limit: float) -> None:
-        self.report, self.limit = report, limit
+    def __init__(self, report: Contents) -> None:
+        self.report, self.limit = report, report.error_limit
         runs = report.frame
         runs = runs[(runs["mode"] == "budget") & (runs["step"] > 0)]
         self.runs = runs.astype(dict.fromkeys(("solver", "start", "case", "sequence"), str))
@@ -53,11 +45,8 @@ class SweepStudy:
             else:
                 same.append(solver)
         enough = [g for g in self.groups if self._find_smallest(g[0])]
-        best = min(
-            [g for g in enough if g[0] in plain] or enough,
-            key=lambda g: self._find_smallest(g[0]) or 0,
-            default=self.groups[0],
-        )
+        preferred = [g for g in enough if g[0] in plain] or enough or self.groups
+        best = min(preferred, key=lambda g: self._find_smallest(g[0]) or 0)
         self.groups.remove(best)
         self.groups.insert(0, best)
         self.first = best[0]
@@ -67,9 +56,8 @@ class SweepStudy:
     def _are_equal(self, one: str, two: str) -> bool:
         """Return whether two solvers have equal errors for each number of sweeps."""
         a, b = (self.errors.loc[name].clip(lower=1e-12) for name in (one, two))
-        return bool(
-            (a.isna() == b.isna()).all() and (np.abs(np.log(a / b)).fillna(0.0) < np.log(EQUAL_RATIO)).all()
-        )
+        is_near = np.abs(np.log(a / b)).fillna(0.0) < np.log(EQUAL_RATIO)
+        return bool((a.isna() == b.isna()).all() and is_near.all())
 
     def _find_smallest(self, solver: str, errors: pd.DataFrame | None = None) -> int | None:
         """Return the smallest number of sweeps from which on all errors are within the limit; None without one."""
@@ -135,9 +123,8 @@ class SweepStudy:
         texts = [f"{name} needs {n}" if n else f"{name} more than {self.budgets[-1]}" for name, n in needs]
         best, cold = self._find_smallest(self.first), self._find_smallest(self.first, self.cold)
         if self.start == "carried":
-            other = (
-                f"{self.first} needs {cold}" if cold else f"{self.budgets[-1]} of {self.first} are not enough"
-            )
+            few = f"{self.budgets[-1]} of {self.first} are not enough"
+            other = f"{self.first} needs {cold}" if cold else few
             same = "From cold starts the number is the same" if cold == best else f"From cold starts {other}"
             return [*lines, " ".join(f"{text}." for text in ("; ".join(texts), same) if text)]
         return [*lines, f"{'; '.join(texts)}."] if texts else lines
@@ -157,9 +144,7 @@ class SweepStudy:
         def fill(axes: Any) -> str:
             axes.set_xscale("log", base=2)
             axes.set_xlim(0.85 * self.budgets[0], 1.08 * self.budgets[-1])
-            high = max(
-                float(self.errors.max(axis=None)), float(self.cold.max(axis=None)) if len(self.cold) else 0.0
-            )
+            high = max(float(x.max(axis=None)) for x in (self.errors, self.cold) if len(x))
             labels = drawing.mark_errors(axes, low, high, self.limit)
 
             def place(errors: pd.Series[float]) -> Any:
@@ -170,15 +155,11 @@ class SweepStudy:
                 dash = {"lw": 1.4 if i else 2.4, "ls": "-" if i < 5 else "--", "ms": 4.5, "clip_on": False}
                 axes.plot(self.budgets, place(own), color=colors[i], marker=drawing.MARKERS[i % 6], **dash)
                 if (last := own.last_valid_index()) is not None:
-                    labels.append(
-                        drawing.Label(
-                            float(place(own)[last]), group[0] + equal, colors[i], "normal" if i else "bold"
-                        )
-                    )
+                    y, weight = float(place(own)[last]), "normal" if i else "bold"
+                    labels.append(drawing.Label(y, group[0] + equal, colors[i], weight))
             if self.start == "carried" and self.first in self.cold.index:
-                axes.plot(
-                    self.budgets, place(self.cold.loc[self.first]), color=drawing.BLUE, lw=0.9, ls=(0, (3, 2))
-                )
+                cold = place(self.cold.loc[self.first])
+                axes.plot(self.budgets, cold, color=drawing.BLUE, lw=0.9, ls=(0, (3, 2)))
             best = self._find_smallest(self.first)
             if best is not None:
                 drop = [low / 4.0, place(self.errors.loc[self.first])[best]]
@@ -187,17 +168,8 @@ class SweepStudy:
             if len(iterations):
                 x, y = float(iterations.max()), max(float(self.answers["velocity"].max()), low / 2.0)
                 x = min(max(x, self.budgets[0]), self.budgets[-1])
-                axes.plot(
-                    [x],
-                    [y],
-                    "*",
-                    ms=13,
-                    color=drawing.INK,
-                    mec=drawing.PAPER,
-                    mew=0.8,
-                    zorder=9,
-                    clip_on=False,
-                )
+                star = {"ms": 13, "color": drawing.INK, "mec": drawing.PAPER, "mew": 0.8, "zorder": 9}
+                axes.plot([x], [y], "*", clip_on=False, **star)
                 axes.annotate(
                     f"your engine\n{iterations.max():.0f} iterations: {format_speed(y)}", (x, y), xytext=(12, 16),
                     textcoords="offset points", fontsize=8.6, fontweight="bold", va="bottom",
@@ -217,9 +189,8 @@ class SweepStudy:
             )
 
         notes = ["Warm starts; dashed: cold starts of the first solver."] if self.start == "carried" else []
-        notes += [
-            f"{' and '.join(g[1:])} equal{'s' * (len(g) == 2)} {g[0]}." for g in self.groups if len(g) > 1
-        ]
+        several = [g for g in self.groups if len(g) > 1]
+        notes += [f"{' and '.join(g[1:])} equal{'s' * (len(g) == 2)} {g[0]}." for g in several]
         margins = {"left": 0.135, "right": 0.72, "top": 0.96, "bottom": 0.14}
         note = " ".join([*notes, "(tables/sweeps.csv)"])
         return drawing.draw_figure("sweeps", fill, (4.9, 3.5), margins, note=note, folder=folder)
@@ -246,9 +217,8 @@ class SweepStudy:
             axes.set_xticks(shown, list(map(str, steps[shown])))
             axes.set_xlabel("recorded step")
             axes.set_ylabel("sweeps")
-            return "Steps above the limit: " + ", ".join(
-                f"{name}: {int((own > self.limit).sum())} of {len(cases)}" for name, own in table.iterrows()
-            )
+            counts = (table > self.limit).sum(axis=1)
+            return f"Steps above the limit: {', '.join(f'{name}: {n} of {len(cases)}' for name, n in counts.items())}"
 
         margins = {"left": 0.21, "right": 0.76, "top": 0.97, "bottom": 0.55 / height}
         note = f"Which steps need them: error of each step with {self.first}" + (

@@ -61,19 +61,11 @@ LEFT_OUT = "left out"  # The verdict on a step that could not be recorded.
 ENGINE_SWEEPS = ("sequential_impulses", "pgs")  # Methods of most engines, listed before other plain sweeps.
 MAX_TIES = 3  # A cell names up to this many solvers.
 PREFERRED_SOLVER = "auto"  # Listed first among equally good solvers, as its users need not choose a method.
-STRUCTURE_ORDER = (
-    *("separate", "chain", "mesh", "stack", "pile", "dense"),
-    *("redundant", "friction", "large mass ratio", "asymmetric"),
-)
+STRUCTURE_ORDER = ("separate", "chain", "mesh", "stack", "pile", "dense", "redundant", "friction", "large mass ratio",
+                   "asymmetric")  # fmt: skip
 
 
 # -- ranking -----------------------------------------------------------------------------------------------
-
-
-def select_ranked_runs(frame: Frame) -> Frame:
-    """Return the runs that rankings count: to a tolerance, if there are any."""
-    mode = "tol" if (frame["mode"] == "tol").any() else "budget"
-    return select_starts(frame[frame["mode"] == mode])
 
 
 def select_starts(runs: Frame) -> Frame:
@@ -144,20 +136,15 @@ def rank_solvers(report: Contents, tolerance: float, cases: Iterable[str] | None
     })  # fmt: skip
     ranking = ranking.assign(liar=ranking["false"] > 0)
     ranking = ranking.sort_values(["liar", "solved", "mean"], ascending=[True, False, True], kind="stable")
-    records = ranking.to_dict("records")
-    tie = np.array([is_tie(records[0], x) and x["liar"] <= records[0]["liar"] for x in records], bool)
+    # Results tie with the first if they solve as many cases, in mean times that differ within noise.
+    first = ranking.head(1).squeeze()
+    noise = 1.0 + np.maximum(ranking["noise"], first["noise"])
+    is_near = ranking["mean"].between(first["mean"] / noise, first["mean"] * noise)
+    is_equal = (ranking["solved"] == first["solved"]) & (ranking["liar"] <= first["liar"])
+    tie = (is_near & is_equal & (ranking["solved"] > 0)).to_numpy()
     ranking = ranking.assign(tie=tie, place=np.where(tie, 1, np.arange(1, len(tie) + 1))).drop(columns="liar")
-    order = sorted(
-        range(len(tie)), key=lambda i: (not tie[i], tie[i] and ranking.index[i] != PREFERRED_SOLVER)
-    )
-    return ranking.iloc[order]
-
-
-def is_tie(first: Any, other: Any) -> bool:
-    """Return whether two ranked results solve the same number of cases, in mean times that differ within noise."""
-    noise = 1.0 + max(first["noise"], other["noise"])
-    is_near = first["mean"] / noise <= other["mean"] <= first["mean"] * noise
-    return bool(is_near and first["solved"] == other["solved"] > 0)
+    is_first = ranking["tie"] & (ranking.index == PREFERRED_SOLVER)
+    return ranking.iloc[np.argsort(np.where(is_first, 0, np.where(tie, 1, 2)), kind="stable")]
 
 
 def is_plug_in(solver: str) -> bool:
@@ -242,33 +229,20 @@ def read_own_answers(report: Contents) -> Frame:
 
 @dataclass(frozen=True, eq=False)
 class Contents:
-    """Lines of a records file, earlier lines, and requested budgets, with the frames of the runs that count.
+    """Lines of a records file, earlier lines, and requested budgets, with the frames of the runs that count."""
 
-    Parameters
-    ----------
-    lines : DataFrame
-        The result of `lavender.report.run` or `read`. Times are compared within the newest run alone.
-    earlier : DataFrame, optional
-        Lines of an earlier run to compare with.
-    times : s, optional
-        Time budgets for which a solver is recommended; default: three decades about the fastest times.
-    engines : DataFrame
-        Answers of the engines that recorded the steps: `lavender.report.tables.read_engine_answers`.
-    error_limit : float, m/s
-        Velocity error with which sentences and figures compare; in rad/s on angular rows.
-    figure_kinds : sequence of str
-        Formats of the files of figures: pdf, svg, png.
-    columns : sequence of str
-        Columns of the table for a paper: solved, tolerances such as 1e-6, ratio, slowest, accepted, false; default:
-        solved and all tolerances.
-    """
-
+    # The result of `lavender.report.run` or `read`. Times are compared within the newest run alone.
     lines: Frame
-    earlier: Frame | None = None
+    earlier: Frame | None = None  # Lines of an earlier run to compare with.
+    # [s] Time budgets for which a solver is recommended; default: three decades about the fastest times.
     times: Sequence[float] = ()
+    # Answers of the engines that recorded the steps (`read_engine_answers`).
     engines: Frame = field(default_factory=_make_answers)
+    # [m/s, rad/s on angular rows] Velocity error with which sentences and figures compare.
     error_limit: float = DEFAULT_ERROR_LIMIT
-    figure_kinds: Sequence[str] = FILE_KINDS
+    figure_kinds: Sequence[str] = FILE_KINDS  # Formats of the files of figures.
+    # Columns of the table for a paper: solved, tolerances such as 1e-6, ratio, slowest, accepted, false; default:
+    # solved and all tolerances.
     columns: Sequence[str] = ()
     _times: dict[float, Frame] = field(default_factory=dict, init=False)  # Results of `get_times`.
 
@@ -329,9 +303,8 @@ class Contents:
         for name, solver in zip(skips["case"], skips["solver"], strict=True):
             for case in [name] if name in self.cases.index else self.cases.index[sequences == name]:
                 done.setdefault(str(case), set()).add(solver)
-        return frame[
-            ~is_running & frame["case"].isin([case for case, some in done.items() if some >= solvers])
-        ]
+        complete = [case for case, some in done.items() if some >= solvers]
+        return frame[~is_running & frame["case"].isin(complete)]
 
     @cached_property
     def frame(self) -> pd.DataFrame:
@@ -348,7 +321,8 @@ class Contents:
     @cached_property
     def ranked_runs(self) -> Frame:
         """The runs of `frame` that rankings count, and the engine's own answers if it gave all of them in a time."""
-        runs = select_ranked_runs(self.frame)
+        mode = "tol" if (self.frame["mode"] == "tol").any() else "budget"
+        runs = select_starts(self.frame[self.frame["mode"] == mode])
         cases = runs.drop_duplicates("case")
         answers = self.engines.reindex([str(Path(s)) for s in self.cases.loc[cases["case"], "source"]])
         if self.is_campaign or not len(cases) or not (answers["seconds"] >= 0.0).all():
@@ -361,9 +335,8 @@ class Contents:
             relative=answers["relative"].to_numpy(), velocity=answers["velocity"].to_numpy(),
             worst_name=answers["worst"].to_numpy(),
         )  # fmt: skip
-        return pd.concat(
-            [runs.astype({name: object for name in runs if runs[name].dtype == "category"}), own]
-        )
+        categories = [name for name in runs if runs[name].dtype == "category"]
+        return pd.concat([runs.astype(dict.fromkeys(categories, object)), own])
 
     @cached_property
     def has_runs(self) -> Frame:
@@ -378,9 +351,7 @@ class Contents:
         accepted = self.has_runs.copy()
         for name in set(sequences) - {""}:
             some = sequences == name
-            accepted.loc[:, some] = np.repeat(
-                accepted.loc[:, some].any(axis=1).to_numpy()[:, None], some.sum(), 1
-            )
+            accepted.loc[:, some] = accepted.loc[:, some].any(axis=1).to_numpy()[:, None]
         return accepted
 
     @cached_property
@@ -468,9 +439,8 @@ def order_solvers(report: Contents) -> list[str]:
 def tabulate_matrix(report: Contents) -> Frame:
     """Tabulate the time [s] of each solver (columns, in their ranking) on each case to the middle tolerance."""
     times = report.get_times(report.tolerance)
-    facts = report.cases.loc[times.columns, ["case", "law", "rows", "variables", "structure"]].reset_index(
-        drop=True
-    )
+    facts = report.cases.loc[times.columns, ["case", "law", "rows", "variables", "structure"]]
+    facts = facts.reset_index(drop=True)
     facts = facts if facts["variables"].any() else facts.drop(columns="variables")
     return facts.join(times.loc[order_solvers(report)].T.add_suffix(" [s]").reset_index(drop=True))
 

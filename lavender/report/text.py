@@ -42,15 +42,12 @@ def format_times_in_one_unit(values: Sequence[float]) -> tuple[str, list[str]]:
     known = [t for t in values if math.isfinite(t) and t > 0.0]
     middle = math.exp(sum(map(math.log, known)) / len(known)) if known else 1.0
     scale, unit = next((u for u in TIME_UNITS if middle >= 0.9995 * u[0]), TIME_UNITS[-1])
-    return unit, [format_significant_digits(t / scale) if math.isfinite(t) else NONE for t in values]
-
-
-def format_significant_digits(x: float, digits: int = 3) -> str:
-    """Return a number with `digits` significant digits and without an exponent: 0.0652, 16.0, 1020."""
-    if x == 0.0:
-        return "0"
-    rounded = float(f"{x:.{digits - 1}e}")
-    return f"{rounded:.{max(0, digits - 1 - math.floor(math.log10(abs(rounded))))}f}"
+    texts = []
+    for t in values:
+        rounded = float(f"{t / scale:.2e}")  # Written without an exponent: 0.0652, 16.0, 1020.
+        decimals = max(0, 2 - math.floor(math.log10(abs(rounded)))) if math.isfinite(t) and rounded else 0
+        texts.append(f"{rounded:.{decimals}f}" if math.isfinite(t) else NONE)
+    return unit, texts
 
 
 def format_tolerance(tolerance: float) -> str:

@@ -97,9 +97,8 @@ def _import_solver_code(solver: str, call: str) -> None:
     if call == "solve":
         tiny = (Problem.lcp if "lcp" in spec.laws else Problem.linear)(np.eye(1), np.ones(1))
     else:
-        import_numerical_modules(
-            "scipy.sparse.linalg", "scipy.optimize"
-        )  # The adapter of programs uses them.
+        # The adapter of programs uses these modules.
+        import_numerical_modules("scipy.sparse.linalg", "scipy.optimize")
         tiny = Problem.from_qp(np.eye(1), np.ones(1), lb=np.zeros(1))
         if spec.delegates:
             for backend in program_backends():
@@ -241,48 +240,32 @@ def make_row(problem: Problem, task: Row, s: Solution) -> Row:
 class Plan:
     """Parameters of the runs of each solver on each case.
 
-    Parameters
-    ----------
-    tolerances : sequence of float
-        Relative residuals to reach, each by a solve with this `tol`.
-    budgets : sequence of int
-        Exact iteration counts (`tol=0`), for solvers that can stop after any iteration.
-    repeats : int
-        Number of solves of each kind, of which minimum and median are recorded. A solve of more than 50 ms is not
-        repeated, and steps of sequences of more than twenty steps are solved once.
-    time_limit : float, s
-        Limit of one solve.
-    sequence_time_limit : float, s
-        Limit of one solver over all steps of a sequence at one budget or tolerance. The remaining steps are not
-        solved, and a note is recorded.
-    warm : bool
-        Also start from the problem's guess, unless it is an answer.
-    campaign : bool
-        Measure no times; see `CampaignPlan`.
-    cap : int
-        Largest number of iterations of a run to a tolerance.
-
     Raises
     ------
     InputError
         A tolerance, budget, count or limit is not positive.
     """
 
+    # Relative residuals to reach, each by a solve with this `tol`.
     tolerances: Sequence[float] = (1e-3, 1e-6, 1e-9)
+    # Exact iteration counts (`tol=0`), for solvers that can stop after any iteration.
     budgets: Sequence[int] = (4, 8, 16, 32, 64)
+    # Number of solves of each kind, of which minimum and median are recorded. A solve of more than 50 ms is not
+    # repeated, and steps of sequences of more than twenty steps are solved once.
     repeats: int = 3
-    time_limit: float = 1.0
+    time_limit: float = 1.0  # [s] Limit of one solve.
+    # [s] Limit of one solver over all steps of a sequence at one budget or tolerance. The remaining steps are not
+    # solved, and a note is recorded.
     sequence_time_limit: float = DEFAULT_SEQUENCE_TIME_LIMIT
-    warm: bool = True
-    campaign: bool = False
-    cap: int = UNLIMITED_ITERATIONS
+    warm: bool = True  # Whether to start also from the problem's guess, unless it is an answer.
+    campaign: bool = False  # Whether no times are measured; see `CampaignPlan`.
+    cap: int = UNLIMITED_ITERATIONS  # Largest number of iterations of a run to a tolerance.
 
     def __post_init__(self) -> None:
-        given = {
-            name: check_sequence(name, getattr(self, name), "numbers") for name in ("tolerances", "budgets")
-        }
-        tolerances = [check_float("tolerance", value, above=0.0) for value in given["tolerances"]]
-        budgets = [check_int("budget", n, 1) for n in given["budgets"]]
+        tolerances = [
+            check_float("tolerance", x, above=0.0) for x in check_sequence("tolerances", self.tolerances, "numbers")
+        ]  # fmt: skip
+        budgets = [check_int("budget", n, 1) for n in check_sequence("budgets", self.budgets, "numbers")]
         if not tolerances and not budgets:
             raise InputError("without tolerances and budgets there is nothing to run: give one of the two")
         # Remove duplicates: a value given twice would be run twice and change the middle value.

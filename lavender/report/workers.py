@@ -85,14 +85,11 @@ def connect_backend(spec: str) -> tuple[str, contextlib.AbstractContextManager[A
     address = address or dask.config.get("scheduler-address", "")
     try:
         if address:
-            client = distributed.Client(address, timeout=CONNECT_TIMEOUT)  # type: ignore[no-untyped-call]
-            return name, client
+            return name, distributed.Client(address, timeout=CONNECT_TIMEOUT)  # type: ignore[no-untyped-call]
         distributed.get_client()
     except (OSError, ValueError) as error:
-        advice = "use dask=tcp://HOST:8786, set DASK_SCHEDULER_ADDRESS, or make a distributed.Client first"
-        raise InputError(
-            f"no dask scheduler answers at {address!r} ({error}); start one there"
-            if address
-            else f"backend 'dask' needs a scheduler: {advice}"
-        ) from None
+        if address:
+            raise InputError(f"no dask scheduler answers at {address!r} ({error})") from None
+        need = "dask=tcp://HOST:8786, DASK_SCHEDULER_ADDRESS, or a distributed.Client that was made first"
+        raise InputError(f"backend 'dask' needs a scheduler: {need}") from None
     return name, contextlib.nullcontext()  # The current client is used.

@@ -7,18 +7,17 @@ of every stretch by itself, warm-started from its own answers. Measured are
     error   [m/s] of the engine's answer to the problem of each step, computed by the judge
     motion  [m] largest distance of a body, at the end of a stretch, from its position in a run with converged solves
 
-A setting with another cone, impratio or number of
-noslip iterations than the model defines another constraint problem: its error is measured on that problem, its motion
-shows how far it deviates, and it is not recommended.
+A setting with another cone, impratio or number of noslip iterations than the model defines another constraint problem:
+its error is measured on that problem, its motion shows how far it deviates, and it is not recommended.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from time import perf_counter
-from types import MappingProxyType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,31 +37,29 @@ MAX_TIME_RATIO = 1.25
 # The errors of every fourth stretch come first: they exclude most settings that are not accurate enough.
 MIN_JUDGED_PARTS = 4
 ERROR_QUANTILE = 0.99  # Settings are compared by this quantile of the error over all steps.
-NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
 class Field(NamedTuple):
-    """An attribute of `<option>`, the values that are tried, its meaning, and the attributes tried together with it."""
+    """An attribute of `<option>`, the values that are tried, and the attributes tried together with it."""
 
     name: str
     values: tuple[Any, ...]
-    meaning: str
-    fixed: Mapping[str, Any] = NOTHING
+    fixed: dict[str, Any]
 
 
 NEWTON, CG, PGS = ({"solver": name} for name in ("Newton", "CG", "PGS"))
 TOLERANCES = (1e-3, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15)
 #: Options of MuJoCo, attributes of `<option>`. The last three change the constraint problem itself.
 MUJOCO = (
-    Field("tolerance", TOLERANCES, "improvement below which Newton's method stops", NEWTON),
-    Field("iterations", (1, 2, 3, 5, 10), "budget of Newton's method", NEWTON),
-    Field("tolerance", TOLERANCES, "improvement below which conjugate gradients stop", CG),
-    Field("iterations", (3, 6, 12, 25, 50), "budget of conjugate gradients", CG),
-    Field("tolerance", TOLERANCES, "improvement below which projected Gauss-Seidel stops", PGS),
-    Field("iterations", (3, 6, 12, 25, 50, 100), "budget of projected Gauss-Seidel", PGS),
-    Field("cone", ("pyramidal", "elliptic"), "shape of the friction cone"),
-    Field("impratio", (1.0, 10.0), "stiffness of friction over that of normal contact"),
-    Field("noslip_iterations", (0, 3, 10), "sweeps of friction after the solve"),
+    Field("tolerance", TOLERANCES, NEWTON),
+    Field("iterations", (1, 2, 3, 5, 10), NEWTON),
+    Field("tolerance", TOLERANCES, CG),
+    Field("iterations", (3, 6, 12, 25, 50), CG),
+    Field("tolerance", TOLERANCES, PGS),
+    Field("iterations", (3, 6, 12, 25, 50, 100), PGS),
+    Field("cone", ("pyramidal", "elliptic"), {}),
+    Field("impratio", (1.0, 10.0), {}),
+    Field("noslip_iterations", (0, 3, 10), {}),
 )
 CONVERGED_OPTIONS = {"solver": "Newton", "iterations": 300, "tolerance": 0.0, "ls_iterations": 100,
                      "ls_tolerance": 1e-4}  # fmt: skip

@@ -66,12 +66,8 @@ class Tuning:
         The errors are the median and the maximum, so that a better worst step cannot hide that usual steps are worse.
         """
         now, threshold = self.present_result, self.threshold
-        pairs = (
-            (m.error.max(), now.error.max()),
-            (float(np.median(m.error)), float(np.median(now.error))),
-            (m.worst_motion, now.worst_motion),
-        )
-        return all(x <= max(own, threshold) for x, own in pairs)
+        numbers = [(x.error.max(), np.median(x.error), x.worst_motion) for x in (m, now)]
+        return all(x <= max(own, threshold) for x, own in zip(*numbers, strict=True))
 
     @property
     def faster(self) -> Measured | None:
@@ -314,13 +310,11 @@ class Tuning:
                 note = "Settings that change the problem: the error is that of its own problem."
                 parts.append(("Other problems", self._tabulate_settings(other), note))
             if self.sizes is not None:
-                parts.append(
-                    ("Rows and contacts of a step", self.sizes.table, "With the model's own setting.")
-                )
+                own = "With the model's own setting."
+                parts.append(("Rows and contacts of a step", self.sizes.table, own))
             blocks += [fold_table(*part) for part in parts]
-        source = (
-            f"lavender tune · {Path(self.model).name} · {format_count(len(self._same_problem), 'setting')}"
-        )
+        n_settings = format_count(len(self._same_problem), "setting")
+        source = f"lavender tune · {Path(self.model).name} · {n_settings}"
         is_bad = worst > self.shown_limit
         footer = ["Files: numbers.json, figures/ as PDF, SVG and PNG."]
         code = [m.setting.option_line] if m is not None and m.setting.option_line else []
@@ -339,9 +333,9 @@ class Tuning:
             "is_limit_met": None if self.error_limit is None else self.within_limit is not None,
             **({} if self.sizes is None else self.sizes.as_dict), "stopped": self.stopped,
             "measured": list(map(_to_dict, self.measured)), "held": list(map(_to_dict, self.held)),
+            "provenance": self.provenance,
         }  # fmt: skip
         last = format_provenance(self.provenance) if self.provenance else ""
-        numbers |= {"provenance": self.provenance}
         return ResultPage(self.make_page, numbers, [self.choices], self.stopped, last)
 
 
