@@ -3,7 +3,8 @@
     python docs/pictures.py [report] [audit]
 
 Each picture is the first screen of a page that the command has just written, in Chromium without a window (playwright,
-the extra `dev`). A page that shows a warning, such as that of a busy machine, is refused: the earlier picture stays.
+the extra `dev`). A page with a warning that is not `ACCEPTED`, such as that of a busy machine, is refused: the earlier
+picture stays.
 `audit` needs the models of gymnasium (extra `robots`).
 """
 
@@ -26,6 +27,9 @@ PICTURES = {
     "report": (["report"], (1180, 1000)),
     "audit": (["audit", "MODEL", "--worlds", "64", "--steps", "200"], (1100, 778)),
 }
+#: Beginnings of warnings that a picture may show. After 4 iterations, far from a solution, the impulses of admm add up
+#: to 12 J on three cases of the default suite; the first report of every reader says so, too.
+ACCEPTED = ("gains energy: admm in 3 runs",)
 MODEL = "humanoidstandup.xml"
 COLORS = 64
 
@@ -35,8 +39,8 @@ def show(page: Path, size: tuple[int, int]) -> bytes:
     width, height = size
     with browse(viewport={"width": width, "height": height}, color_scheme="light") as tab:
         tab.goto(page.as_uri())
-        warnings = tab.locator("p.warn").all_inner_texts()
-        if warnings:
+        shown = tab.locator("p.warn").all_inner_texts()
+        if warnings := [text for text in shown if not text.startswith(ACCEPTED)]:
             sys.exit(f"{page}: the page shows a warning, no picture: {warnings[0]}")
         return tab.screenshot()
 

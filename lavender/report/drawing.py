@@ -200,13 +200,16 @@ def draw_error_strip(
     axes: Any, errors: FloatArray, close: float, limit: float, extent: Sequence[float]
 ) -> None:
     """Draw errors (lines, steps) [m/s] as colours, blue up to the limit and orange above it; NaN is empty."""
-    edges = [close, limit / 100.0, limit / 10.0, limit, 10.0 * limit]
-    colors = np.array(ERROR_COLORS)[np.searchsorted(edges, np.nan_to_num(errors))]
+    levels = [(close, ERROR_COLORS[0])] if close < limit else []
+    others = zip((limit / 100.0, limit / 10.0, limit, 10.0 * limit), ERROR_COLORS[1:], strict=False)
+    levels += [(edge, color) for edge, color in others if edge > close or edge >= limit]
+    edges, palette = [edge for edge, _ in levels], [*(color for _, color in levels), ERROR_COLORS[-1]]
+    colors = np.array(palette)[np.searchsorted(edges, np.nan_to_num(errors))]
     colors[np.isnan(errors)] = 0.0
     axes.imshow(colors, aspect="auto", interpolation="none", extent=extent)
     axes.spines[["left", "bottom"]].set_visible(False)
     names = [f"≤ {format_speed(x)}" for x in edges] + ["more"]
-    for i, (color, name) in enumerate(zip(ERROR_COLORS, names, strict=True)):
+    for i, (color, name) in enumerate(zip(palette, names, strict=True)):
         y, style = 0.96 - 0.135 * i, {"ms": 7, "mfc": color, "mec": QUIET, "mew": 0.4}
         axes.plot([1.03], [y], "s", transform=axes.transAxes, clip_on=False, **style)
         write_label(axes, 1.06, y, name, fontsize=8.2, color=QUIET)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from lavender.report import drawing
 from lavender.report.page import make_table
@@ -151,12 +151,12 @@ class SweepStudy:
                 return errors.where(errors.isna() | (errors >= low), low / 2.0)
 
             for i, group in enumerate(self.groups):
-                own, equal = self.errors.loc[group[0]], f" (+{len(group) - 1} equal)" * (len(group) > 1)
+                own = self.errors.loc[group[0]]
                 dash = {"lw": 1.4 if i else 2.4, "ls": "-" if i < 5 else "--", "ms": 4.5, "clip_on": False}
                 axes.plot(self.budgets, place(own), color=colors[i], marker=drawing.MARKERS[i % 6], **dash)
                 if (last := own.last_valid_index()) is not None:
                     y, weight = float(place(own)[last]), "normal" if i else "bold"
-                    labels.append(drawing.Label(y, group[0] + equal, colors[i], weight))
+                    labels.append(drawing.Label(y, group[0], colors[i], weight))
             if self.start == "carried" and self.first in self.cold.index:
                 cold = place(self.cold.loc[self.first])
                 axes.plot(self.budgets, cold, color=drawing.BLUE, lw=0.9, ls=(0, (3, 2)))
@@ -191,7 +191,8 @@ class SweepStudy:
         notes = ["Warm starts; dashed: cold starts of the first solver."] if self.start == "carried" else []
         several = [g for g in self.groups if len(g) > 1]
         notes += [f"{' and '.join(g[1:])} equal{'s' * (len(g) == 2)} {g[0]}." for g in several]
-        margins = {"left": 0.135, "right": 0.72, "top": 0.96, "bottom": 0.14}
+        names = [f"limit {format_speed(self.limit)}", *(g[0] for g in self.groups)]
+        margins = drawing.fit_margins(names, left_margin=0.135)
         note = " ".join([*notes, "(tables/sweeps.csv)"])
         return drawing.draw_figure("sweeps", fill, (4.9, 3.5), margins, note=note, folder=folder)
 
@@ -244,7 +245,8 @@ class SweepStudy:
             cells += [(write(float(motion[budget])), "", "")] if has_motion else []
             cells += [(format_time(times[budget]), "q wide", "")] if is_idle else []
             rows.append([str(budget), *cells])
-        heads: list[Any] = ["sweeps", *(g[0] for g in self.groups)]
+        # Long names break at underscores only.
+        heads: list[Any] = ["sweeps", *(escape(g[0]).replace("_", Markup("_<wbr>")) for g in self.groups)]
         heads += ["motion¹"] if has_motion else []
         heads += [("time²", "wide", "")] if is_idle else []
         notes = f"¹ largest error of a body's velocity with {self.first}. " if has_motion else ""

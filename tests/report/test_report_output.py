@@ -18,7 +18,7 @@ from tests.report.synthetic import EVIL, FALSE_CLAIM, example, record, report_of
 class Reader(html.parser.HTMLParser):
     """Elements of a page that do not close, the files that it loads, ids, links, and alternative texts."""
 
-    VOID = frozenset({"meta", "br", "hr", "img", "input", "link", "path", "use", "rect"})
+    VOID = frozenset({"meta", "br", "hr", "img", "input", "link", "path", "use", "rect", "wbr"})
 
     def __init__(self, text):
         super().__init__()
@@ -177,3 +177,17 @@ def test_page_of_forty_problems_and_twenty_solvers_has_at_most_150_kb(tmp_path):
     ]  # fmt: skip
     write(report_of(*made), tmp_path)
     assert (tmp_path / "index.html").stat().st_size <= 150_000
+
+
+@pytest.mark.parametrize("close", [1e-9, 1e-6, 2e-5, 1e-4, 1e-2])
+def test_strip_of_errors_names_each_colour_once_and_shows_the_limit(close):
+    from matplotlib.figure import Figure
+
+    axes = Figure().subplots()
+    errors = np.array([[0.0, 0.99e-4, 1.01e-4, 1.0, np.nan]])
+    drawing.draw_error_strip(axes, errors, close, limit=1e-4, extent=(0, 5, 1, 0))
+    names = [text.get_text() for text in axes.texts]
+    assert len(set(names)) == len(names) and "≤ 0.1\u00a0mm/s" in names and names[-1] == "more"
+    _, below, above, far, empty = axes.images[0].get_array()[0].tolist()
+    orange = [list(color) for color in drawing.ERROR_COLORS[-2:]]
+    assert [above, far] == orange and below not in orange and empty == [0.0] * 4
