@@ -1,6 +1,7 @@
-"""Worlds in the lanes of vectors: 8, 4 or 2 worlds of equal structure at once, with bounded rows and contacts of three rows.
+"""Worlds in the lanes of vectors: 8, 4 or 2 worlds of similar structure at once, with bounded rows and contacts of three rows.
 
-Entry i of an array holds entry i of every world: x[width i + lane]. A world's arithmetic is that of one problem by the functions
+Entry i of an array holds entry i of every world: x[width i + lane]. Worlds with fewer rows than another lane's receive empty
+rows, whose impulses are 0 and which change no bit of the others. A world's arithmetic is that of one problem by the functions
 of core and judge, with the same bits: no sum runs over lanes, so that the width changes no bit. Zeros of J, M and Y are processed
 as numbers, or left out where every lane has them. Worlds that a lane does not cover are processed alone: invalid numbers,
 several islands, a zero impulse that is a solution or violates bounds, results that judge/refine.pxd refines or that are above
@@ -9,7 +10,7 @@ single calls (`solve_in_one_lane`, with vectors over rows). To change a width, o
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t, uint64_t
-from libc.string cimport memmove, memset
+from libc.string cimport memset
 
 from lavender_ext.batch.world cimport (BLOCK, BLOCKS, CONE_ROW, FREE, JAC, MASS, MU, PLACES, ROWS, SOFT, TARGET, VELOCITIES,
                                        AT_ROW, worlds_t)
@@ -30,56 +31,47 @@ cdef extern from *:
         const int *ptr, *kind;                  /* blocks of every lane: first rows (k + 1), 0 for bounded rows (k) */
         double asymmetry;                       /* permitted asymmetry of M, as in `worlds_t`; below 0: M is a lower triangle */
         double *jac, *mass, *free, *target, *soft, *mu, *lower, *upper;         /* data */
+        double *real;                           /* (k) 1 for blocks of the world, 0 for those that only other lanes have */
         double *inverse, *root, *y, *d, *b, *zero, *w, *e, *lam, *push, *size, *out;
         double *a, *g, *step, *change, *kept;   /* for `solve`, to the relative residual `tol` */
         double tol;
         unsigned long long *fours, *last;       /* (k) sets of the columns of each block: all but the last, and these */
+        int *left, *own;        /* lists (LANE_LIST) of the columns of each row of L and of each block that any lane has */
     } lavender_lanes_t;
     enum { LANE_IS_PLAIN, LANE_START_ENERGY, LANE_START_SPEED, LANE_RHS, LANE_CONDITION, LANE_ENERGY, LANE_SPEED, LANE_WORST,
-           LANE_FLOOR_ENERGY, LANE_FLOOR_SPEED, LANE_WORK, LANE_HEAVIEST, LANE_STEPS, LANE_NUMBERS, LANE_ROWS = 48,
-           LANE_VELOCITIES = 40 };
-    /* List the columns of each block of a lane: those of J and their ancestors. Return 0 if the blocks may belong to several
-     * islands, 1 if they are one island, and 2 if M is also full. */
-    static int lavender_list_columns(const lavender_lanes_t* x, int width, int lane) {
-        const int n = x->n;
+           LANE_FLOOR_ENERGY, LANE_FLOOR_SPEED, LANE_WORK, LANE_HEAVIEST, LANE_STEPS, LANE_COUNT, LANE_NUMBERS, LANE_ROWS = 48,
+           LANE_VELOCITIES = 40, LANE_LIST = LANE_VELOCITIES + 1,
+           LANE_TRIANGLE = LANE_VELOCITIES * LANE_LIST / 2 };
+    /* Replace the columns of M left of the diagonal (n sets) by the columns of L, and write the ancestors of each column, itself
+     * included, to `above` (n). */
+    static void lavender_close_columns(int n, unsigned long long* left, unsigned long long* above) {
         const unsigned long long one = 1;
-        unsigned long long above[LANE_VELOCITIES], roots = 0, common = ~(unsigned long long)0;
-        int full = 1;
-        for (int i = 0; i < n; i++) {
-            above[i] = 0;
-            for (int j = 0; j < i; j++) above[i] |= (unsigned long long)(x->mass[(i * n + j) * width + lane] != 0.0) << j;
-            full &= above[i] == (one << i) - 1;
-        }
-        for (int i = n - 1; i > 0; i--) {               /* the pattern of L; row i is added to that of its last column */
+        int last[LANE_VELOCITIES];
+        for (int i = n - 1; i >= 0; i--) {              /* row i is added to that of its last column */
             int j = i - 1;
-            while (j >= 0 && !(above[i] >> j & 1)) j--;
-            if (j >= 0) above[j] |= above[i] & ((one << j) - 1);
+            while (j >= 0 && !(left[i] >> j & 1)) j--;
+            if (j >= 0) left[j] |= left[i] & ((one << j) - 1);
+            last[i] = j;
         }
-        for (int i = 0; i < n; i++) {                   /* sets of ancestors */
-            int j = i - 1;
-            while (j >= 0 && !(above[i] >> j & 1)) j--;
-            if (j < 0) roots |= one << i;
-            above[i] = (j >= 0 ? above[j] : 0) | one << i;
-        }
-        for (int i = 0; i < x->k; i++) {
-            unsigned long long columns = 0, last = 0;
-            int count = 0;
-            for (int r = x->ptr[i]; r < x->ptr[i + 1]; r++)
-                for (int k = 0; k < n; k++)
-                    if (x->jac[(r * n + k) * width + lane] != 0.0) columns |= above[k];
-            for (int k = 0; k < n; k++) count += columns >> k & 1;
-            count &= 3;
-            for (int k = n - 1; count > 0; k--)
-                if (columns >> k & 1) {
-                    last |= one << k;
-                    count--;
-                }
-            x->fours[i * width + lane] = columns ^ last;
-            x->last[i * width + lane] = last;
-            common &= columns;
-        }
-        return (common & roots) ? (n < LANE_VELOCITIES || full) + full : 0;
+        for (int i = 0; i < n; i++) above[i] = (last[i] >= 0 ? above[last[i]] : 0) | one << i;
     }
+    /* Write the number of runs of columns in a set, and the first column and the end of each run. */
+    static void lavender_list_columns(unsigned long long set, int* list) {
+        int inside = 0;
+        list[0] = 0;
+        for (int k = 0; set || inside; k++, set >>= 1) {
+            if (!inside && (set & 1)) list[2 * list[0] + 1] = k;
+            if (inside && !(set & 1)) list[2 * list[0]++ + 2] = k;
+            inside = set & 1;
+        }
+    }
+    /* for (all columns k of a list), upwards and downwards */
+    #define LAVENDER_UP(k, list) \
+        for (const int *run_ = (list) + 1, *end_ = run_ + 2 * (list)[0]; run_ < end_; run_ += 2) \
+            for (int k = run_[0], stop_ = run_[1]; k < stop_; k++)
+    #define LAVENDER_DOWN(k, list) \
+        for (const int *run_ = (list) + 2 * (list)[0] - 1; run_ > (list); run_ -= 2) \
+            for (int k = run_[1] - 1, stop_ = run_[0]; k >= stop_; k--)
     /* One lane has vectors over rows: places of n numbers in fours, and a place from which all numbers after j are reached. */
     #define LAVENDER_PLACES(V, n) (sizeof(V) == sizeof(double) ? ((n) + 3) & ~3 : (n))
     #define LAVENDER_FROM(V, j) (sizeof(V) == sizeof(double) ? ((j) + 1) & ~3 : (j) + 1)
@@ -90,6 +82,7 @@ cdef extern from *:
     ISA static inline V abs_##N(V a) { return ABS(V, I, a); } \
     ISA static inline V root_##N(V a) { return ROOT; } \
     ISA static inline int any_##N(I mask) { return ANY; } \
+    ISA static inline I all_##N(I mask) { return sizeof(V) == sizeof(double) ? (I)(0 - mask) : mask; }  /* all bits */ \
     \
     /* The judge's errors e (m) of impulses with slack w, and sum d e^2, the largest nu d e^2 and its row (judge/tally.pxd). */ \
     ISA static void errors_##N(const lavender_lanes_t* x, const V* lam, const V* w, V* e, V* energy, V* fast, V* worst) { \
@@ -369,34 +362,41 @@ cdef extern from *:
         V *a = (V*)x->a, *lam = (V*)x->lam, *step = (V*)x->step, *change = (V*)x->change, *kept = (V*)x->kept; \
         V *out = (V*)x->out, *across = (V*)x->g; \
         V now, steps = zero, misses = zero; \
+        int own[LANE_VELOCITIES]; \
         I on = (I)(out[LANE_IS_PLAIN] > 0.0); \
         for (int r = 0; r < m; r++) { \
             lam[r] = zero; \
-            if (m > n) on &= (I)(soft[r] >= 1e-5 * d[r]); \
+            on &= (I)(out[LANE_COUNT] <= (double)n) | (I)(soft[r] >= 1e-5 * d[r]); \
             for (int k = 0; k < n; k++) across[k * ld + r] = y[r * n + k]; \
         } \
         for (int k = 0; k < n; k++) \
             for (int r = m; r < ld; r++) across[k * ld + r] = zero; \
         if (!any_##N(on)) return; \
-        for (int r = 0; r < m; r++) { \
-            const V* row = y + r * n; \
-            V* to_row = a + r * ld; \
-            const int end = LAVENDER_PLACES(V, r + 1); \
-            int k = 0; \
-            for (int j = 0; j < ld; j++) to_row[j] = zero; \
-            for (; k + 4 <= n; k += 4) { \
-                const V *c = across + k * ld, *c1 = c + ld, *c2 = c1 + ld, *c3 = c2 + ld; \
-                const V y0 = row[k], y1 = row[k + 1], y2 = row[k + 2], y3 = row[k + 3]; \
-                LAVENDER_APART \
-                for (int j = 0; j < end; j++) to_row[j] = (((to_row[j] + c[j] * y0) + c1[j] * y1) + c2[j] * y2) + c3[j] * y3; \
+        for (int i = 0; i < x->k; i++) { \
+            int count = 0; \
+            LAVENDER_UP(k, x->own + i * LANE_LIST) own[count++] = k; \
+            for (int r = x->ptr[i]; r < x->ptr[i + 1]; r++) { \
+                const V* row = y + r * n; \
+                V* to_row = a + r * ld; \
+                const int end = LAVENDER_PLACES(V, r + 1); \
+                int t = 0; \
+                for (int j = 0; j < ld; j++) to_row[j] = zero; \
+                for (; t + 4 <= count; t += 4) { \
+                    const int k = own[t], k1 = own[t + 1], k2 = own[t + 2], k3 = own[t + 3]; \
+                    const V *c = across + k * ld, *c1 = across + k1 * ld, *c2 = across + k2 * ld, *c3 = across + k3 * ld; \
+                    const V y0 = row[k], y1 = row[k1], y2 = row[k2], y3 = row[k3]; \
+                    LAVENDER_APART \
+                    for (int j = 0; j < end; j++) \
+                        to_row[j] = (((to_row[j] + c[j] * y0) + c1[j] * y1) + c2[j] * y2) + c3[j] * y3; \
+                } \
+                for (; t < count; t++) { \
+                    const V *c = across + own[t] * ld, y0 = row[own[t]]; \
+                    LAVENDER_APART \
+                    for (int j = 0; j < end; j++) to_row[j] += c[j] * y0; \
+                } \
+                for (int j = 0; j < r; j++) a[j * ld + r] = to_row[j]; \
+                to_row[r] += soft[r]; \
             } \
-            for (; k < n; k++) { \
-                const V *c = across + k * ld, y0 = row[k]; \
-                LAVENDER_APART \
-                for (int j = 0; j < end; j++) to_row[j] += c[j] * y0; \
-            } \
-            for (int j = 0; j < r; j++) a[j * ld + r] = to_row[j]; \
-            to_row[r] += soft[r]; \
         } \
         for (int i = 0; i < x->k; i++) { \
             int r = x->ptr[i]; \
@@ -443,8 +443,8 @@ cdef extern from *:
         out[LANE_STEPS] = steps; \
     }
     #define LAVENDER_LANES(N, V, I, ISA) \
-    /* Interleave n numbers from each of N arrays, of float if `narrow`. */ \
-    ISA static void interleave_##N(const void* const* from, int narrow, long long n, double* to) { \
+    /* Interleave n numbers from each of N arrays, of float if `narrow`, to their places, or one after the other if `at` is 0. */ \
+    ISA static void interleave_##N(const void* const* from, int narrow, long long n, const int* at, double* to) { \
         const float* single[N]; \
         const double* wide[N]; \
         for (int l = 0; l < N; l++) { \
@@ -452,20 +452,24 @@ cdef extern from *:
             wide[l] = from[l]; \
         } \
         for (long long i = 0; narrow && i < n; i++) \
-            for (int l = 0; l < N; l++) to[N * i + l] = single[l][i]; \
+            for (int l = 0; l < N; l++) to[N * (at ? at[i] : i) + l] = single[l][i]; \
         for (long long i = 0; !narrow && i < n; i++) \
-            for (int l = 0; l < N; l++) to[N * i + l] = wide[l][i]; \
+            for (int l = 0; l < N; l++) to[N * (at ? at[i] : i) + l] = wide[l][i]; \
     } \
     \
     /* Overwrite v (n) with M^-1 v. */ \
     ISA static void solve_mass_##N(const lavender_lanes_t* x, V* v) { \
         const int n = x->n; \
         const V *l = (const V*)x->mass, *inverse = (const V*)x->inverse; \
-        for (int k = n - 1; k >= 0; k--) \
-            for (int i = 0; i < k; i++) v[i] -= l[k * n + i] * v[k]; \
+        for (int k = n - 1; k >= 0; k--) { \
+            const int* left = x->left + k * LANE_LIST; \
+            const V z = v[k]; \
+            LAVENDER_UP(i, left) v[i] -= l[k * n + i] * z; \
+        } \
         for (int k = 0; k < n; k++) { \
+            const int* left = x->left + k * LANE_LIST; \
             V z = v[k] * inverse[k]; \
-            for (int i = 0; i < k; i++) z -= l[k * n + i] * v[i]; \
+            LAVENDER_UP(i, left) z -= l[k * n + i] * v[i]; \
             v[k] = z; \
         } \
     } \
@@ -488,12 +492,14 @@ cdef extern from *:
             v[i] = zero; \
         } \
         for (int i = n - 1; i >= 0; i--) { \
+            const int* left = x->left + i * LANE_LIST; \
             v[i] += pick_##N((I)(v[i] >= 0.0), s[i], -s[i]); \
-            for (int j = 0; j < i; j++) v[j] -= l[i * n + j] * v[i]; \
+            LAVENDER_UP(j, left) v[j] -= l[i * n + j] * v[i]; \
         } \
         for (int i = 0; i < n; i++) { \
+            const int* left = x->left + i * LANE_LIST; \
             V z = v[i] * ((const V*)x->inverse)[i]; \
-            for (int j = 0; j < i; j++) z -= v[j] * l[i * n + j]; \
+            LAVENDER_UP(j, left) z -= v[j] * l[i * n + j]; \
             v[i] = z; \
         } \
         for (int i = 0; i < n; i++) v[i] *= s[i]; \
@@ -504,6 +510,57 @@ cdef extern from *:
         second = norm_##N(v, n); \
         second = larger_##N(larger_##N(second, first / sqrt((double)n)), zero + 1.0); \
         return pick_##N((I)(first > 0.0) & (I)(first < 1e300), second, zero + 1e300); \
+    } \
+    \
+    /* List the columns of L and of each block, with their ancestors. Return the lanes whose blocks are one island. */ \
+    ISA static I list_columns_##N(const lavender_lanes_t* x) { \
+        enum { LANES = sizeof(V) / sizeof(double) }; \
+        const int n = x->n; \
+        const V *jac = (const V*)x->jac, *l = (const V*)x->mass; \
+        const I none = {0}; \
+        I left[LANE_VELOCITIES], above[LANE_VELOCITIES], full = none - 1, common = none - 1, roots = none; \
+        unsigned long long at[2][LANE_VELOCITIES], differs = 0; \
+        for (int i = 0; i < n; i++) { \
+            left[i] = none; \
+            for (int j = 0; j < i; j++) left[i] |= all_##N((I)(l[i * n + j] != 0.0)) & 1LL << j; \
+            full &= all_##N((I)(left[i] == (1LL << i) - 1)); \
+            for (int k = 1; k < LANES; k++) \
+                differs |= ((unsigned long long*)(left + i))[k] ^ ((unsigned long long*)(left + i))[0]; \
+        } \
+        for (int k = 0; k < LANES; k++) { \
+            for (int i = 0; i < n && (k == 0 || differs); i++) at[0][i] = ((unsigned long long*)(left + i))[k]; \
+            if (k == 0 || differs) lavender_close_columns(n, at[0], at[1]); \
+            for (int i = 0; i < n; i++) { \
+                ((unsigned long long*)(left + i))[k] = at[0][i]; \
+                ((unsigned long long*)(above + i))[k] = at[1][i]; \
+            } \
+        } \
+        for (int i = 0; i < n; i++) { \
+            unsigned long long set = 0; \
+            for (int k = 0; k < LANES; k++) set |= ((unsigned long long*)(left + i))[k]; \
+            lavender_list_columns(set, x->left + i * LANE_LIST); \
+            roots |= all_##N((I)(left[i] == 0)) & 1LL << i; \
+        } \
+        for (int i = 0; i < x->k; i++) { \
+            int* own = x->own + i * LANE_LIST; \
+            I columns = none, last = none, count = none; \
+            unsigned long long set = 0; \
+            for (int r = x->ptr[i]; r < x->ptr[i + 1]; r++) \
+                for (int k = 0; k < n; k++) columns |= all_##N((I)(jac[r * n + k] != 0.0)) & above[k]; \
+            for (int k = 0; k < LANES; k++) set |= ((unsigned long long*)&columns)[k]; \
+            lavender_list_columns(set, own); \
+            LAVENDER_UP(k, own) count += columns >> k & 1; \
+            count &= 3; \
+            LAVENDER_DOWN(k, own) { \
+                const I one = all_##N((I)(count > 0)) & columns >> k & 1; \
+                last |= one << k; \
+                count -= one; \
+            } \
+            ((I*)x->fours)[i] = columns ^ last; \
+            ((I*)x->last)[i] = last; \
+            common &= columns | all_##N((I)(((const V*)x->real)[i] == 0.0)); \
+        } \
+        return (I)((common & roots) != 0) & (full | (n < LANE_VELOCITIES ? -1 : 0)); \
     } \
     /* Check the data; M = L^T D L, Y = J L^-1 D^-1/2, d, b, and the errors of the zero impulse. LANE_IS_PLAIN receives 1 if \
      * no number is out of range, the rows form one island, and the zero impulse is within its bounds and not a solution. */ \
@@ -516,7 +573,6 @@ cdef extern from *:
         const V zero = {0.0}, one = zero + 1.0; \
         V largest = zero, determinant = one, right = zero, energy, fast, worst; \
         I good = (I)(zero == zero), moves = (I)(zero != zero); \
-        int is_sparse = 0; \
         for (int i = 0; i < m * n; i++) good &= (I)(abs_##N(jac[i]) <= 1e60); \
         for (int i = 0; i < n; i++) good &= (I)(abs_##N(free[i]) <= 1e60); \
         for (int i = 0; i < m; i++) \
@@ -532,26 +588,21 @@ cdef extern from *:
                 const V gap = l[i * n + j] - l[j * n + i], size = l[i * n + i] * l[j * n + j]; \
                 good &= (I)(gap == 0.0) | (I)(gap * gap <= 0.99 * x->asymmetry * x->asymmetry * size); \
             } \
-        for (int i = 0; i < (int)(sizeof(V) / sizeof(double)); i++) { \
-            const int found = lavender_list_columns(x, sizeof(V) / sizeof(double), i); \
-            ((double*)(out + LANE_IS_PLAIN))[i] = found > 0; \
-            is_sparse |= found < 2; \
-        } \
-        good &= (I)(out[LANE_IS_PLAIN] > 0.0); \
+        good &= list_columns_##N(x); \
         /* factor of M; the diagonal of l keeps D */ \
         for (int i = 0; i < n; i++) inverse[i] = l[i * n + i]; \
         for (int k = n - 1; k >= 0; k--) { \
             V* row = l + k * n; \
             const V size = inverse[k]; \
+            const int* left = x->left + k * LANE_LIST; \
             good &= (I)(row[k] > 8.8817841970012523e-16 * size) & (I)(row[k] >= 1e-60); \
             inverse[k] = 1.0 / row[k]; \
             root[k] = root_##N(inverse[k]); \
-            for (int j = k - 1; j >= 0; j--) { \
-                V *to = l + j * n; \
-                if (is_sparse && !any_##N((I)(row[j] != 0.0))) continue; \
+            LAVENDER_DOWN(j, left) { \
+                V* to = l + j * n; \
                 const V z = row[j] * inverse[k]; \
                 to[j] -= z * row[j]; \
-                for (int i = 0; i < j; i++) to[i] -= z * row[i]; \
+                LAVENDER_UP(i, x->left + j * LANE_LIST) to[i] -= z * row[i]; \
                 row[j] = z; \
             } \
             push[k] = size;                                     /* M_kk for the determinant below */ \
@@ -560,39 +611,36 @@ cdef extern from *:
         out[LANE_CONDITION] = 2.72 * determinant; \
         if (any_##N((I)(determinant > 1e3))) out[LANE_CONDITION] = condition_##N(x, push); \
         /* Y and b */ \
-        for (int r = 0; r < m; r++) { \
-            V *row = y + r * n, sum = zero; \
-            for (int k = 0; k < n; k++) { \
-                row[k] = jac[r * n + k]; \
-                sum += row[k] * free[k]; \
+        for (int i = 0; i < x->k; i++) { \
+            const int* own = x->own + i * LANE_LIST; \
+            for (int r = x->ptr[i]; r < x->ptr[i + 1]; r++) { \
+                V *row = y + r * n, sum = zero; \
+                for (int k = 0; k < n; k++) row[k] = jac[r * n + k]; \
+                LAVENDER_UP(k, own) sum += row[k] * free[k]; \
+                b[r] = target[r] - sum; \
+                largest = larger_##N(abs_##N(b[r]), largest); \
+                LAVENDER_DOWN(k, own) { \
+                    const V *from = l + k * n, z = row[k]; \
+                    LAVENDER_UP(j, x->left + k * LANE_LIST) row[j] -= from[j] * z; \
+                    row[k] = z * root[k]; \
+                } \
             } \
-            b[r] = target[r] - sum; \
-            largest = larger_##N(abs_##N(b[r]), largest); \
         } \
         good &= (I)(largest <= 1e60) & ((I)(largest >= 1e-60) | (I)(largest == 0.0)); \
-        for (int k = n - 1; k >= 0; k--) { \
-            const V *from = l + k * n, scale = root[k]; \
-            for (int r = 0; r < m; r++) { \
-                V* row = y + r * n; \
-                const V z = row[k]; \
-                if (is_sparse && !any_##N((I)(z != 0.0))) continue; \
-                for (int i = 0; i < k; i++) row[i] -= from[i] * z; \
-                row[k] = z * scale; \
-            } \
-        } \
         /* d: four running sums over the columns of a block, and its last columns in the first sum (core/dot.pxd); the sums \
          * change places after each column */ \
         for (int i = 0; i < x->k; i++) { \
             const I fours = ((const I*)x->fours)[i], last = ((const I*)x->last)[i]; \
+            const int* own = x->own + i * LANE_LIST; \
             for (int r = x->ptr[i]; r < x->ptr[i + 1]; r++) { \
                 V s0 = zero, s1 = zero, s2 = zero, s3 = zero; \
-                for (int k = 0; k < n; k++) { \
-                    const I own = 0 - (fours >> k & 1), end = 0 - (last >> k & 1); \
+                LAVENDER_UP(k, own) { \
+                    const I turns = 0 - (fours >> k & 1), end = 0 - (last >> k & 1); \
                     const V square = y[r * n + k] * y[r * n + k], sum = s0 + square; \
-                    s0 = pick_##N(own, s1, s0); \
-                    s1 = pick_##N(own, s2, s1); \
-                    s2 = pick_##N(own, s3, s2); \
-                    s3 = pick_##N(own, sum, s3); \
+                    s0 = pick_##N(turns, s1, s0); \
+                    s1 = pick_##N(turns, s2, s1); \
+                    s2 = pick_##N(turns, s3, s2); \
+                    s3 = pick_##N(turns, sum, s3); \
                     s0 += pick_##N(end, square, zero); \
                 } \
                 d[r] = ((s0 + s1) + (s2 + s3)) + soft[r]; \
@@ -617,7 +665,7 @@ cdef extern from *:
     \
     /* Judge lam: slack, errors, norms, floors, and the sums of judge/refine.pxd. */ \
     ISA static void judge_##N(const lavender_lanes_t* x) { \
-        const int m = x->m, n = x->n; \
+        const int n = x->n; \
         const V *y = (const V*)x->y, *d = (const V*)x->d, *b = (const V*)x->b, *lam = (const V*)x->lam; \
         const V *jac = (const V*)x->jac, *soft = (const V*)x->soft, *mu = (const V*)x->mu; \
         const V *lower = (const V*)x->lower, *upper = (const V*)x->upper; \
@@ -625,19 +673,23 @@ cdef extern from *:
         const V zero = {0.0}, one = zero + 1.0; \
         V energy, fast, worst, sum[2] = {zero, zero}, heaviest = zero; \
         const double unit = 1.1102230246251565e-16; \
-        I good = (I)(out[LANE_IS_PLAIN] > 0.0); \
+        I good = (I)(out[LANE_IS_PLAIN] > 0.0), odd = (I)(zero != zero); \
         /* push = M^-1 J^T lam, w = J push + soft lam - b */ \
         for (int k = 0; k < n; k++) push[k] = size[k] = zero; \
-        for (int r = 0; r < m; r++) { \
-            const V* row = jac + r * n; \
-            for (int k = 0; k < n; k++) push[k] += row[k] * lam[r]; \
+        for (int i = 0; i < x->k; i++) { \
+            const int* own = x->own + i * LANE_LIST; \
+            for (int r = x->ptr[i]; r < x->ptr[i + 1]; r++) \
+                LAVENDER_UP(k, own) push[k] += jac[r * n + k] * lam[r]; \
         } \
         solve_mass_##N(x, push); \
-        for (int r = 0; r < m; r++) { \
-            V s = zero; \
-            for (int k = 0; k < n; k++) s += jac[r * n + k] * push[k]; \
-            w[r] = s + (soft[r] * lam[r] - b[r]); \
-            good &= (I)(abs_##N(w[r]) <= 1.7976931348623157e308) & (I)(abs_##N(lam[r]) <= 1e60); \
+        for (int i = 0; i < x->k; i++) { \
+            const int* own = x->own + i * LANE_LIST; \
+            for (int r = x->ptr[i]; r < x->ptr[i + 1]; r++) { \
+                V s = zero; \
+                LAVENDER_UP(k, own) s += jac[r * n + k] * push[k]; \
+                w[r] = s + (soft[r] * lam[r] - b[r]); \
+                good &= (I)(abs_##N(w[r]) <= 1.7976931348623157e308) & (I)(abs_##N(lam[r]) <= 1e60); \
+            } \
         } \
         errors_##N(x, lam, w, e, &energy, &fast, &worst); \
         good &= (I)(energy < 1e300) & (I)(fast < 1e300); \
@@ -645,16 +697,19 @@ cdef extern from *:
         out[LANE_SPEED] = pick_##N((I)(fast > 0.0), root_##N(larger_##N(fast, zero)), zero); \
         out[LANE_WORST] = worst; \
         /* rounding: |Y| |Y|^T |lam| + soft |lam| and |b| (judge/forms.pxd, add_block_floor of judge/tally.pxd) */ \
-        for (int r = 0; r < m; r++) \
-            for (int k = 0; k < n; k++) size[k] += abs_##N(y[r * n + k] * lam[r]); \
+        for (int i = 0; i < x->k; i++) { \
+            const int* own = x->own + i * LANE_LIST; \
+            for (int r = x->ptr[i]; r < x->ptr[i + 1]; r++) \
+                LAVENDER_UP(k, own) size[k] += abs_##N(y[r * n + k] * lam[r]); \
+        } \
         energy = fast = zero; \
         for (int i = 0; i < x->k; i++) { \
-            const int end = x->ptr[i + 1]; \
+            const int end = x->ptr[i + 1], *own = x->own + i * LANE_LIST; \
             V terms[LANE_ROWS], rounding, t; \
             int r = x->ptr[i]; \
             for (int j = r; j < end; j++) { \
                 V s = zero; \
-                for (int k = 0; k < n; k++) s += abs_##N(y[j * n + k]) * size[k]; \
+                LAVENDER_UP(k, own) s += abs_##N(y[j * n + k]) * size[k]; \
                 terms[j - r] = s + soft[j] * abs_##N(lam[j]); \
             } \
             for (int j = r; !x->kind[i] && j < end; j++) { \
@@ -692,9 +747,15 @@ cdef extern from *:
         out[LANE_FLOOR_ENERGY] = root_##N(energy); \
         out[LANE_FLOOR_SPEED] = root_##N(fast); \
         /* `estimate_factor_loss` in two sums, an odd last row in the first */ \
-        for (int r = 0; r < m; r++) { \
-            sum[r & 1] += lam[r] * (w[r] + (b[r] - soft[r] * lam[r])); \
-            heaviest = larger_##N(d[r], heaviest); \
+        for (int i = 0; i < x->k; i++) { \
+            const I real = (I)(((const V*)x->real)[i] > 0.0); \
+            for (int r = x->ptr[i]; r < x->ptr[i + 1]; r++) { \
+                const V work = lam[r] * (w[r] + (b[r] - soft[r] * lam[r])); \
+                sum[0] += pick_##N(odd, zero, work); \
+                sum[1] += pick_##N(odd, work, zero); \
+                odd ^= real; \
+                heaviest = larger_##N(d[r], heaviest); \
+            } \
         } \
         out[LANE_WORK] = sum[0] + sum[1]; \
         out[LANE_HEAVIEST] = heaviest; \
@@ -754,28 +815,33 @@ cdef extern from *:
     #define lavender_prepare_lanes(x, width) LAVENDER_IN_LANES(width, prepare, (x))
     #define lavender_solve_lanes(x, width) LAVENDER_IN_LANES(width, solve, (x))
     #define lavender_judge_lanes(x, width) LAVENDER_IN_LANES(width, judge, (x))
-    #define lavender_interleave(from, narrow, n, to, width) LAVENDER_IN_LANES(width, interleave, (from, narrow, n, to))
+    #define lavender_interleave(from, narrow, n, at, to, width) LAVENDER_IN_LANES(width, interleave, (from, narrow, n, at, to))
     """
     ctypedef struct lanes_t "lavender_lanes_t":
         int32_t m, n, law, k
         const int32_t *ptr, *kind
         double asymmetry
         double *jac, *mass, *free, *target, *soft, *mu, *lower, *upper
+        double *real
         double *inverse, *root, *y, *d, *b, *zero, *w, *e, *lam, *push, *size, *out
         double *a, *g, *step, *change, *kept
         double tol
         uint64_t *fours, *last
+        int32_t *left, *own
     enum:
         LANE_IS_PLAIN, LANE_START_ENERGY, LANE_START_SPEED, LANE_RHS, LANE_CONDITION, LANE_ENERGY, LANE_SPEED, LANE_WORST
-        LANE_FLOOR_ENERGY, LANE_FLOOR_SPEED, LANE_WORK, LANE_HEAVIEST, LANE_STEPS, LANE_NUMBERS
+        LANE_FLOOR_ENERGY, LANE_FLOOR_SPEED, LANE_WORK, LANE_HEAVIEST, LANE_STEPS, LANE_COUNT, LANE_NUMBERS
         MAX_LANE_ROWS "LANE_ROWS"
         MAX_LANE_VELOCITIES "LANE_VELOCITIES"
+        LANE_LIST, LANE_TRIANGLE
         FEWEST_LANES "LAVENDER_FEWEST_LANES"
+    void list_lane_columns "lavender_list_columns"(uint64_t set, int32_t* out) noexcept nogil
     void prepare_lanes "lavender_prepare_lanes"(const lanes_t* x, int32_t width) noexcept nogil
     void solve_lanes "lavender_solve_lanes"(const lanes_t* x, int32_t width) noexcept nogil
     void solve_one "lavender_solve_one"(const lanes_t* x, int32_t wide) noexcept nogil
     void judge_lanes "lavender_judge_lanes"(const lanes_t* x, int32_t width) noexcept nogil
-    void interleave "lavender_interleave"(const void** x, int32_t narrow, int64_t n, double* out, int32_t width) noexcept nogil
+    void interleave "lavender_interleave"(const void** x, int32_t narrow, int64_t n, const int32_t* at, double* out,
+                                          int32_t width) noexcept nogil
 
 
 cdef enum:
@@ -793,42 +859,92 @@ cdef inline bint fits_lanes(const blocks_t* p, int32_t i) noexcept nogil:
             and p.patch_radius[i] == 0.0 and p.rolling[i] == 0.0)
 
 
-cdef inline int64_t compute_structure_key(const worlds_t* w, int64_t i) noexcept nogil:
-    """Return a number that is equal for worlds with equal sizes and kinds of blocks; 0 if lanes do not cover world i."""
+cdef struct lane_rows_t:        # places of the worlds of a group in its lanes
+    int32_t rows[MAX_LANES]     # number of rows of each world
+    int32_t row[MAX_LANE_ROWS * MAX_LANES]      # row of each world that a row of the lanes holds; -1: none
+    int32_t block[MAX_LANE_ROWS * MAX_LANES]
+    int32_t ptr[MAX_LANE_ROWS + 1]              # blocks of the lanes
+    int32_t kind[MAX_LANE_ROWS]
+
+
+cdef inline int32_t kind_of_block(const blocks_t* p, int32_t i) noexcept nogil:
+    """Return a number that is equal for blocks that lanes process alike, smaller for fewer rows."""
+    return 2 * (p.ptr[i + 1] - p.ptr[i]) + (p.kind[i] != ROW)
+
+
+cdef inline int64_t compute_structure_key(const worlds_t* w, int64_t i, int64_t* order) noexcept nogil:
+    """Return a number that is equal for worlds that may share a group, and their order; 0 if lanes do not cover world i.
+
+    Worlds with single bounded rows and contacts share groups, others only with equal sizes and kinds of blocks. The order is
+    by contacts, bounded rows that follow contacts, and other rows, upwards and downwards in turn.
+    """
     cdef const int64_t* at = w.at + i * PLACES
     cdef uint64_t key = 64 * <uint64_t>at[ROWS] + <uint64_t>at[VELOCITIES]
-    cdef int32_t k, j = <int32_t>at[BLOCK]
+    cdef int32_t k, kind, j = <int32_t>at[BLOCK], contacts = 0, before = 0, after = 0
+    order[0] = 0
     if not (0 < at[ROWS] <= MAX_LANE_ROWS and 0 < at[VELOCITIES] <= MAX_LANE_VELOCITIES):
         return 0
     for k in range(j, j + <int32_t>at[BLOCKS]):
         if not fits_lanes(&w.blocks, k):
             return 0
-        key ^= <uint64_t>(2 * (w.blocks.ptr[k + 1] - w.blocks.ptr[k]) + (w.blocks.kind[k] == ROW))
-        key *= <uint64_t>0x100000001B3U                 # FNV-1a
-    return <int64_t>(key | 1)
+        kind = kind_of_block(&w.blocks, k)
+        contacts, before, after = contacts + kind % 2, before + (contacts + kind % 2 == 0), after + (contacts > 0 and kind % 2 == 0)
+        key = (key ^ <uint64_t>kind) * <uint64_t>0x100000001B3U         # FNV-1a
+    if 3 * contacts + before + after < at[ROWS]:
+        return <int64_t>(key | 1)
+    order[0] = (contacts * MAX_LANE_ROWS + after) * 2 * MAX_LANE_ROWS
+    order[0] += MAX_LANE_ROWS - before if (contacts + after) % 2 else before
+    return 2 * at[VELOCITIES]
 
 
-cdef inline bint have_worlds_equal_structure(const worlds_t* w, int64_t i, int64_t j) noexcept nogil:
-    """Return whether worlds i and j have equal sizes and kinds of blocks."""
-    cdef const int64_t* at = w.at + i * PLACES
-    cdef const int64_t* other = w.at + j * PLACES
-    cdef const blocks_t* p = &w.blocks
-    cdef int64_t k, a = at[BLOCK], b = other[BLOCK]
-    if at[ROWS] != other[ROWS] or at[VELOCITIES] != other[VELOCITIES] or at[BLOCKS] != other[BLOCKS]:
+cdef inline bint arrange_lanes(const worlds_t* w, const int64_t* worlds, int32_t n_worlds, int32_t width, lanes_t* x,
+                               lane_rows_t* p) noexcept nogil:
+    """Find rows and blocks of lanes that hold every world's (n_worlds) in its order, the smallest first.
+
+    Returns whether lanes take less time than single worlds: the time grows with (rows + 8)^2, and half a group takes as long
+    alone. Further lanes hold the first world again.
+    """
+    cdef const int64_t* at[MAX_LANES]
+    cdef int32_t next_block[MAX_LANES]
+    cdef int32_t next_row[MAX_LANES]
+    cdef int32_t lane, r, kind, own, least
+    cdef int64_t order, work = 0
+    if n_worlds < 2 or compute_structure_key(w, worlds[0], &order) == 0:
         return False
-    for k in range(at[BLOCKS] if a != b else 0):
-        if p.ptr[a + k + 1] - p.ptr[a + k] != p.ptr[b + k + 1] - p.ptr[b + k] or p.kind[a + k] != p.kind[b + k]:
+    for lane in range(width):
+        at[lane] = w.at + PLACES * worlds[lane if lane < n_worlds else 0]
+        p.rows[lane], next_block[lane], next_row[lane] = <int32_t>at[lane][ROWS], 0, 0
+        work += (p.rows[lane] + 8) * (p.rows[lane] + 8) if lane < n_worlds else 0
+        if at[lane][VELOCITIES] != at[0][VELOCITIES]:
             return False
-    return True
+    x.n, x.law, x.k, x.m, x.ptr, x.kind, p.ptr[0] = <int32_t>at[0][VELOCITIES], w.blocks.law, 0, 0, p.ptr, p.kind, 0
+    while True:
+        least = 2 * MAX_LANE_ROWS + 2
+        for lane in range(width):
+            if next_block[lane] < at[lane][BLOCKS]:
+                least = min(least, kind_of_block(&w.blocks, <int32_t>at[lane][BLOCK] + next_block[lane]))
+        if x.m + least // 2 > MAX_LANE_ROWS:            # no block is left, or too many rows
+            return least == 2 * MAX_LANE_ROWS + 2 and 2 * work > width * (x.m + 8) * (x.m + 8)
+        for lane in range(width):
+            own = next_block[lane]
+            kind = kind_of_block(&w.blocks, <int32_t>at[lane][BLOCK] + own) if own < at[lane][BLOCKS] else -1
+            p.block[x.k * width + lane] = own if kind == least else -1
+            for r in range(least // 2):
+                p.row[(x.m + r) * width + lane] = next_row[lane] + r if kind == least else -1
+            if kind == least:
+                next_block[lane], next_row[lane] = own + 1, next_row[lane] + least // 2
+        p.kind[x.k] = least % 2
+        x.k, x.m = x.k + 1, x.m + least // 2
+        p.ptr[x.k] = x.m
 
 
-cdef inline void list_lane_blocks(const blocks_t* p, int32_t block, lanes_t* x, int32_t* ptr, int32_t* kind) noexcept nogil:
-    """Write the x.k blocks from `block` on to ptr (k + 1) and kind (k) of lanes."""
+cdef inline void list_lane_blocks(const blocks_t* p, lanes_t* x, int32_t* ptr, int32_t* kind) noexcept nogil:
+    """Write the x.k blocks of a problem to ptr (k + 1) and kind (k) of lanes."""
     cdef int32_t i
     x.ptr, x.kind, ptr[0] = ptr, kind, 0
     for i in range(x.k):
-        ptr[i + 1] = p.ptr[block + i + 1] - p.ptr[block]
-        kind[i] = 0 if has_independent_rows(p, block + i) else 1
+        ptr[i + 1] = p.ptr[i + 1]
+        kind[i] = 0 if has_independent_rows(p, i) else 1
 
 
 cdef inline int64_t bind_lanes(lanes_t* x, int32_t width, double* memory) noexcept nogil:
@@ -836,61 +952,72 @@ cdef inline int64_t bind_lanes(lanes_t* x, int32_t width, double* memory) noexce
     cdef int64_t m = x.m, n = x.n, at = 0, places = m + 3 & ~3
     cdef double*** array = [&x.jac, &x.mass, &x.y, &x.free, &x.inverse, &x.root, &x.push, &x.size, &x.target, &x.soft,
                             &x.lower, &x.upper, &x.d, &x.b, &x.zero, &x.w, &x.e, &x.lam, &x.step, &x.change, &x.kept, &x.mu,
-                            &x.out, &x.a, &x.g, <double**>&x.fours, <double**>&x.last]
+                            &x.out, &x.a, &x.g, <double**>&x.fours, <double**>&x.last, <double**>&x.left, <double**>&x.own,
+                            &x.real]
     cdef int64_t* count = [m * n, n * n, m * n, n, n, n, n, n, m, m, m, m, m, m, m, places, m, m, m, m, m, m,
-                           LANE_NUMBERS, places * m, places * max(m, n), m, m]
+                           LANE_NUMBERS, places * m, places * max(m, n), m, m, n * LANE_LIST, m * LANE_LIST, m]
     cdef int32_t i
-    for i in range(27):
+    for i in range(30):
         array[i][0] = memory + at if memory != NULL else NULL
         at += width * count[i]
     return at
 
 
-cdef inline void load_lanes(const lanes_t* x, const worlds_t* w, const double* lam, const int64_t* worlds, int32_t n_worlds,
-                            int32_t width) noexcept nogil:
+cdef inline double read_number(const worlds_t* w, int32_t which, int64_t i) noexcept nogil:
+    """Return a number of an array of all worlds."""
+    return (<const float*>w.array[which])[i] if w.narrow[which] else (<const double*>w.array[which])[i]
+
+
+cdef inline void load_lanes(const lanes_t* x, const lane_rows_t* p, const worlds_t* w, const double* lam, const int64_t* worlds,
+                            int32_t n_worlds, int32_t width) noexcept nogil:
     """Load worlds (n_worlds) and their impulses to the lanes; further lanes receive the first world again."""
     cdef const int64_t* at[MAX_LANES]
     cdef const void* line[MAX_LANES]
-    cdef double** to = [x.jac, x.mass, x.free, x.target, x.soft, x.mu, x.lam, x.lower, x.upper]
-    cdef int32_t* place = [JAC, MASS, FREE, TARGET, SOFT, MU, AT_ROW, CONE_ROW, CONE_ROW]
-    cdef int32_t* count = [x.n, x.n, x.n, x.m, x.m, x.k, x.m, x.m, x.m]
-    cdef int32_t* lines = [x.m, x.n, 1, 1, 1, 1, 1, 1, 1]
-    cdef const void* source[9]
-    cdef int64_t stride
-    cdef int32_t i, k, lane, narrow
+    cdef double zero[MAX_LANE_VELOCITIES]
+    cdef int32_t place_in_mass[LANE_TRIANGLE]
+    cdef int32_t i, k, own, lane, n = x.n
+    cdef int64_t j, stride, here
+    memset(zero, 0, sizeof(zero))
     for lane in range(width):
         at[lane] = w.at + PLACES * worlds[lane if lane < n_worlds else 0]
-    for i in range(6):
-        source[i] = w.array[i]
-    source[6], source[7], source[8] = lam, w.blocks.lower, w.blocks.upper
-    if w.array[5] == NULL:
-        source[5], place[5] = w.blocks.mu, BLOCK
-    for i in range(9):
-        narrow = i < 6 and w.array[i] != NULL and w.narrow[i]
-        stride = w.jac_row_stride if i == 0 else w.mass_row if i == 1 else 0
-        if i == 1 and w.mass_ptr != NULL:
-            lines[i], count[i] = 1, w.mass_ptr[x.n]
-        elif stride == 0 or stride == count[i]:         # one line
-            stride, count[i], lines[i] = 0, count[i] * lines[i], 1
-        for k in range(lines[i]):
-            for lane in range(width):
-                line[lane] = <const char*>source[i] + (4 if narrow else 8) * (at[lane][place[i]] + k * stride)
-            interleave(line, narrow, count[i], to[i] + <int64_t>k * count[i] * width, width)
+        x.out[LANE_COUNT * width + lane] = p.rows[lane]
+    # M and v*
+    for lane in range(width):
+        line[lane] = <const char*>w.array[2] + (4 if w.narrow[2] else 8) * at[lane][FREE]
+    interleave(line, w.narrow[2], n, NULL, x.free, width)
+    stride = w.mass_row if w.mass_row else n
     if w.mass_ptr != NULL:
-        spread_lower_triangle(x, w.mass_ptr, w.mass_col, width)
-
-
-cdef inline void spread_lower_triangle(const lanes_t* x, const int32_t* ptr, const int32_t* col, int32_t width) noexcept nogil:
-    """Move the entries of a lower triangle in compressed rows, at the beginning of x.mass, to their places, from the last on."""
-    cdef int32_t i, j, k, q = ptr[x.n] - 1
-    for i in range(x.n - 1, -1, -1):
-        for j in range(x.n - 1, -1, -1):
-            k = q >= ptr[i] and col[q] == j
-            if k:
-                memmove(x.mass + (i * x.n + j) * width, x.mass + q * width, width * sizeof(double))
-                q -= 1
-            else:
-                memset(x.mass + (i * x.n + j) * width, 0, width * sizeof(double))
+        memset(x.mass, 0, <int64_t>n * n * width * sizeof(double))
+        for i in range(n):
+            for k in range(w.mass_ptr[i], w.mass_ptr[i + 1]):
+                place_in_mass[k] = i * n + w.mass_col[k]
+    for i in range(1 if w.mass_ptr != NULL else n):
+        for lane in range(width):
+            line[lane] = <const char*>w.array[1] + (4 if w.narrow[1] else 8) * (at[lane][MASS] + i * stride)
+        interleave(line, w.narrow[1], w.mass_ptr[n] if w.mass_ptr != NULL else n, place_in_mass if w.mass_ptr != NULL else NULL,
+                   x.mass + <int64_t>i * n * width, width)
+    # rows and blocks; an empty row has a tiny d, so that it is no lane's largest
+    stride = w.jac_row_stride if w.jac_row_stride else n
+    for i in range(x.m):
+        for lane in range(width):
+            j = i * width + lane
+            own = p.row[j]
+            line[lane] = zero
+            x.target[j] = x.lower[j] = x.upper[j] = x.lam[j] = 0.0
+            x.soft[j] = 1e-60
+            if own >= 0:
+                line[lane] = <const char*>w.array[0] + (4 if w.narrow[0] else 8) * (at[lane][JAC] + own * stride)
+                x.target[j], x.soft[j] = read_number(w, 3, at[lane][TARGET] + own), read_number(w, 4, at[lane][SOFT] + own)
+                here = at[lane][CONE_ROW] + own
+                x.lower[j], x.upper[j], x.lam[j] = w.blocks.lower[here], w.blocks.upper[here], lam[at[lane][AT_ROW] + own]
+        interleave(line, w.narrow[0], n, NULL, x.jac + <int64_t>i * n * width, width)
+    for i in range(x.k):
+        for lane in range(width):
+            j = i * width + lane
+            own = p.block[j]
+            x.real[j], x.mu[j] = own >= 0, 0.0
+            if own >= 0:
+                x.mu[j] = w.blocks.mu[at[lane][BLOCK] + own] if w.array[5] == NULL else read_number(w, 5, at[lane][MU] + own)
 
 
 cdef inline double lane_number(const lanes_t* x, int32_t which, int32_t width, int32_t lane) noexcept nogil:
@@ -937,6 +1064,7 @@ cdef inline int32_t solve_in_one_lane(const blocks_t* p, const generalized_t* g,
     """Solve from the zero impulse, with the bits of a lane, into lam (m); return the Newton steps, -1 without memory."""
     cdef lanes_t x
     cdef int32_t i, r, a, nc
+    cdef uint64_t columns
     cdef int32_t ptr[MAX_LANE_ROWS + 1]
     cdef int32_t kind[MAX_LANE_ROWS]
     cdef const double* y
@@ -944,7 +1072,7 @@ cdef inline int32_t solve_in_one_lane(const blocks_t* p, const generalized_t* g,
     if not grow_workspace_to(workspace, 0, bind_lanes(&x, 1, NULL)):
         return -1
     bind_lanes(&x, 1, workspace.real)
-    list_lane_blocks(p, 0, &x, ptr, kind)
+    list_lane_blocks(p, &x, ptr, kind)
     memset(x.y, 0, <int64_t>x.m * x.n * sizeof(double))
     for i in range(g.n_panels):
         nc = g.pcol[i + 1] - g.pcol[i]
@@ -952,9 +1080,14 @@ cdef inline int32_t solve_in_one_lane(const blocks_t* p, const generalized_t* g,
             y = g.y + g.pval[i] + <int64_t>(r - g.prow[i]) * nc
             for a in range(nc):
                 x.y[r * x.n + g.cols[g.pcol[i] + a]] = y[a]
+    for i in range(x.k):
+        columns = 0
+        for a in range(g.pcol[g.home[i]], g.pcol[g.home[i] + 1]):
+            columns |= <uint64_t>1 << g.cols[a]
+        list_lane_columns(columns, x.own + i * LANE_LIST)
     x.b, x.d, x.soft, x.mu = <double*>p.b, <double*>p.d, <double*>g.compliance, <double*>p.mu
     x.lower, x.upper = <double*>p.lower, <double*>p.upper
     x.out[LANE_IS_PLAIN], x.out[LANE_START_ENERGY], x.out[LANE_START_SPEED] = 1.0, zero_residual[0], zero_residual[1]
-    x.out[LANE_STEPS], x.lam = 0.0, lam
+    x.out[LANE_STEPS], x.out[LANE_COUNT], x.lam = 0.0, x.m, lam
     solve_one(&x, has_wide())
     return <int32_t>x.out[LANE_STEPS]

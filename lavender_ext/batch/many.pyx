@@ -30,9 +30,9 @@ from lavender_ext.batch.task cimport prepare_task, solve_generalized_task, solve
 from lavender_ext.small.limits cimport estimate_newton_cost_terms, limits_t, max_newton_cost, newton_cost_t
 from lavender_ext.host cimport grow_workspace_to, free_workspace
 from lavender_ext.batch.lanes cimport (LANE_IS_PLAIN, LANE_RHS, LANE_START_ENERGY, LANE_START_SPEED, LANE_STEPS,
-                                       MAX_LANES, MAX_LANE_ROWS,
-                                       bind_lanes, compute_structure_key, count_lanes, have_worlds_equal_structure,
-                                       is_lane_refined, judge_lanes, lane_number, lanes_t, list_lane_blocks, load_lanes,
+                                       MAX_LANES,
+                                       arrange_lanes, bind_lanes, compute_structure_key, count_lanes, is_lane_refined,
+                                       judge_lanes, lane_number, lane_rows_t, lanes_t, load_lanes,
                                        prepare_lanes, score_of_lane, solve_lanes)
 from lavender_ext.batch.world cimport (BAD, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, LATE, LEFT, MASS, MU, N_ARRAYS, PLACES, READY,
                                        AT_ROW, ROWS, SOFT, STARTED, TARGET, TRIED, VELOCITIES, VELOCITY, worker_scratch_t,
@@ -515,13 +515,13 @@ cdef class Worlds:
     cdef void order_worlds(self):
         """Order the worlds by their structure, in groups of MAX_LANES; -1 fills the last group of each structure."""
         cdef int64_t i
-        cdef int64_t[::1] key
+        cdef int64_t[:, ::1] key
         cdef const int64_t[::1] order
-        keys = np.empty(self.w.n, np.int64)
-        key = keys
+        both = np.empty((2, self.w.n), np.int64)
+        key = both
         for i in range(self.w.n):
-            key[i] = compute_structure_key(&self.w, i)
-        by = np.argsort(keys, kind="stable")
+            key[1, i] = compute_structure_key(&self.w, i, &key[0, i])
+        by, keys = np.lexsort(both), both[1]
         sizes = np.diff(np.flatnonzero(np.diff(keys[by])) + 1, prepend=0, append=self.w.n)
         places = -(-sizes // MAX_LANES) * MAX_LANES
         self.order = np.full(places.sum(), -1)
@@ -607,30 +607,23 @@ cdef class Worlds:
                                   bint judges) noexcept nogil:
         """Judge or solve worlds (n_worlds) in lanes as `process_world` does; return their number, -1 without lanes.
 
-        The code of worlds that no lane covers or solves stays LEFT. Half a group takes as long alone as in lanes.
+        The code of worlds that no lane covers or solves stays LEFT.
         """
         cdef lanes_t x
+        cdef lane_rows_t rows
         cdef task_t j
         cdef const int64_t* at
-        cdef int32_t ptr[MAX_LANE_ROWS + 1]
-        cdef int32_t kind[MAX_LANE_ROWS]
-        cdef int32_t lane, k, done = 0, width = self.width
+        cdef int32_t lane, k, r, done = 0, width = self.width
         cdef double* lam
         cdef int64_t i, n = self.w.n + 1
         cdef double* v
-        if n_worlds < 2 or 2 * n_worlds <= width or compute_structure_key(&self.w, worlds[0]) == 0:
+        if not arrange_lanes(&self.w, worlds, n_worlds, width, &x, &rows):
             return -1
-        for lane in range(1, n_worlds):
-            if not have_worlds_equal_structure(&self.w, worlds[0], worlds[lane]):
-                return -1
-        at = self.w.at + worlds[0] * PLACES
-        x.m, x.n, x.law, x.k = <int32_t>at[ROWS], <int32_t>at[VELOCITIES], self.w.blocks.law, <int32_t>at[BLOCKS]
         x.asymmetry = self.w.asymmetry if self.w.mass_ptr == NULL else -1.0
         if not grow_workspace_to(&h.at[LANES], 0, bind_lanes(&x, width, NULL)):
             return -1
         bind_lanes(&x, width, h.at[LANES].real)
-        list_lane_blocks(&self.w.blocks, <int32_t>at[BLOCK], &x, ptr, kind)
-        load_lanes(&x, &self.w, self.lam, worlds, n_worlds, width)
+        load_lanes(&x, &rows, &self.w, self.lam, worlds, n_worlds, width)
         prepare_lanes(&x, width)
         x.tol = tol
         if not judges:
@@ -654,10 +647,13 @@ cdef class Worlds:
                     continue
                 lam = self.lam + at[AT_ROW]
                 for k in range(x.m):
-                    lam[k] = x.lam[k * width + lane]
+                    if rows.row[k * width + lane] >= 0:
+                        lam[rows.row[k * width + lane]] = x.lam[k * width + lane]
                 k = <int32_t>lane_number(&x, LANE_STEPS, width, lane)
                 self.count[N_COUNTS * i] = self.count[N_COUNTS * i + 1] = k
-            self.store_judgement(i, &j, x.e[j.score.worst * width + lane] if j.score.worst >= 0 else 0.0)
+            r = j.score.worst                           # All errors are 0 if this is an empty row: the first row is as bad.
+            j.score.worst = max(rows.row[r * width + lane], 0) if r >= 0 else -1
+            self.store_judgement(i, &j, x.e[r * width + lane] if r >= 0 else 0.0)
             if judges:
                 self.number[RHS_ENERGY * n + i] = lane_number(&x, LANE_RHS, width, lane)
             v = self.v + at[VELOCITY]
