@@ -233,6 +233,13 @@ def _bound_transposed_product(
     size = length * float(length @ np.abs(y))
     if problem.matrix is not None:
         z = _multiply_transposed(problem.csr[rows], y[rows])
+        n = len(z) - len(problem.qp.target) if problem.has_singular_program else 0
+        if n and not y[:n].any():  # d has the unit of the cost, which has no part in J^T y.
+            ptr, columns, entries = problem.qp.jacobian
+            scale = problem.qp.scales[1]
+            size = np.zeros(len(z))
+            np.maximum.at(size, columns, np.abs(entries) * np.repeat(scale, np.diff(ptr)))
+            size *= float(np.sum(np.abs(y[n:]) / scale))
         return z, z, size
     r = _multiply_transposed(problem.jacobian[rows], y[rows])
     if problem.rows is None:

@@ -17,7 +17,8 @@ subtracted from the residuals of rows and columns (Arioli, Demmel, Duff 1989) (5
     X = max(sigma, max |x_j| / D_j),   norm_i = max_j (|J_ij| D_j) X + |t_i|,   cost_j = max_k (|P_jk| D_k) X + |q_j|
     Y = max(max |lambda_i| / E_i, max_j D_j cost_j),            norm_j = cost_j + max_i (E_i |J_ij|) Y
 
-The strict error compares rows with |t_i| and columns with |q_j| alone, unless these are rounding.
+The strict error compares rows with |t_i| and columns with |q_j| alone, unless these are rounding; such a row is compared
+with norm_i for X = sigma, so that large x do not hide rows that contradict each other.
 """
 from libc.math cimport INFINITY, exp2, fabs, isfinite, round, sqrt
 from libc.stdint cimport int32_t, int64_t
@@ -36,6 +37,7 @@ cdef double EQUILIBRATION_TOLERANCE = 1e-4  # Squared residual of (6) at which i
 cdef double NEGLIGIBLE_ENTRY = 1e-13        # Entries below this share of their row have no part in (6).
 cdef double NEGLIGIBLE_SIDE = 1e-14         # Right-hand sides below this share of the others are rounding.
 cdef double PLACEHOLDER = 1e18              # Larger numbers have no part in the size of the variables.
+cdef double MAX_SIZE_GROWTH = 1e10          # Largest ratio of x to sigma whose rounding the strict error accepts.
 cdef double MAX_SIZE_RATIO = 1e6            # Largest ratio of the size of the variables to the smallest right-hand side.
 
 
@@ -119,7 +121,7 @@ def judge_program(hessian, q_, jac, t_, scales, lam_, x_, int32_t free):
     active_ = np.zeros(m, bool)
     cdef double* lam = as_double_pointer(complementary, m)
     cdef unsigned char[::1] active = active_.view(np.uint8)
-    cdef Workspace workspace = allocate_bytes((7 * n + 3 * m + 1) * sizeof(double))
+    cdef Workspace workspace = allocate_bytes((7 * n + 4 * m + 1) * sizeof(double))
     cdef double* px = <double*>workspace.at             # (n) P x + q
     cdef double* cost = px + n
     cdef double* cost_norm = cost + n
@@ -130,6 +132,7 @@ def judge_program(hessian, q_, jac, t_, scales, lam_, x_, int32_t free):
     cdef double* slack = norm + n                       # (m) J x - t
     cdef double* row = slack + m                        # (m) divisor of (1)
     cdef double* row_norm = row + m                     # (m) norm_i
+    cdef double* start_norm = row_norm + m              # (m) norm_i for X = sigma
     cdef columns_t columns = columns_t(cost, cost_norm, force_norm, force, divisor, norm)
     cdef double v, w, share, excess
     cdef double top = scales[2], top_cost = 0.0, top_term = 0.0, terms = 0.0, gap = 0.0
@@ -163,6 +166,7 @@ def judge_program(hessian, q_, jac, t_, scales, lam_, x_, int32_t free):
             w = max(w, fabs(a.val[k]) * d[j])
             force_norm[j] = max(force_norm[j], fabs(a.val[k]) * e[i])
         row_norm[i] = w * top + fabs(t[i])
+        start_norm[i] = w * <double>scales[2] + fabs(t[i])
         row[i] = above_noise(row[i], row_norm[i])
         if not isfinite(lam[i]) or (i >= free and lam[i] < 0.0) or not has_cost:
             lam[i] = 0.0
@@ -182,7 +186,8 @@ def judge_program(hessian, q_, jac, t_, scales, lam_, x_, int32_t free):
             excess = max(fabs(slack[i]) - ROUNDING * row_norm[i], 0.0)
             gap += fabs(lam[i]) * excess
             row_error = max(row_error, ratio_or_inf(excess, row[i]))
-            strict = max(strict, ratio_or_inf(excess, fabs(t[i]) if fabs(t[i]) > NOISE * row_norm[i] else row[i]))
+            excess = max(fabs(slack[i]) - ROUNDING * min(row_norm[i], MAX_SIZE_GROWTH * start_norm[i]), 0.0)
+            strict = max(strict, ratio_or_inf(excess, fabs(t[i]) if fabs(t[i]) > NOISE * row_norm[i] else start_norm[i]))
     for j in range(n):
         excess = max(fabs(px[j] - force[j]) - ROUNDING * norm[j], 0.0)
         gap += fabs(x[j]) * excess

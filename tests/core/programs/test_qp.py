@@ -322,6 +322,17 @@ def test_solve_qp_without_forces_is_found_only_if_rows_hold(seed):
     assert answer.found and np.abs(P @ answer.x).max() <= 1e-6 and answer.primal_residual <= 1e-7
 
 
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("side", [1.0, 0.0])
+def test_two_rows_over_a_singular_p_that_contradict_each_other_are_infeasible(unit, side):
+    """a.x = 1 and 3 a.x = 4, or a.x <= -1 and 3 a.x >= 0, whose violations are small relative to a large x."""
+    rng = np.random.default_rng(3)
+    a, root = rng.normal(size=11), rng.normal(size=(11, 5))
+    rows = {"A": [a, 3.0 * a], "b": [1.0, 4.0]} if side else {"G": [a, -3.0 * a], "h": [-1.0, 0.0]}
+    answer = lv.solve_qp(unit * root @ root.T, np.zeros(11), **rows)
+    assert answer.solution.status is lv.Status.INFEASIBLE and not answer.found
+
+
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in (1, 2))])
 def test_solve_qp_of_contradicting_rows_among_many_returns_a_proof(seed):
     rng = np.random.default_rng(seed)
