@@ -492,17 +492,20 @@ def replace_error(
 ) -> Residual:
     """Return a residual with the error (m,) [N s] of an engine's motion and its rounding."""
     get_zero_impulse_reference(problem)
-    speeds = [problem.metric.weight * np.abs(e) for e in (error, rounding)]
-    energies = [float(np.sqrt(np.sum(problem.d * e * e))) for e in (error, rounding)]
-    relative, floor = (
-        divide_by_reference(problem.metric, e, float(v.max())) for e, v in zip(energies, speeds, strict=True)
+    found, rounds = (
+        measure.measure_error(problem.metric, np.ascontiguousarray(e)) for e in (error, rounding)
     )
+    energy, velocity, worst, by_island = found
+    floors = rounds[-1]
+    at = int(np.argmax(by_island))
     limit = MAX_EXCUSED_RESIDUAL if result.precision == "float64" else 1.0
-    is_rounding = _is_explained_by_rounding(relative, floor, result.precision)
+    above = [
+        0.0 if _is_explained_by_rounding(x, floor, result.precision) and x <= limit else x
+        for x, floor in zip(by_island, floors, strict=True)
+    ]
     return replace(
-        result, relative=relative, energy=energies[0], velocity=float(speeds[0].max()), roundoff_floor=floor,
-        worst_row=int(speeds[0].argmax()), error=mark_read_only(error), worst_island=-1,
-        above_floor=0.0 if is_rounding and relative <= limit else relative, moved_by="acceleration", **fields,
+        result, relative=by_island[at], energy=energy, velocity=velocity, roundoff_floor=floors[at], worst_row=worst,
+        error=mark_read_only(error), worst_island=-1, above_floor=max(above), moved_by="acceleration", **fields,
     )  # fmt: skip
 
 

@@ -27,8 +27,9 @@ from lavender_ext.judge.refine cimport estimate_factor_loss, min_reported_loss, 
 from lavender_ext.judge.rounding cimport mass_t, relative_size_of_change, compute_squared_float32_rounding
 from lavender_ext.judge.score cimport is_at_floor, make_empty_score, relative_residual, score_t
 from lavender_ext.judge.slack cimport compute_generalized_slack, compute_body_slack
-from lavender_ext.judge.tally cimport (add_block_error, compute_rhs_energy_norm, get_row_terms, make_empty_tally, score_all_blocks,
-                                       tally_t)
+from lavender_ext.judge.tally cimport (add_block_error, add_island_to_score, compute_rhs_energy_norm, get_block_in_order,
+                                       get_row_terms, index_of_island_begin, index_of_island_end, make_empty_tally,
+                                       score_all_blocks, tally_t)
 
 
 cdef void judge_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, bint floor,
@@ -396,6 +397,26 @@ def residuals_by_island(Data p, const double[::1] lam):
         table[i, 2] = sqrt(t.fast) if t.fast > 0.0 else 0.0
         table[i, 3], table[i, 4] = s.reference[2 * i], s.reference[2 * i + 1]
     return label_, table_
+
+
+def measure_error(Data p, const double[::1] e):
+    """Return E [sqrt J], V [m/s] and the worst row of errors e (m) [N s], and the relative residual of each island (n,)."""
+    cdef const islands_t* s = p.blocks.islands
+    cdef int32_t i, a, n = s.n if s != NULL else 1
+    cdef score_t score = make_empty_score()
+    cdef tally_t t, total = make_empty_tally()
+    cdef double[:, ::1] table = np.zeros((n, 2))
+    cdef double energy, velocity
+    score.by_island = &table[0, 0]
+    for i in range(n):
+        t = make_empty_tally()
+        for a in range(index_of_island_begin(&p.blocks, i), index_of_island_end(&p.blocks, i)):
+            add_block_error(&p.blocks, get_block_in_order(s.order if s != NULL else NULL, a), &e[0], &t)
+        add_island_to_score(&p.blocks, i, &e[0], &e[0], &t, NULL, &total, &score)
+    energy, velocity = sqrt(total.energy), sqrt(total.fast) if total.fast > 0.0 else 0.0
+    if s == NULL:
+        table[0, 0] = relative_residual(energy, velocity, p.reference_energy, p.reference_velocity)
+    return energy, velocity, total.worst, np.asarray(table)[:, 0].tolist()
 
 
 cdef class BestImpulse:
