@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray, mark_read_only
-from lavender.judge.residuals import Residual, residual
+from lavender.judge.residuals import Residual, measure_residual
 from lavender.judge.solution import raise_if_interrupted
 from lavender.problem import Problem, check_problem
 from lavender.solving.solve import solve
@@ -149,7 +149,7 @@ def motion_error(problem: Problem, impulse: Any, reference: Any = None) -> Motio
 
 def _compute_error(problem: Problem, x: FloatArray, reference: FloatArray) -> MotionError:
     """Compute the distance of an impulse x (m,) [N s] from a reference (m,) [N s]."""
-    judged = residual(problem, reference, "float64")
+    judged = measure_residual(problem, reference, "float64")
     values: dict[str, Any] = dict.fromkeys(("kinetic", "energy", "relative", "speed", "spin", "rows"))
     values |= {"body": -1, "spin_body": -1, "row": -1}
     notes = []

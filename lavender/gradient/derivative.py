@@ -13,7 +13,7 @@ from lavender.base.errors import CapabilityError, InputError
 from lavender.base.lazy_import import issparse
 from lavender.gradient.result import COEFFICIENT_INPUTS, INPUTS, MATRICES, CoefficientRows, Gradient
 from lavender.gradient.system import MAX_KERNEL_ROWS, System, factor_dense
-from lavender.judge.residuals import residual
+from lavender.judge.residuals import measure_residual
 from lavender.judge.states import States, compute_states, judge_and_linearise_impulse
 from lavender.problem import Problem, check_problem
 from lavender.problem.derived import cached_property
@@ -565,7 +565,7 @@ def derivative(problem: Problem, solution: Any) -> Derivative:
     impulse = problem.make_start(getattr(solution, "impulse", solution))
     linear = judge_and_linearise_impulse(problem, impulse, MAX_KERNEL_ROWS)
     if not linear.above_floor <= MAX_ACCEPTED_RESIDUAL:
-        error = residual(problem, impulse, "float64")
+        error = measure_residual(problem, impulse, "float64")
         if not (error.nothing_to_do and error.rounds):
             raise InputError(
                 "the impulse is not a solution of this problem: its relative residual is "

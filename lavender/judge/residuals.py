@@ -461,6 +461,18 @@ def residual(
     >>> early.verdict, early.excess > 1e4
     ('stopped before convergence', True)
     """
+    result = measure_residual(problem, impulse, precision, threshold, tol)
+    motion = problem.__dict__.get("engine_motion")  # `lavender.io.engine_motion.EngineMotion`
+    if motion is not None and not result.at_floor and np.array_equal(motion.impulse, result._impulse):
+        result = motion.judge(problem, result)
+    return result
+
+
+def measure_residual(
+    problem: Problem, impulse: Any, precision: str | None = None, threshold: float = DEFAULT_THRESHOLD,
+    tol: float = TOL,
+) -> Residual:  # fmt: skip
+    """Return the residual of impulses by `residual`, also of those with which an engine moved by its acceleration."""
     check_problem(problem)
     precision = problem.precision if precision is None else check_choice("precision", precision, PRECISIONS)
     if type(impulse) is not np.ndarray or impulse.dtype != float or not impulse.flags.c_contiguous:
@@ -468,7 +480,7 @@ def residual(
     if impulse.shape != (problem.m,):
         raise InputError(f"impulse has shape {impulse.shape}; ({problem.m},) is needed")
     if problem.cones.has_ellipse:
-        of_disk = residual(problem.disk, problem.on_disk(impulse), precision, threshold, tol)
+        of_disk = measure_residual(problem.disk, problem.on_disk(impulse), precision, threshold, tol)
         stretch = problem.cones.stretch
         with np.errstate(over="ignore"):
             error, slack = mark_read_only(stretch * of_disk.error), mark_read_only(of_disk.slack / stretch)
@@ -481,9 +493,6 @@ def residual(
         result = replace(result, threshold=check_float("threshold", threshold, low=0.0))
     if precision != "float64":
         result = _apply_float32_floor(problem, result, impulse)
-    motion = problem.__dict__.get("engine_motion")  # `lavender.io.engine_motion.EngineMotion`
-    if motion is not None and not result.at_floor and np.array_equal(motion.impulse, impulse):
-        result = motion.judge(problem, result)
     return result
 
 

@@ -28,7 +28,7 @@ from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import sparse as sp
 from lavender.judge.certificates import Proof, prove_infeasibility
-from lavender.judge.residuals import residual
+from lavender.judge.residuals import measure_residual
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.problem.ordering import group_blocks_by_island
@@ -259,7 +259,7 @@ def check_infeasibility_claim(
     if _is_proof(problem, own_claim, tol, deadline):
         message = f"{claim.message}; auto found the certificate".removeprefix("; ")
         return replace(claim, certificate=own_claim.certificate, message=message), ""
-    relative = residual(problem, impulse, "float64").relative
+    relative = measure_residual(problem, impulse, "float64").relative
     solution = f"auto found a solution to a relative residual of {relative:.1e}"
     return claim, solution if relative <= tol else ""
 

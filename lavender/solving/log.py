@@ -17,7 +17,7 @@ from lavender.judge.residuals import (
     MAX_EXCUSED_RESIDUAL,
     find_relative_at_zero,
     get_zero_impulse_reference,
-    residual,
+    measure_residual,
     reuse_or_judge_impulse,
 )
 from lavender.judge.solution import Claim, SolverStage, Status, sum_work_counts
@@ -78,7 +78,7 @@ class SolveLog:
             start = self._best_islands.begin
         self.impulse = start.copy()
         relative = find_relative_at_zero(self.problem, start)
-        self.best = float(residual(self.problem, start).relative) if relative is None else relative
+        self.best = float(measure_residual(self.problem, start).relative) if relative is None else relative
         self.start = self.impulse, self.best
 
     @property
@@ -260,7 +260,7 @@ class Recorder:
     def record_impulse(self, solver: str, iterations: int, impulse: FloatArray) -> None:
         """Record an impulse (m,) [N s] after this number of iterations of all stages."""
         time, begin = self.time, perf_counter()
-        r = residual(self.solve.problem, impulse, "float64")
+        r = measure_residual(self.solve.problem, impulse, "float64")
         self.append_later_records(solver, [(iterations, time, r.relative, r.energy, r.velocity)])
         self.solve.recording_time += perf_counter() - begin
 

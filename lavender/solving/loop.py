@@ -20,7 +20,7 @@ from lavender.judge.residuals import (
     Residual,
     combine_best_islands,
     judge_impulse,
-    residual,
+    measure_residual,
     reuse_or_judge_impulse,
 )
 from lavender.judge.solution import (
@@ -204,7 +204,7 @@ class Loop:
     def _record_residual(self) -> bool:
         """Record the residual and call the callback; return whether the callback stops the solve."""
         begin = perf_counter()
-        r = residual(self.problem, self.impulse, "float64")
+        r = measure_residual(self.problem, self.impulse, "float64")
         if self.records is not None:
             self.records.append((self.done, self.time, r.relative, r.energy, r.velocity))
         self.recording_time += perf_counter() - begin

@@ -35,7 +35,7 @@ from lavender.judge.residuals import (
     choose_start,
     combine_best_islands,
     get_zero_impulse_reference,
-    residual,
+    measure_residual,
 )
 from lavender.judge.solution import (
     CONVERGED,
@@ -313,7 +313,7 @@ class Prepared:
         if problem is not original:
             result, proof = mark_read_only(original.cones.stretch * solution.impulse), solution.certificate
             # The impulse is judged again, because multiplying it by the scale of the ellipses rounds it.
-            judged = residual(original, result, "float64", tol=tol)
+            judged = measure_residual(original, result, "float64", tol=tol)
             proof = None if proof is None else mark_read_only(original.cones.stretch * proof)
             solution = replace(solution, impulse=result, residual=judged, certificate=proof)
         name = name_start(original.guess, impulse)
@@ -430,7 +430,7 @@ class Prepared:
             claimed = loop.impulse.copy()
             loop.replace_by_best_impulse(start)
             if claim.status is CONVERGED and not np.array_equal(claimed, loop.impulse):
-                relative = residual(problem, claimed).relative
+                relative = measure_residual(problem, claimed).relative
                 if relative > loop.tol:
                     refutation = f"its own impulse has a relative residual of {relative:.2e}"
         return claim, refutation
@@ -512,7 +512,7 @@ def _call_in_original_tangents(
 ) -> Any:
     """Call the callback of a problem with ellipses with an impulse (m,) [N s] of its `disk`."""
     impulse = original.cones.stretch * impulse
-    return callback(done, impulse, residual(original, impulse, "float64"))
+    return callback(done, impulse, measure_residual(original, impulse, "float64"))
 
 
 def _make_solver(spec: SolverSpec, options: dict[str, Any]) -> Solver:

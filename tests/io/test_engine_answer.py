@@ -136,6 +136,17 @@ def test_acceleration_of_an_island_is_compared_with_this_island_alone():
     np.testing.assert_allclose((found.velocity, found.relative), 0.5 / 1.1, rtol=1e-9)
 
 
+@pytest.mark.parametrize("options", [{"max_iter": 50}, {"history": True}])
+def test_solve_from_an_engines_forces_judges_forces_also_if_its_acceleration_is_exact(options):
+    problem = lv.Problem.from_jacobian(np.eye(2), np.eye(2), [-3.0, -1.0], cones=lv.Cones.bounded([0.0, 0.0], np.inf))
+    exact = np.array([3.0, 1.0])
+    problem.__dict__["engine_motion"] = EngineMotion(0.5 * exact, exact, np.ones(2), "acceleration")
+    assert lv.residual(problem, 0.5 * exact).relative < 1e-12
+    solution = lv.solve(problem, impulse=0.5 * exact, tol=1e-9, **options)
+    assert solution.success
+    np.testing.assert_allclose(solution.impulse, exact, rtol=1e-9)
+
+
 for mark in every_model:
     test_engine_answer_of_unconverged_solve_predicts_the_next_velocity = mark(
         test_engine_answer_of_unconverged_solve_predicts_the_next_velocity
