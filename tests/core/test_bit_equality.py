@@ -138,6 +138,14 @@ def test_solve_in_another_way_has_the_bits_of_a_fresh_solve(name, way):
         assert facts(WAYS[way](fresh(problem), name, **options)) == expected, problem
 
 
+@pytest.mark.parametrize("name", SOLVERS)
+def test_prepared_solve_from_a_start_has_the_bits_of_a_fresh_solve(name):
+    for problem, options, _ in solved(name):
+        options = options | {"impulse": 10.0 * np.ones(problem.m)}
+        expected = facts(lv.solve(fresh(problem), name, **options))
+        assert facts(lv.prepare(fresh(problem), name).solve(**options)) == expected, problem
+
+
 # -- one run, and the same run in parts ---------------------------------------------------------------
 
 
