@@ -18,7 +18,7 @@ from lavender.cli.options import (
     print_escaped,
     reject_options_without_effect,
 )
-from lavender.io.stored import check_figure_path, check_writable
+from lavender.io.stored import check_writable
 
 
 @click.command()
@@ -63,7 +63,7 @@ def run(
     from lavender.sim.engine import Simulation
     from lavender.sim.engine import run as run_simulation
     from lavender.sim.engine.picture import Film
-    from lavender.sim.engine.run import format_step
+    from lavender.sim.engine.run import check_figure_path, format_step
     from lavender.sim.scene import Scene
 
     reject_options_without_effect(context, without_record=record is None)

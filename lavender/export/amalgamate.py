@@ -16,32 +16,11 @@ EXTRACT_C: dict[str, Any] = runpy.run_path(str(HERE.parent / "sim" / "web" / "ex
 ExtractionError: type[Exception] = EXTRACT_C["ExtractionError"]
 #: Modules of lavender_ext with functions that the library uses.
 MODULES = (
-    "core.assemble",
-    "core.blocks",
-    "core.checks",
-    "core.generalized",
-    "core.order",
-    "core.problem",
-    "judge.measure",
-    "judge.stopping_test",
-    "sweep.packed",
-    "sweep.pgs",
-    "sweep.serial",
-    "local.gauss_seidel",
-    "accelerate.accelerated",
-    "accelerate.admm",
-    "driver.driver",
-    "newton.solve",
-    "pivot.direct",
-    "pivot.lemke",
-    "pivot.principal",
-    "factor.graph",
-    "factor.linear",
-    "factor.symbolic",
-    "engine.arrays",
-    "engine.substep",
-    "driver.memory",
-)
+    "core.assemble", "core.blocks", "core.checks", "core.generalized", "core.order", "core.problem", "judge.measure",
+    "judge.stopping_test", "sweep.packed", "sweep.pgs", "sweep.serial", "local.gauss_seidel", "accelerate.accelerated",
+    "accelerate.admm", "driver.driver", "newton.solve", "pivot.direct", "pivot.lemke", "pivot.principal",
+    "factor.graph", "factor.linear", "factor.symbolic", "engine.arrays", "engine.substep", "driver.memory",
+)  # fmt: skip
 HEADER = HERE / "c" / "lavender.h"
 FRONT = [
     HERE / "capi" / f"{name}.c"

@@ -25,13 +25,8 @@ def engine_image(simulation: Simulation) -> bytes:
     """
     state = simulation.snapshot()
     index = state.index.astype("<i4").tobytes()
-    body = (
-        state.size.astype("<i4").tobytes()
-        + state.real.astype("<f8").tobytes()
-        + index
-        + bytes(-len(index) % 8)
-    )
-    body += state.keys.astype("<u8").tobytes()
+    body = state.size.astype("<i4").tobytes() + state.real.astype("<f8").tobytes()
+    body += index + bytes(-len(index) % 8) + state.keys.astype("<u8").tobytes()
     h, full = 0, 2**64 - 1
     for word in np.frombuffer(body, "<u8").tolist():
         h = ((h ^ word) * 0x9E3779B97F4A7C15) & full

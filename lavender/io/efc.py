@@ -168,20 +168,12 @@ def from_efc(
     loss = _broadcast_numbers_to_rows("efc_frictionloss", efc_frictionloss, n, m)
     count = np.full(n, m) if nefc is None else check_row_counts("nefc", nefc, n, m)
     used_rows = np.arange(m) < count[:, None]
-    _check_rows(
-        "efc_type",
-        row_type,
-        used_rows & ~((row_type >= 0.0) & (row_type <= ELLIPTIC) & (row_type == np.rint(row_type))),
-        "a value of mjtConstraint, 0 to 7,",
-    )
+    is_type = (row_type >= 0.0) & (row_type <= ELLIPTIC) & (row_type == np.rint(row_type))
+    _check_rows("efc_type", row_type, used_rows & ~is_type, "a value of mjtConstraint, 0 to 7,")
     _check_rows("efc_D", inv_compliance, used_rows & (inv_compliance <= 0.0), "above 0")
     has_loss = used_rows & ((row_type == FRICTION[0]) | (row_type == FRICTION[1]))
-    _check_rows(
-        "efc_frictionloss",
-        loss,
-        has_loss & ~((loss >= 0.0) & (loss < np.inf)),
-        "a finite number of at least 0",
-    )
+    is_wrong = has_loss & ~((loss >= 0.0) & (loss < np.inf))
+    _check_rows("efc_frictionloss", loss, is_wrong, "a finite number of at least 0")
     mass = _convert_mass(M, n, nv)
     precision = get_common_precision(jac, mass, before)
     before = as_array("qvel", before, (n, nv), finite=False)

@@ -91,12 +91,8 @@ def _convert_solver_arrays(scene: Any, solver: Any) -> EngineStep:
     _check_configuration(scene, solver)
     rows = _copy_to_host(constraints.n_constraints).astype(np.int32)
     equalities, losses, contact_rows = (
-        _copy_to_host(x).astype(np.int64)
-        for x in (
-            constraints.n_constraints_equality,
-            constraints.n_constraints_frictionloss,
-            constraints.n_constraints_cone,
-        )
+        _copy_to_host(getattr(constraints, f"n_constraints_{kind}")).astype(np.int64)
+        for kind in ("equality", "frictionloss", "cone")
     )
     n, m = len(rows), int(rows.max(initial=0))
     size = int(config.rows_per_contact)
@@ -145,8 +141,7 @@ def _convert_solver_arrays(scene: Any, solver: Any) -> EngineStep:
         friction="coulomb" if config.enable_signorini_contact else "cone",
     )  # fmt: skip
     converged = ~_copy_to_host(constraints.improved).astype(bool)
-    if result.impulse is None:
-        raise AssertionError("from_efc returns impulses if it is given forces")
+    assert result.impulse is not None
     return EngineStep(result.batch, result.impulse, Claims(converged, np.full(n, -1), {}))
 
 

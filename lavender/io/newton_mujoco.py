@@ -71,10 +71,9 @@ def _convert_solver_arrays(solver: Any, data: Any, model: Any, velocity: Any) ->
         )
     used = np.minimum(rows, capacity)
     m = int(used.max(initial=0))
-    efc = {
-        name: getattr(data.efc, name).numpy()[:, :m]
-        for name in ("D", "aref", "type", "frictionloss", "force")
-    }
+    names = "D", "aref", "type", "frictionloss", "force"
+    arrays = {f"efc_{name}": getattr(data.efc, name).numpy()[:, :m] for name in names}
+    arrays |= {name: getattr(data, name).numpy() for name in ("qacc_smooth", "qfrc_smooth", "qacc")}
     dropped_contacts = max(count - len(contact.dim), 0)
     count -= dropped_contacts
     world, address, dim, friction = (
@@ -86,23 +85,10 @@ def _convert_solver_arrays(solver: Any, data: Any, model: Any, velocity: Any) ->
     else:
         mass = mass[:, :nv, :nv]
     result = from_efc(
-        efc_J=jac[:, :m, :nv].copy(),
-        efc_D=efc["D"],
-        efc_aref=efc["aref"],
-        efc_type=efc["type"],
-        efc_frictionloss=efc["frictionloss"],
-        efc_force=efc["force"],
-        M=mass,
-        qvel=velocity.astype(jac.dtype),
-        qacc_smooth=data.qacc_smooth.numpy(),
-        qfrc_smooth=data.qfrc_smooth.numpy(),
-        qacc=data.qacc.numpy(),
-        timestep=solver.mjw_model.opt.timestep.numpy(),
-        nefc=used,
-        contacts=(world, address[:, 0], dim, friction),
-    )
-    if result.impulse is None:
-        raise AssertionError("from_efc returns impulses if it is given forces")
+        efc_J=jac[:, :m, :nv].copy(), M=mass, qvel=velocity.astype(jac.dtype), **arrays, nefc=used,
+        timestep=solver.mjw_model.opt.timestep.numpy(), contacts=(world, address[:, 0], dim, friction),
+    )  # fmt: skip
+    assert result.impulse is not None
     iterations = data.solver_niter.numpy().astype(np.int64)
     limit = int(np.max(to_numpy("iterations", solver.mjw_model.opt.iterations)))
     dropped = {

@@ -73,9 +73,11 @@ def read_npz(path: str | os.PathLike[str]) -> Stored:
             b = as_array("entry 'b'", archive["b"], (None,))
             cones = _build_box_cones(archive, len(b))
             problem = Problem(b, cones, _read_matrix(archive), name=Path(path).stem)
-            compare = str(archive.read_scalar("compare")) if "compare" in archive else ""
+            compare = archive["compare"].ravel().tolist() if "compare" in archive else [""]
+            if len(compare) != 1:
+                raise InputError(f"entry 'compare' is {compare!r:.60}; one text is needed")
             impulse, slack = (_read_vector(archive, name, problem) for name in ("l_ref", "w_ref"))
-            return Stored(problem, "box", impulse, slack, compare)
+            return Stored(problem, "box", impulse, slack, str(compare[0]))
         if "q" in archive:
             return Stored(_read_program(archive, name=Path(path).stem), "program")
     except InputError as error:
@@ -98,49 +100,37 @@ def write_npz(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = 
     """
     check_problem(problem)
     arrays: dict[str, Any] = {"lavender_format": np.int64(FORMAT_VERSION)}
-    rows, general, qp = problem.rows, problem.generalized, problem.qp
+    rows, general, qp, cones = problem.rows, problem.generalized, problem.qp, problem.cones
     if qp is None:
         arrays["b"] = problem.b
-        arrays |= {name: getattr(problem.cones, name.removeprefix("cones_")) for name in CONES}
-        if problem.cones.has_rolling:
-            arrays["cones_rolling"] = problem.cones.rolling
+        arrays |= {name: getattr(cones, name.removeprefix("cones_")) for name in CONES}
+        arrays |= {"cones_rolling": cones.rolling} if cones.has_rolling else {}
     if qp is not None:
         operator = "program"
         for name, x in qp.arrays.items():
-            if issparse(x):
-                columns = sp.csc_array(x)
-                arrays |= {f"{name}_{part}": getattr(columns, part) for part in COMPRESSED}
-                arrays[f"{name}_shape"] = np.array(x.shape, np.int64)
-            else:
-                arrays[name] = x
+            arrays |= _split_matrix(name, sp.csc_array(x)) if issparse(x) else {name: x}
     elif rows is not None:
         operator = "rows"
         arrays |= {name: getattr(rows, name.removeprefix("rows_")) for name in ROWS}
     elif general is not None:
         operator = "generalized"
         for name in ("jac", "mass"):
-            arrays |= {f"general_{name}_{part}": getattr(getattr(general, name), part) for part in COMPRESSED}
+            arrays |= _split_matrix(f"general_{name}", getattr(general, name), has_shape=False)
         arrays["general_v_free"] = general.v_free
     elif issparse(problem.matrix):
-        operator, a = "csr", problem.matrix
-        arrays |= {f"A_{part}": getattr(a, part) for part in COMPRESSED} | {
-            "A_shape": np.array(a.shape, np.int64)
-        }
+        operator = "csr"
+        arrays |= _split_matrix("A", problem.matrix)
     else:
         operator, arrays["A"] = "dense", problem.matrix
-    stored = {"compliance": problem.compliance, "guess": problem.guess, "key": problem.key}
+    stored = {
+        "compliance": problem.compliance, "guess": problem.guess, "key": problem.key,
+        "angular": None if problem.angular is None else problem.angular.astype(np.int8),
+        "impulse": None if impulse is None else problem.make_start(impulse),
+    }  # fmt: skip
     arrays |= {name: x for name, x in stored.items() if x is not None}
-    if problem.angular is not None:
-        arrays["angular"] = problem.angular.astype(np.int8)
-    if impulse is not None:
-        arrays["impulse"] = problem.make_start(impulse)
     names = None if problem.names is None else list(problem.names)
-    meta: dict[str, Any] = {
-        "operator": operator,
-        "friction": problem.friction,
-        "name": problem.name,
-        "names": names,
-    }
+    meta: dict[str, Any] = {"operator": operator, "friction": problem.friction}
+    meta |= {"name": problem.name, "names": names}
     if problem.precision != "float64":
         meta["precision"] = problem.precision
     if general is not None and qp is None:
@@ -157,11 +147,19 @@ def write_npz(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = 
     write_arrays(path, arrays)
 
 
+def _split_matrix(name: str, matrix: Any, has_shape: bool = True) -> dict[str, Any]:
+    """Return the entries of a matrix in compressed rows or columns, by default with its shape."""
+    shape = {f"{name}_shape": np.array(matrix.shape, np.int64)} if has_shape else {}
+    return {f"{name}_{part}": getattr(matrix, part) for part in COMPRESSED} | shape
+
+
 def _read_own_format(archive: Arrays) -> Stored:
     """Read a problem in our own format."""
-    version = archive.read_scalar("lavender_format")
-    if version != FORMAT_VERSION or isinstance(version, bool):
-        raise InputError(f"lavender_format is {version!r}; this lavender reads {FORMAT_VERSION}: update it")
+    version = archive["lavender_format"].ravel().tolist()
+    if version != [FORMAT_VERSION] or isinstance(version[0], bool):
+        raise InputError(
+            f"lavender_format is {version!r:.60}; this lavender reads {FORMAT_VERSION}: update it"
+        )
     meta = _read_meta(archive)
     for name in archive:
         if archive[name].dtype.kind not in "iuf":

@@ -162,7 +162,12 @@ def _convert_constraints(
     nv = int(model.nv)
     rows: list[Any] = [np.zeros((0, nv))]
     targets: list[Any] = [np.zeros(0)]
-    cones, names, angular, rotates = Cones.free(0), [], [], _find_angular_velocities(model)
+    cones, names, angular, rotates = Cones.free(0), [], [], np.zeros(nv, bool)
+    for joint in list(model.joints)[1:]:  # Mark the angular velocities of the model [rad/s].
+        name, first, count = joint.shortname().removeprefix("JointModel"), int(joint.idx_v), int(joint.nv)
+        is_angular = name.startswith(("R", "Spherical", "Universal", "Helical", "H"))
+        begin = 0 if is_angular else {"FreeFlyer": 3, "Planar": 2}.get(name, count)
+        rotates[first + begin : first + count] = True
     for i, (wrapped_model, wrapped_data) in enumerate(pairs):
         model_of = _unwrap_constraint(wrapped_model)
         _check_constraint(i, model, model_of, _unwrap_constraint(wrapped_data))
@@ -191,17 +196,6 @@ def _convert_constraints(
         blocks = own_cones.n_blocks
         names += [word] if blocks == 1 else [f"{word}, row {k}" for k in range(blocks)]
     return np.concatenate(rows), np.concatenate(targets), cones, names, angular
-
-
-def _find_angular_velocities(model: Any) -> Any:
-    """Return which velocities (nv,) of a model are angular [rad/s]."""
-    angular = np.zeros(int(model.nv), bool)
-    for joint in list(model.joints)[1:]:
-        name, first, count = joint.shortname().removeprefix("JointModel"), int(joint.idx_v), int(joint.nv)
-        rotates = name.startswith(("R", "Spherical", "Universal", "Helical", "H"))
-        begin = 0 if rotates else {"FreeFlyer": 3, "Planar": 2}.get(name, count)
-        angular[first + begin : first + count] = True
-    return angular
 
 
 def _compute_mass_and_acceleration(

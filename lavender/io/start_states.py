@@ -231,17 +231,6 @@ def check_array_names(source: str, names: Iterable[str], valid: Iterable[str]) -
             raise InputError(f"{source} has an array {name!r}; the arrays of a state are {', '.join(valid)}")
 
 
-def _read_keyframes(mj: Any, model: Any) -> StartStates:
-    """Return the model's keyframes; raise InputError if it has none."""
-    if not model.nkey:
-        raise InputError("states are 'keyframes', and the model has none; a keyframe is needed")
-    data, vectors = mj.MjData(model), []
-    for key in range(model.nkey):
-        mj.mj_resetDataKeyframe(model, data, key)
-        vectors.append(_read_state_vector(mj, model, data))
-    return StartStates(np.array(vectors), np.array(model.key_ctrl, float).reshape(model.nkey, model.nu))
-
-
 def _read_arrays(mj: Any, model: Any, arrays: Mapping[str, Any], source: str) -> StartStates:
     """Build states from arrays by name; `source` begins the error messages."""
     check_array_names(source, arrays, (VECTOR, *NEEDED, *OPTIONAL))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import json
 import math
 import os
@@ -155,12 +154,6 @@ class Arrays(dict[str, np.ndarray]):
     def __missing__(self, name: str) -> np.ndarray:
         raise InputError(f"it has no entry {name!r}; it has {', '.join(self) or 'nothing'}")
 
-    def read_scalar(self, name: str) -> Any:
-        """Return the single value of an entry."""
-        if self[name].size != 1:
-            raise InputError(f"entry {name!r} has shape {self[name].shape}; one value is needed")
-        return self[name].reshape(()).item()
-
 
 def read_arrays(path: str | os.PathLike[str]) -> Arrays:
     """Read all arrays of an archive (.npz); nothing is unpickled."""
@@ -178,31 +171,6 @@ def read_arrays(path: str | os.PathLike[str]) -> Arrays:
         entry = f"entry {name!r} of {path}" if name else f"{path}"
         raise InputError(f"{entry} cannot be read: {error}; an .npz archive of arrays is needed") from None
     return arrays
-
-
-def check_figure_path(path: str | os.PathLike[str]) -> Path:
-    """Return the path of a figure, with .png if it has no suffix; InputError if matplotlib cannot write the format."""
-    from matplotlib.backend_bases import FigureCanvasBase
-
-    path = as_path(path)
-    path = path if path.suffix else path.with_name(path.name + ".png")
-    known = ", ".join(sorted(FigureCanvasBase.get_supported_filetypes()))
-    if path.suffix[1:].lower() not in known.split(", "):
-        raise InputError(f"cannot write the figure {str(path)!r}: its suffix must be of {known}")
-    return path
-
-
-def write_figure(canvas: Any, path: str | os.PathLike[str]) -> None:
-    """Write a figure of matplotlib with `write_atomically`; the suffix selects the format (default: png)."""
-    from matplotlib import rc_context
-
-    path, content = check_figure_path(path), io.BytesIO()
-    try:
-        with rc_context({"pdf.fonttype": 42}):  # Embed TrueType fonts, since publishers reject Type 3 fonts.
-            canvas.savefig(content, format=path.suffix[1:].lower())
-    except (ValueError, OverflowError) as error:
-        raise InputError(f"cannot write the figure {str(path)!r}: {error}") from None
-    write_bytes(path, content.getvalue())
 
 
 def as_path(path: str | os.PathLike[str]) -> Path:

@@ -260,7 +260,7 @@ META = {"operator": "dense", "friction": "coulomb", "name": "", "names": None}
     ("changes", "sign"),
     [
         ({"lavender_format": np.int64(2)}, "this lavender reads 1"),
-        ({"lavender_format": np.array([1, 1])}, "one value"), ({"A": None}, "no entry 'A_shape'"),
+        ({"lavender_format": np.array([1, 1])}, "this lavender reads 1"), ({"A": None}, "no entry 'A_shape'"),
         ({"cones_mu": None}, "no entry 'cones_mu'"),
         *(({"meta": np.frombuffer(text, np.uint8)}, "JSON") for text in (b"{", b"[]", b"\xff\xfe", b"[" * 100_000)),
         ({"meta": {k: x for k, x in META.items() if k != "names"}}, "entry 'meta' has no names"),

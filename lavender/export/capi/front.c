@@ -34,6 +34,7 @@ struct lav_solver {
   kept_t kept;
   int32_t form, has_keys, is_short, n_v; /* n_v: number of velocities. */
   int32_t in_rows; /* Every block has one row, and the sweep uses the given order. */
+  int32_t rubs;    /* A contact has friction rows: then the law and the supported sweeps matter, even if mu is 0. */
   blocks_t p;
   csr_t a;
   rows_t r;

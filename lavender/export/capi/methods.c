@@ -2,14 +2,6 @@
 /* -- sweeps, accelerated or not --------------------------------------------------------------------------------------- */
 
 #ifndef LAV_SWEEPS_ONLY
-/* Return whether a contact has friction rows: then the law and the supported sweeps matter, even if mu is 0. */
-static int32_t has_tangents(const blocks_t *p) {
-  int32_t i;
-  for (i = 0; i < p->n_blocks; i++)
-    if (p->kind[i] != LAV_ROW && p->ptr[i + 1] - p->ptr[i] > 1) return 1;
-  return 0;
-}
-
 static int32_t restarts_of(const lav_solver *s) {
   if (s->options.method == LAV_ADMM) return s->factors;
   return (int32_t)(is_accelerated(&s->options) ? accelerate_accelerated_count_undone_steps(&s->acceleration) : s->swept.context.fallbacks);
@@ -23,7 +15,7 @@ static int32_t start_sweeps(lav_solver *s) {
   int64_t numbers, more = 0;
   double *workspace;
 #ifndef LAV_SWEEPS_ONLY
-  const int32_t rubs = has_tangents(&s->p), is_cone = s->p.law == LAV_CONE && rubs;
+  const int32_t rubs = s->rubs, is_cone = s->p.law == LAV_CONE && rubs;
   const int32_t memory = o->method == LAV_NNCG ? 0 : o->memory, convex = rubs && !is_cone ? o->convex : 0,
                 cone_sweeps = accelerate_accelerated_count_convex_iterations(s->p.n_rows, convex);
   x->packing.single = is_accelerated(o);

@@ -131,9 +131,11 @@ static int32_t fill_blocks(lav_solver *s, const lav_problem *q) {
   int32_t *ptr = (int32_t *)(uintptr_t)s->p.ptr, *kind = (int32_t *)(uintptr_t)s->p.kind, i, single = 1;
   const int32_t k = q->n_blocks, m = q->n_rows;
   for (i = 0; i <= k; i++) ptr[i] = q->block_ptr ? q->block_ptr[i] : i;
+  s->rubs = 0;
   for (i = 0; i < k; i++) {
     kind[i] = q->kind ? q->kind[i] : LAV_ROW;
     if (kind[i] != LAV_ROW || ptr[i + 1] - ptr[i] > 1) single = 0;
+    if (kind[i] != LAV_ROW && ptr[i + 1] - ptr[i] > 1) s->rubs = 1;
   }
   copy_or(s->p.lower, q->lower, m, -INFINITY);
   copy_or(s->p.upper, q->upper, m, INFINITY);
@@ -185,27 +187,20 @@ static void fill_matrix(const int32_t *to_ptr, const int32_t *to_index, const do
   }
 }
 
-/* Copy the frames of contacts; correct those that are only accurate to float32: n / |n|, then t orthogonalised and normalised. */
-static void fill_frames(lav_solver *s, const lav_problem *q) {
-  double *normal = (double *)(uintptr_t)s->r.normal, *tangent = (double *)(uintptr_t)s->r.tangent;
-  int32_t i;
-  COPY(normal, q->normal, 3 * (int64_t)s->r.n_contacts);
-  COPY(tangent, q->tangent, 3 * (int64_t)s->r.n_contacts);
-  for (i = 0; i < s->r.n_contacts; i++, normal += 3, tangent += 3) {
-    if (!(core_faults_measure_frame_error(normal, tangent) <= EXACT)) core_faults_orthonormalise_frame(normal, tangent);
-  }
-}
-
 static void fill_bodies(lav_solver *s, const lav_problem *q) {
   const int64_t n = q->n_bodies, c = s->r.n_contacts, mj = s->p.ptr[q->n_joints];
   double *b = (double *)(uintptr_t)s->p.b;
+  double *normal = (double *)(uintptr_t)s->r.normal, *tangent = (double *)(uintptr_t)s->r.tangent;
   int32_t i;
   COPY(s->r.inv_mass, q->inv_mass, n);
   COPY(s->r.inv_inertia, q->inv_inertia, 9 * n);
   COPY(s->r.joint_body, q->joint_body, 2 * (int64_t)q->n_joints);
   COPY(s->r.jac, q->jac, 12 * mj);
   COPY(s->r.contact_body, q->contact_body, 2 * c);
-  fill_frames(s, q);
+  COPY(normal, q->normal, 3 * c);
+  COPY(tangent, q->tangent, 3 * c);
+  for (i = 0; i < c; i++, normal += 3, tangent += 3) /* Frames accurate to float32: n / |n|, then t orthonormalised. */
+    if (!(core_faults_measure_frame_error(normal, tangent) <= EXACT)) core_faults_orthonormalise_frame(normal, tangent);
   COPY(s->r.arm_a, q->arm_a, 3 * c);
   COPY(s->r.arm_b, q->arm_b, 3 * c);
   copy_or(s->r.compliance, q->compliance, q->n_rows, 0.0);

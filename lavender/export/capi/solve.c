@@ -278,23 +278,16 @@ int32_t lav_set(lav_solver *solver, const lav_problem *problem) {
   return leave(solver, code);
 }
 
-/* Copy a budget, with the relative residual that guarantees velocity_tol as tol: relative <= velocity_tol / V0 => V <= velocity_tol.
- * V0 is the velocity error of the zero impulse, whose relative residual is 1. */
-static lav_budget with_relative_tolerance(const lav_solver *s, const lav_budget *budget) {
-  const double reference = s->p.n_rows > 0 ? s->start[1] : 0.0;
-  lav_budget out = *budget;
-  if (out.velocity_tol > 0.0) out.tol = out.velocity_tol < reference ? out.velocity_tol / reference : 1.0;
-  return out;
-}
-
 static int32_t run(lav_solver *s, const lav_budget *requested, lav_result *out) {
   const method_t *row = row_of(s->options.method);
+  const double reference = s->p.n_rows > 0 ? s->start[1] : 0.0; /* V0, the velocity error of the zero impulse. */
   lav_budget limits;
   const lav_budget *budget = &limits;
   double first; /* Residual of the result before refinement. */
   if (!s->ready) return LAV_ERROR_NO_PROBLEM;
   if (requested->size != sizeof *requested || out->size != sizeof *out) return LAV_ERROR_VERSION;
-  limits = with_relative_tolerance(s, requested);
+  limits = *requested; /* This tol guarantees velocity_tol: relative <= velocity_tol / V0 => V <= velocity_tol. */
+  if (limits.velocity_tol > 0.0) limits.tol = limits.velocity_tol < reference ? limits.velocity_tol / reference : 1.0;
   if (budget->iterations < 0 || !(budget->tol >= 0.0 && budget->tol < INFINITY)) return LAV_ERROR_OPTION;
   if (!(budget->velocity_tol >= 0.0 && budget->velocity_tol < INFINITY)) return LAV_ERROR_OPTION;
   if (!(budget->seconds >= 0.0 && budget->seconds < INFINITY)) return LAV_ERROR_OPTION;

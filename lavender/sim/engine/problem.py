@@ -39,30 +39,16 @@ def build_problem(state: State, bodies: Sequence[str], joints: Sequence[str], na
         size = compute_norm(side)
         tangent[i] = side / size if size > 0.0 else 0.0  # For a zero normal, `Rows` raises the error.
     rows = Rows(
-        inv_mass=a["inv_mass"].copy(),
-        inv_inertia=a["inv_inertia"].copy(),
-        v_free=a["v_free"].copy(),
-        jac=a["jac"].copy(),
-        joint_ptr=a["ptr"][: kj + 1].copy(),
-        joint_body=a["joint_body"].copy(),
-        normal=normal,
-        tangent=tangent,
-        arm_a=a["arm_a"][:c].copy(),
-        arm_b=a["arm_b"][:c].copy(),
-        contact_body=a["contact_body"][:c].copy(),
-        copy=False,
-    )
+        **{name: a[name].copy() for name in ("inv_mass", "inv_inertia", "v_free", "jac", "joint_body")},
+        **{name: a[name][:c].copy() for name in ("arm_a", "arm_b", "contact_body")},
+        joint_ptr=a["ptr"][: kj + 1].copy(), normal=normal, tangent=tangent, copy=False,
+    )  # fmt: skip
     lower, upper = np.full(m, -np.inf), np.full(m, np.inf)
     lower[:mj], upper[:mj] = a["lower"][:mj], a["upper"][:mj]
     cones = Cones(
-        ptr=a["ptr"][: k + 1].copy(),
-        kind=a["kind"][:k].copy(),
-        lower=lower,
-        upper=upper,
-        mu=a["mu"][:k].copy(),
-        patch_radius=a["patch_radius"][:k].copy(),
-        rolling=a["rolling"][:k].copy() if len(a["rolling"]) else np.zeros(k),
-    )
+        **{name: a[name][:k].copy() for name in ("kind", "mu", "patch_radius")}, lower=lower, upper=upper,
+        ptr=a["ptr"][: k + 1].copy(), rolling=a["rolling"][:k].copy() if len(a["rolling"]) else np.zeros(k),
+    )  # fmt: skip
     # Keys of joints are larger than keys of contacts: body numbers have 24 bits, and the pair (2^24 - 1, ...) is
     # unused.
     joint_keys = np.uint64(0xFFFFFF << 40) + np.arange(kj, dtype=np.uint64)
@@ -96,13 +82,10 @@ def summarise_residual(problem: Problem, impulse: FloatArray) -> dict[str, Any]:
     """Return the values of `Simulation.residual` for impulses (m,) [N s]."""
     result = residual(problem, impulse)
     return {
-        "relative": result.relative,
-        "energy": result.energy,
-        "velocity": result.velocity,
-        "floor": result.roundoff_floor,
-        "worst": result.worst_name,
+        "relative": result.relative, "energy": result.energy, "velocity": result.velocity,
+        "floor": result.roundoff_floor, "worst": result.worst_name,
         "share": _compute_energy_fractions(problem, result),
-    }
+    }  # fmt: skip
 
 
 def summarise_motion(problem: Problem, impulse: FloatArray, moving_bodies: Sequence[str]) -> dict[str, Any]:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from os import PathLike
+from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from lavender.base.arrays import FloatArray, check_int
-from lavender.base.errors import require_packages
-from lavender.io.stored import prepare_step_folder, write_figure, write_text
+from lavender.base.errors import InputError, require_packages
+from lavender.io.stored import as_path, prepare_step_folder, write_bytes, write_text
 from lavender.sim.engine.simulation import Simulation
 from lavender.sim.engine.stepping import get_sweep_order
 from lavender.sim.engine.values import SOLVER_FIELDS
@@ -78,8 +80,10 @@ class Trace:
     def plot(self, path: str | PathLike[str]) -> None:
         """Write a figure of residuals, contacts with cache matches, and depth over time."""
         require_packages("a figure of a run", "matplotlib")
+        from matplotlib import rc_context
         from matplotlib.figure import Figure
 
+        path, content = check_figure_path(path), io.BytesIO()
         canvas = Figure(figsize=(8, 7), layout="constrained")
         top, middle, bottom = canvas.subplots(3, 1, sharex=True)
         for name, label in (
@@ -96,7 +100,26 @@ class Trace:
             axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
         bottom.plot(self.time, 1e3 * self.depth)
         bottom.set(title="largest depth", xlabel="time [s]", ylabel="[mm]", ylim=(0, None))
-        write_figure(canvas, path)
+        try:
+            with rc_context(
+                {"pdf.fonttype": 42}
+            ):  # Embed TrueType fonts, since publishers reject Type 3 fonts.
+                canvas.savefig(content, format=path.suffix[1:].lower())
+        except (ValueError, OverflowError) as error:
+            raise InputError(f"cannot write the figure {str(path)!r}: {error}") from None
+        write_bytes(path, content.getvalue())
+
+
+def check_figure_path(path: str | PathLike[str]) -> Path:
+    """Return the path of a figure, with .png if it has no suffix; InputError if matplotlib cannot write the format."""
+    from matplotlib.backend_bases import FigureCanvasBase
+
+    path = as_path(path)
+    path = path if path.suffix else path.with_name(path.name + ".png")
+    known = ", ".join(sorted(FigureCanvasBase.get_supported_filetypes()))
+    if path.suffix[1:].lower() not in known.split(", "):
+        raise InputError(f"cannot write the figure {str(path)!r}: its suffix must be of {known}")
+    return path
 
 
 def run(

@@ -87,12 +87,8 @@ class State:
             even = rows == contacts * per
             block = a["impulse"][first : first + rows].reshape(contacts, per).copy if even else None
             out = self.setting[SETTING["out"] : SETTING["out"] + 8].view(SolverValues)
-            array_of = {
-                "positions": "x",
-                "quaternions": "q",
-                "velocities": "v",
-                "joint_impulses": "joint_impulse",
-            }
+            array_of = {"positions": "x", "quaternions": "q", "velocities": "v"}
+            array_of["joint_impulses"] = "joint_impulse"
             each = {"pair": "contact_pair", "point": "point", "normal": "normal", "tangent": "tangent"}
             views = ObservationViews(
                 arrays={**{name: a[array].copy for name, array in array_of.items()}, "solver": out.copy},

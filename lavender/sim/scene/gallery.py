@@ -76,18 +76,12 @@ def card_house(scene: Scene, levels: int = 2, lean: float = 0.3) -> None:
         apex = [(i - 0.5 * (pairs - 1)) * pitch for i in range(pairs)]
         for x in apex:
             for side in (1.0, -1.0):
-                scene.add_box(
-                    (thick, width, tall),
-                    mass,
-                    position=(x - side * 0.5 * half_width, 0.0, z + 0.5 * height),
-                    quaternion=make_quaternion((0.0, 1.0, 0.0), side * lean),
-                )
+                place = (x - side * 0.5 * half_width, 0.0, z + 0.5 * height)
+                turn = make_quaternion((0.0, 1.0, 0.0), side * lean)
+                scene.add_box((thick, width, tall), mass, position=place, quaternion=turn)
         for left, right in pairwise(apex):
-            scene.add_box(
-                (pitch - 1e-3, width, thick),
-                mass,
-                position=(0.5 * (left + right), 0.0, z + height + 0.5 * thick),
-            )
+            place = (0.5 * (left + right), 0.0, z + height + 0.5 * thick)
+            scene.add_box((pitch - 1e-3, width, thick), mass, position=place)
         z += height + thick
 
 
@@ -137,13 +131,9 @@ def chain(scene: Scene, n: int = 20, tip_mass: float = 1.0, length: float = 0.25
     before = -1
     for i in range(n):
         thick = 0.2 * length if i < n - 1 else 0.4 * length
-        link = scene.add_box(
-            (thick, thick, 0.9 * length),
-            tip_mass if i == n - 1 else 1.0,
-            position=(i + 0.5) * length * down,
-            quaternion=turn,
-            name=f"link {i}",
-        )
+        size, mass = (thick, thick, 0.9 * length), tip_mass if i == n - 1 else 1.0
+        place = (i + 0.5) * length * down
+        link = scene.add_box(size, mass, position=place, quaternion=turn, name=f"link {i}")
         scene.add_joint("ball", before, link, anchor=i * length * down)
         before = link
 
@@ -157,11 +147,8 @@ def bridge(scene: Scene, n: int = 16, load: float = 10.0) -> None:
     check_int("n", n, 2)
     planks = []
     for i in range(n):
-        planks.append(
-            scene.add_box(
-                (0.46, 1.0, 0.1), 1.0, position=((i + 0.5 - 0.5 * n) * 0.5, 0.0, 3.0), name=f"plank {i}"
-            )
-        )
+        place = ((i + 0.5 - 0.5 * n) * 0.5, 0.0, 3.0)
+        planks.append(scene.add_box((0.46, 1.0, 0.1), 1.0, position=place, name=f"plank {i}"))
     for i, (a, b) in enumerate(zip([-1, *planks], [*planks, -1], strict=True)):
         scene.add_joint("hinge", a, b, anchor=((i - 0.5 * n) * 0.5, 0.0, 3.0), axis=(0.0, 1.0, 0.0))
     if load > 0.0:
@@ -221,9 +208,8 @@ def spinner(scene: Scene, spin: float = 20.0, radius: float = 0.5) -> None:
     The scene has 2 bodies and 1 contact of 4 rows.
     """
     scene.add_plane()
-    scene.add_sphere(
-        radius, position=(0.0, 0.0, radius), angular_velocity=(0.0, 0.0, check_float("spin", spin))
-    )
+    turning = (0.0, 0.0, check_float("spin", spin))
+    scene.add_sphere(radius, position=(0.0, 0.0, radius), angular_velocity=turning)
 
 
 @named_scene(restitution=1.0, friction=0.0, restitution_threshold=0.01, dt=1.0 / 240.0, substeps=4)
@@ -264,15 +250,8 @@ def four_bar(scene: Scene, motor: float | None = None, torque: float = 200.0, ti
         q = convert_frame_to_quaternion(np.column_stack([x, axis, np.cross(x, axis)]))  # pyright: ignore[reportArgumentType]
         # The bars are offset along the axis, so that they do not overlap.
         position = 0.5 * (corner[i] + corner[i + 1]) + 0.15 * (i - 1) * axis
-        bars.append(
-            scene.add_box(
-                (long, 0.1, 0.1),
-                long,
-                position=position,
-                quaternion=q,
-                name=("crank", "coupler", "rocker")[i],
-            )
-        )
+        name = ("crank", "coupler", "rocker")[i]
+        bars.append(scene.add_box((long, 0.1, 0.1), long, position=position, quaternion=q, name=name))
     for i, (a, b) in enumerate(zip([-1, *bars], [*bars, -1], strict=True)):
         drive: dict[str, Any] = {} if motor is None or i else {"motor_speed": motor, "motor_torque": torque}
         scene.add_joint("hinge", a, b, anchor=corner[i], axis=axis, **drive)

@@ -176,13 +176,8 @@ def _compile_to_wasm(source: Path, names: Iterable[str], extra_options: Iterable
     flags += ["-mbulk-memory"] if named else []
     compiled, linked = source.with_suffix(".o"), source.with_suffix(".wasm")
     _run_command([*compiler, *flags, "-c", str(source), "-o", str(compiled)], source.parent)
-    link_options = [
-        "--no-entry",
-        "--gc-sections",
-        "-s",
-        *(f"--export={name}" for name in (*names, *LINKER_SYMBOLS)),
-        *extra_options,
-    ]
+    exports = [f"--export={name}" for name in (*names, *LINKER_SYMBOLS)]
+    link_options = ["--no-entry", "--gc-sections", "-s", *exports, *extra_options]
     try:
         _run_command([*linker, *link_options, str(compiled), "-o", str(linked)], source.parent)
     except BuildFailed as error:

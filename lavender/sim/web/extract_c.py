@@ -87,15 +87,8 @@ NAME = re.compile(r"(?<![\w.])(?<!->)[A-Za-z_]\w*")
 DIGITS = re.compile(r"\d+")
 #: Words that need no declaration from the kernels: some are defined by the prologue or by the headers.
 PREDEFINED = (
-    "CYTHON_INLINE",
-    "CYTHON_UNUSED",
-    "__PYX_EXTERN_C",
-    "likely",
-    "unlikely",
-    "NULL",
-    "DL_IMPORT",
-    "inline",
-)
+    "CYTHON_INLINE", "CYTHON_UNUSED", "__PYX_EXTERN_C", "likely", "unlikely", "NULL", "DL_IMPORT", "inline",
+)  # fmt: skip
 OPENING = ("if", "ifdef", "ifndef")
 #: Beginning of a name of Cython: function, type, enum, or the variant of a function with fused types, such as `0_1`.
 MANGLED = re.compile(r"__pyx_(?:[fte]_|fuse_(\d+(?:_\d+)*)__pyx_f_)(?=\d)")

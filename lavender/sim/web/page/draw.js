@@ -200,11 +200,6 @@ export class View {
       const reach = Math.max(...high.map((v, k) => Math.max(v, -low[k])));
       [low[0], low[2], high[0], high[2]] = [-reach, -1.05 * reach, reach, 0.05 * reach];
     }
-    this.hold(low, high, hasGround);
-  }
-
-  // Set the bounds of the picture as a box.
-  hold(low, high, hasGround) {
     this.hasGround = hasGround;
     this.low = low;
     this.high = high;

@@ -52,15 +52,11 @@ export class Side {
     this.simulation.set({ iterations, warm_start, order, box });
     this.choose(solver);
     this.start = Float64Array.from(this.simulation.array("x"));
-    this.forget();
-    this.readSettings();
-  }
-
-  forget() {
     this.history = { time: [], values: [], plain: true }; // plain: since the start, only the side's own settings have acted.
     this.curve = null; // Curve of the last step that recorded its sweeps.
     this.fresh = true; // No step has followed.
     this.kept = null;
+    this.readSettings();
   }
 
   get settings() {
