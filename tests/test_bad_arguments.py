@@ -301,7 +301,7 @@ NOT_CALLED = [
     "Generalized.from_compressed_rows", "Generalized.from_operator", "Generalized.from_validated",
     "Generalized.with_diagonal_shift", "Generalized.restrict_to_rows_and_velocities", "Generalized.with_scaled_rows",
     "Solutions.store_late_world", "Problem.on_disk", "Problem.has_operator_of", "Problem.save",
-    "Problem.compute_velocity_change", "Residuals.store_residual", "Solution.with_late_fields",
+    "Problem.compute_velocity_change", "Residuals.store_residual",
     "Solution.from_fields", "Solution.with_fields",
     "Solutions.store_solution", "Solutions.get_start", "CrossCheck.__getitem__",
     "Simulation.write_problem", "Simulation.load", "Simulation.record", "Simulation.save", "Simulation.view",

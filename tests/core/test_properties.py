@@ -553,7 +553,7 @@ def test_solution_history_and_time_exclude_the_judge(monkeypatch):
 
     for module in (loop, log):
         monkeypatch.setattr(module, "residual", judge_slowly)
-    for module in (loop, deadline):
+    for module in (loop, log):
         monkeypatch.setattr(module, "perf_counter", lambda: now[0])
     problem = random_contact_problem(0)
     solution = lv.solve(problem, "auto", history=True, tol=1e-9)

@@ -94,7 +94,7 @@ def run_newton_claim(problem, budget=300, impulse=None):
     """Run `newton` without `auto` and the judge; return its claim and the impulse."""
     system = make_system(problem, "velocity" if problem.matrix is None else "impulse")
     impulse = (problem.start() if impulse is None else impulse).copy()
-    return Newton().run(NewtonState(problem, system), impulse, budget, 1e-6), impulse
+    return Newton().run(NewtonState(problem, system), impulse, budget, 1e-6, None), impulse
 
 
 def test_euler_steps_pile_slides_solves_coulomb_and_shifted_cone_law():

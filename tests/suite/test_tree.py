@@ -23,7 +23,8 @@ def rates(monkeypatch):
     """Fix the rates: which stage comes first depends on them, how stages follow each other does not."""
     work = {"bodies": 0.2, "dense": 0.04, "panels": 0.4, "velocities": 0.1}
     fixed = {"start": 1e5, "row": 300.0, "entry": 0.25, "work": work, "sweep row": 12.0, "sweep cone": 2.0}
-    monkeypatch.setattr(costs, "RATES", costs.RATES | fixed | {"pivot row": 100.0, "pivot work": 0.2})
+    for name, rate in (fixed | {"pivot row": 100.0, "pivot work": 0.2}).items():
+        monkeypatch.setitem(costs.RATES, name, rate)
 
 
 def asymmetric():
