@@ -2,7 +2,7 @@
 
 The call is used for few rows of bodies or of A and for small islands with friction (`lavender_ext/small/call.pyx`),
 and for generalised coordinates if Newton's method is estimated to cost no more than other solvers
-(`lavender_ext/batch/many.pyx`). The overhead of Python would exceed the time of such a solve. If the call does not
+(`lavender_ext/batch/task.pxd`). The overhead of Python would exceed the time of such a solve. If the call does not
 find a solution, it returns None, and the solver runs from the beginning as on any other problem.
 """
 

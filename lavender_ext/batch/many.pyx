@@ -579,17 +579,6 @@ cdef class Worlds:
         j.slack_error = h.at[SLACK_ERROR].real
         return code
 
-    cdef void store_result(self, int64_t i, const task_t* j, const worker_scratch_t* scratch) noexcept nogil:
-        """Store the judge's results of world i, and its velocity v+ after the step if the worlds are given as arrays."""
-        cdef const int64_t* at = self.w.at + i * PLACES
-        cdef double* v
-        cdef int32_t k
-        self.store_judgement(i, j, j.slack_error[j.v.p.n_rows + j.score.worst] if j.score.worst >= 0 else 0.0)
-        if self.tasks == NULL:
-            v = self.v + at[VELOCITY]
-            for k in range(at[VELOCITIES]):
-                v[k] = scratch.free[k] + j.push[k]
-
     cdef void store_judgement(self, int64_t i, const task_t* j, double push) noexcept nogil:
         """Store the judge's results of world i; push: e of the worst row [N s]."""
         cdef int64_t n = self.w.n + 1
@@ -670,6 +659,8 @@ cdef class Worlds:
         narrow: judge with the round-off floor of float32.
         """
         cdef task_t j
+        cdef const int64_t* at = self.w.at + i * PLACES
+        cdef double* v = self.v + at[VELOCITY]
         cdef int32_t k, code
         cdef bint had_derived
         if not judges and (limits == NULL if self.tasks == NULL or self.tasks[i].v.g != NULL else rules == NULL):
@@ -678,7 +669,7 @@ cdef class Worlds:
         if code != READY:
             return code
         if j.v.p.n_rows == 0:                           # v+ = v*
-            memcpy(self.v + self.w.at[i * PLACES + VELOCITY], h.scratch.free, self.w.at[i * PLACES + VELOCITIES] * sizeof(double))
+            memcpy(v, h.scratch.free, at[VELOCITIES] * sizeof(double))
             return READY
         had_derived, j.deadline = j.has_derived, deadline
         j.tol, j.failed_in_lanes = tol, h.failed >> (h.next - 1 - h.begin) & 1
@@ -686,7 +677,9 @@ cdef class Worlds:
         if j.v.g != NULL and not had_derived:
             h.made = j.made                             # The next world reuses the memory of `made`.
         if code == READY or code == STARTED:
-            self.store_result(i, &j, &h.scratch)
+            self.store_judgement(i, &j, j.slack_error[j.v.p.n_rows + j.score.worst] if j.score.worst >= 0 else 0.0)
+            for k in range(at[VELOCITIES] if self.tasks == NULL else 0):        # v+ after the step, for worlds of arrays
+                v[k] = h.scratch.free[k] + j.push[k]
         if judges:
             return code
         if code != LEFT:
