@@ -274,9 +274,7 @@ def impulse(model: Any, data: Any) -> FloatArray:
 
     With `noslip_iterations`, it is not a solution of the problem.
     """
-    step = read_step(model, data)
-    _get_timestep(step)
-    return _scale_force(step, data, get_row_scales(make_blocks(step, data)))
+    return _scale_force(read_step(model, data), data, scaling(model, data))
 
 
 def _scale_force(step: Step, data: Any, scale: FloatArray) -> FloatArray:

@@ -199,7 +199,8 @@ def read_states(mj: Any, model: Any, source: Any) -> StartStates:
             vectors.append(_read_state_vector(mj, model, data))
         controls = np.array(model.key_ctrl, float).reshape(model.nkey, model.nu)
         return StartStates(np.array(vectors), controls)
-    arrays, label = source if isinstance(source, Mapping) else {VECTOR: source}, "states"
+    arrays: Mapping[str, Any] = source if isinstance(source, Mapping) else {VECTOR: source}
+    label = "states"
     if isinstance(source, (str, os.PathLike)):
         label = f"states {os.fspath(source)}"
         arrays = read_arrays(source)

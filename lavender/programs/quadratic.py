@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from time import perf_counter
 from types import MappingProxyType
@@ -170,38 +171,34 @@ def solve_qp(
     return task.solve(begun)
 
 
+@dataclass(eq=False)
 class _Task:
     """One call of `solve_qp`: its arguments, the best point, and the solvers that ran."""
 
-    def __init__(
-        self,
-        qp: QuadraticProgram,
-        problem: Problem | None,
-        spec: SolverSpec,
-        tol: float,
-        deadline: Deadline,
-        max_iter: int | None,
-        start: Any,
-        options: dict[str, Any],
-    ) -> None:
-        self.qp, self.spec, self.tol, self.deadline = qp, spec, tol, deadline
-        self.max_iter, self.options = max_iter, options
-        if problem is not None:
-            self.__dict__["problem"] = problem
-        self.start = None if start is None else self.problem.make_start(start)
-        self.initial_x: FloatArray | None = None
+    qp: QuadraticProgram
+    given: Problem | None
+    spec: SolverSpec
+    tol: float
+    deadline: Deadline
+    max_iter: int | None
+    start: Any
+    options: dict[str, Any]
+    initial_x: FloatArray | None = None
+    runs: list[Run] = field(default_factory=list)
+    rays: list[FloatArray] = field(default_factory=list)  # Multipliers of claims of infeasibility.
+    proof: Proof | None = None
+    ray: FloatArray | None = None
+    solution: Solution | None = None  # Last solution of the constraint problem.
+
+    def __post_init__(self) -> None:
+        self.start = None if self.start is None else self.problem.make_start(self.start)
         self.program = get_program(self.qp)
-        self.judge = ProgramJudge(self.program, max(tol, MIN_TOL), deadline)
-        self.runs: list[Run] = []
-        self.rays: list[FloatArray] = []  # Multipliers of claims of infeasibility.
-        self.proof: Proof | None = None
-        self.ray: FloatArray | None = None
-        self.solution: Solution | None = None  # Last solution of the constraint problem.
+        self.judge = ProgramJudge(self.program, max(self.tol, MIN_TOL), self.deadline)
 
     @cached_property
     def problem(self) -> Problem:
         """The constraint problem, which a backend does not need."""
-        return Problem(**self.qp.problem_fields(), qp=self.qp)
+        return Problem(**self.qp.problem_fields(), qp=self.qp) if self.given is None else self.given
 
     def solve(self, begun: float) -> QPSolution:
         """Run the solvers, search for proofs, and build the answer."""

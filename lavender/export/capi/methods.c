@@ -181,15 +181,6 @@ static int32_t start_newton(lav_solver *s) {
   return LAV_OK;
 }
 
-/* After a run that did not converge, keep in each island the best of its result and its start. */
-static void keep_better(lav_solver *s, double tol) {
-  if (s->stopping_test.best.seen == 0) {
-    judge_measure_set_zero_impulse(&s->p, s->compare, s->stopping_test.w);
-    see(s, s->compare, -tol);
-  }
-  if (see(s, s->impulse, tol) > tol) COPY(s->impulse, s->stopping_test.best.impulse, s->p.n_rows);
-}
-
 static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out) {
   struct core_method_info_t info = {0, 0, 0, 0, 0.0, NULL, NULL};
   double closer = 1.0;
@@ -219,7 +210,14 @@ static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out)
     else if (how != core_method_MORE && how != core_method_CERTIFICATE) out->outcome = LAV_STALLED;
     else if (is_late(s, budget)) out->outcome = LAV_TIME_LIMIT;
   }
-  if (out->outcome != LAV_CONVERGED && out->outcome != LAV_ROUNDOFF_LIMIT) keep_better(s, budget->tol);
+  if (out->outcome != LAV_CONVERGED && out->outcome != LAV_ROUNDOFF_LIMIT) {
+    /* Keep in each island the best of its result and its start. */
+    if (s->stopping_test.best.seen == 0) {
+      judge_measure_set_zero_impulse(&s->p, s->compare, s->stopping_test.w);
+      see(s, s->compare, -budget->tol);
+    }
+    if (see(s, s->impulse, budget->tol) > budget->tol) COPY(s->impulse, s->stopping_test.best.impulse, s->p.n_rows);
+  }
   s->newton_options.tol = budget->tol;
   s->newton_options.budget = budget->iterations;
   out->restarts = out->iterations;

@@ -287,13 +287,3 @@ static int32_t fill_velocities(lav_solver *s, const lav_problem *q) {
   return LAV_OK;
 }
 #endif
-
-/* Check the range of computed numbers: b, and A_ii of J and M. */
-static int32_t check_derived(lav_solver *s, const lav_problem *q) {
-  const int64_t m = q->n_rows;
-  int64_t i = 0;
-  const int32_t fault = core_faults_find_rhs_fault(s->p.b, m, &i);
-  if (fault) return refuse(&s->refused, LAV_ERROR_NUMBER, q->b ? "b" : "target", i);
-  i = core_validate_find_invalid_number(s->p.d, m);
-  return i < 0 ? LAV_OK : refuse(&s->refused, LAV_ERROR_NUMBER, q->form == LAV_BODIES ? "inv_mass" : "value", i);
-}

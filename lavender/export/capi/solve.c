@@ -222,6 +222,7 @@ uint64_t lav_needed(const lav_solver *solver) {
 
 static int32_t set_problem(lav_solver *s, const lav_problem *q) {
   int32_t code = LAV_OK;
+  int64_t at = 0;
   keep_impulses(s);
   s->ready = s->begun = 0; /* If an error follows, results of the previous problem must not be returned for this one. */
   s->refused.array = NULL;
@@ -243,7 +244,10 @@ static int32_t set_problem(lav_solver *s, const lav_problem *q) {
   else code = fill_velocities(s, q);
 #endif
   if (code != LAV_OK) return code;
-  GIVE_BACK(check_derived(s, q));
+  if (core_faults_find_rhs_fault(s->p.b, q->n_rows, &at)) /* The range of computed numbers: b, and A_ii of J and M. */
+    return refuse(&s->refused, LAV_ERROR_NUMBER, q->b ? "b" : "target", at);
+  at = core_validate_find_invalid_number(s->p.d, q->n_rows);
+  if (at >= 0) return refuse(&s->refused, LAV_ERROR_NUMBER, q->form == LAV_BODIES ? "inv_mass" : "value", at);
   memset(&s->swept, 0, sizeof s->swept);
   memset(&s->read, 0, sizeof s->read);
   s->p.islands = NULL;

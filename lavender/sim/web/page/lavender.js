@@ -300,13 +300,8 @@ export class Simulation {
       this.first ??= this.values;
     }
     const numbers = this.k.f64(this.curve, 2 * n);
-    const normal = [];
-    const energy = [];
-    for (let i = 0; i < n; i++) {
-      normal.push(numbers[2 * i]);
-      energy.push(numbers[2 * i + 1]);
-    }
-    return { finite: this.#finished(status), normal, energy, at: normal.map((_, i) => i) };
+    const column = (c) => Array.from({ length: n }, (_, i) => numbers[2 * i + c]);
+    return { finite: this.#finished(status), normal: column(0), energy: column(1), at: [...Array(n).keys()] };
   }
 
   #finished(status) {
