@@ -22,11 +22,6 @@ def parse_struct_fields(header: str, name: str) -> list[tuple[str, str]]:
     """Return (type, name) of the fields of a struct in order.
 
     Examples are ("int32_t", "n_rows"), ("const double *", "b"), and ("(*)", "clock") for a pointer to a function.
-
-    Raises
-    ------
-    ValueError
-        The header has no such struct.
     """
     body = re.search(rf"typedef struct {name} \{{(.*?)\}} {name};", header, re.DOTALL)
     if body is None:

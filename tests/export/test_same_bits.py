@@ -145,6 +145,8 @@ def test_c_library_method_has_the_bits_of_the_package(library, at):
         assert solver.impulse().tobytes() == found.impulse.tobytes(), case
         assert said.verdict.relative == found.residual.relative, case
         assert said.verdict.floor == found.residual.roundoff_floor, case
+        assert said.verdict.worst == found.residual.worst_row, case
+        assert tol == 0.0 or (said.outcome == 1) == (said.verdict.relative <= tol), case
         assert said.verdict.energy == found.residual.energy and said.verdict.velocity == found.residual.velocity
         if (tol or name == "lemke") and name not in ("newton", "direct"):
             assert said.iterations == found.iterations, case

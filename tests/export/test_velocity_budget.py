@@ -1,6 +1,5 @@
 """`velocity_tol` of a budget: the rule of `lavender.solve`, with its bits."""
 
-import numpy as np
 import pytest
 from clib import SWEEPS
 from random_problems import as_matrix, random_contact_problem, random_lcp
@@ -19,7 +18,7 @@ def accepted(method):
     return [p for p in problems if method in lv.available(p)]
 
 
-@pytest.mark.parametrize("velocity_tol", [1e-2, 1e-4, 1e-7])
+@pytest.mark.parametrize("velocity_tol", [1e3, 1e-2, 1e-4, 1e-7])  # 1e3 m/s: zero impulses are accepted
 @pytest.mark.parametrize("method", (*SWEEPS, "newton", "direct"))
 def test_c_library_to_a_velocity_error_has_the_bits_of_the_package(library, method, velocity_tol):
     problems = accepted(method)
@@ -50,10 +49,3 @@ def test_c_library_to_a_velocity_error_accepts_a_larger_relative_residual(librar
     assert any(exceeds_guarantee), (
         "every answer meets the guaranteeing tolerance, so the velocity error decided nothing"
     )
-
-
-def test_c_library_to_a_velocity_error_accepts_zero_impulses_of_small_error(library):
-    problem = as_matrix(self_test_problem())
-    solver = library.open(library.problem(problem), library.options("pgs"))
-    out = solver.run(100, 1e-6, 1e3 * np.abs(problem.b).max())
-    assert out.outcome == 1 and out.iterations <= 1

@@ -52,28 +52,16 @@ class NotSupported(InputError):
 
 @dataclass(frozen=True)
 class ProblemView:
-    """The contents of a `lav_problem`.
+    """The contents of a `lav_problem`."""
 
-    Parameters
-    ----------
-    counts : tuple of int
-        Form, law, and numbers of blocks, rows, entries, bodies, joints, velocities and entries of M.
-    arrays : mapping of str to array or None
-        Arrays by name; None for a null pointer.
-    """
-
-    counts: tuple[int, ...]
-    arrays: dict[str, Any]
+    counts: tuple[
+        int, ...
+    ]  # Form, law, and numbers of blocks, rows, entries, bodies, joints, velocities, entries of M.
+    arrays: dict[str, Any]  # By name; None for a null pointer.
 
 
 def make_problem_view(problem: lv.Problem) -> ProblemView:
-    """Return the contents of the `lav_problem` of a problem; its start is the problem's guess, if there is one.
-
-    Raises
-    ------
-    NotSupported
-        The problem has ellipses, or its generalised velocities have been reordered.
-    """
+    """Return the contents of the `lav_problem` of a problem; its start is the problem's guess, if there is one."""
     c = problem.cones
     if c.has_ellipse:
         raise NotSupported("the library has no ellipses: give it `problem.disk`, the same problem with scaled tangents")
@@ -121,13 +109,7 @@ def is_accepted_by_library(problem: lv.Problem, solver: str) -> bool:
 
 
 def encode_options(solver: str, options: Mapping[str, Any]) -> tuple[tuple[int, ...], float]:
-    """Encode the options of a solver as five integers (order, memory, sweep, convex, keeps of `lav_options`) and omega.
-
-    Raises
-    ------
-    NotSupported
-        The library does not have the solver or the option.
-    """
+    """Encode the options of a solver as five integers (order, memory, sweep, convex, keeps) and omega."""
     remaining = dict(options)
     order = remaining.pop("order", "given")
     sweep, restart = remaining.pop("sweep", None), remaining.pop("restart", "growth")
@@ -198,16 +180,7 @@ def join_vectors(packed: Sequence[bytes]) -> bytes:
 def make_test_vector(
     problem: Any, solver: str, tol: float, max_iter: int, options: Mapping[str, Any]
 ) -> tuple[bytes, list[Step]]:
-    """Return one test vector and its steps.
-
-    The vector contains the impulse of the package bit for bit, or only the residual to reach for methods whose bits
-    differ in the library (`OTHER_BITS`).
-
-    Raises
-    ------
-    NotSupported
-        The library does not have the method, option or formulation that the package used.
-    """
+    """Return one test vector and its steps; of methods of `OTHER_BITS` it contains only the residual to reach."""
     max_iter = max_iter or registry.specs()[solver].max_iter
     solution = lv.solve(problem, solver, tol=tol, max_iter=max_iter, **options)
     form = solution.solver.form
@@ -243,11 +216,6 @@ def run_compiled_newton(problem: lv.Problem, tol: float, budget: int) -> tuple[n
 
     `lavender.solve` differs: it first tries warm-started sweeps and a solve of the joints, searches for certificates
     between the stages of the driver, and solves J and M of free bodies in the form of bodies.
-
-    Raises
-    ------
-    NotSupported
-        The driver does not support the problem.
     """
     # Make the judge compute d, nu and J M^-1 J^T, which the driver reads.
     lv.residual(problem, problem.start())

@@ -34,17 +34,6 @@ def test_from_mujoco_answer_of_newton_is_a_solution(cone, condim, jacobian):
     assert found.velocity_at_zero > 1e-3  # m/s: there was something to do
 
 
-def test_solve_of_a_mujoco_step_gives_its_acceleration():
-    model, data = state()
-    problem = lv.io.from_mujoco(model, data)
-    solution = lv.solve(problem, "admm", tol=1e-10, max_iter=100_000)
-    assert solution.success
-    # tol times the largest acceleration asked of a row, over dt and the least mass: 1e-10 * 1e3 with room.
-    assert np.abs(adapter.acceleration(model, data, solution.impulse) - data.qacc).max() < 1e-5
-    # Its forces and its accelerations agree as far as it converged: 1e-8 of about 25 m/s2.
-    assert np.abs(adapter.acceleration(model, data, adapter.impulse(model, data)) - data.qacc).max() < 1e-6
-
-
 def test_from_mujoco_matrix_and_b_equal_the_arrays_of_mujoco():
     model, data = state(jacobian="sparse")
     problem = lv.io.from_mujoco(model, data)
@@ -394,23 +383,6 @@ def test_from_mujoco_with_a_jacobian_of_other_data_raises(factor, stepped, movin
     if moving or any(gravity) or np.abs(data.efc_force).max() > 0.0:
         with pytest.raises(lv.CapabilityError, match="not the Jacobian of this forward pass"):
             lv.io.from_mujoco(model, data)
-
-
-@pytest.mark.parametrize("integrator", ["EULER", "RK4", "IMPLICIT", "IMPLICITFAST"])
-@pytest.mark.parametrize("jacobian", ["dense", "sparse"])
-def test_from_mujoco_after_a_step_or_a_forward_pass_is_consistent(jacobian, integrator):
-    model, data = state(jacobian=jacobian)
-    model.opt.integrator = getattr(mj.mjtIntegrator, f"mjINT_{integrator}")
-    problem = lv.io.from_mujoco(model, data)
-    for _ in range(20):
-        mj.mj_step(model, data)
-        if integrator != "RK4":  # whose qacc is that of no single pass
-            stepped, made = lv.io.from_mujoco(model, data), problem.generalized
-            assert stepped.m == problem.m
-            np.testing.assert_allclose(stepped.generalized.v_free, made.v_free, atol=1e-12, rtol=0)
-            assert np.array_equal(stepped.b, problem.b)
-        mj.mj_forward(model, data)
-        problem = lv.io.from_mujoco(model, data)
 
 
 def test_from_mujoco_with_data_of_another_model_raises():

@@ -185,16 +185,6 @@ def test_from_pinocchio_desired_velocity_is_the_target(kind):
 # -- data that were changed -----------------------------------------------------------------------------
 
 
-def chain(n):
-    """Another model, of n hinges in a row."""
-    model, last = pin.Model(), 0
-    for i in range(n):
-        last = model.addJoint(last, pin.JointModelRX(), pin.SE3.Identity(), f"joint {i}")
-        model.appendBodyToJoint(last, pin.Inertia.Random(), pin.SE3.Identity())
-    model.lowerPositionLimit[:], model.upperPositionLimit[:] = -0.5, 0.5
-    return model
-
-
 def anchored_chain(kind):
     """A chain of four hinges with its tip anchored, a velocity that keeps the anchor, and (dJ/dt) v by kinematics."""
     model, parent = pin.Model(), 0

@@ -127,14 +127,6 @@ def test_no_cell_of_a_report_says_nan_or_inf(tmp_path):
     assert "nan" not in set(map(str, csv))
 
 
-@pytest.mark.parametrize("width", [60, 80, 120])
-def test_terminal_complete_report_stays_within_the_width(written, width):
-    out = shown(written[0], width, complete=True)
-    assert max(map(len, out.splitlines())) <= width
-    for section in written[0].sections.values():
-        assert section.title.split()[0] in out
-
-
 @pytest.mark.parametrize(("cases", "width"), [(1, 60), (45, 80), (45, 10_000)])
 def test_terminal_short_report_of_any_size_has_the_answer_first_and_ten_solvers(cases, width):
     made, names = [], [f"case {i} of a folder with a long name" for i in range(cases)]

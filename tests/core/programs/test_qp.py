@@ -257,23 +257,6 @@ def test_solve_qp_with_a_singular_p_runs_a_backend_that_is_named():
     assert problem.row_name(2) == "variable 2" and problem.row_name(3) == "constraint 0"
 
 
-CONVEX = lv.Problem.from_qp(np.eye(2), np.zeros(2), lb=np.zeros(2))
-
-
-@pytest.mark.parametrize("name", [n for n in lv.available(CONVEX) if not lv.get(n).external])
-@pytest.mark.parametrize("seed", range(4))
-def test_own_solvers_solve_strictly_convex_programs(name, seed):
-    rng = np.random.default_rng(seed)
-    root, G, x = rng.normal(size=(6, 6)), rng.normal(size=(3, 6)), rng.normal(size=6)
-    P = root.T @ root + 5.0 * np.eye(6)
-    qp = dict.fromkeys(NAMES) | {"P": P, "q": rng.normal(size=6), "G": G, "h": G @ x + rng.random(3)}
-    qp |= {"lb": x - 1.0, "ub": x + 1.0}
-    answer = lv.solve_qp(lv.Problem.from_qp(**qp), name, tol=1e-6)
-    assert answer.found, str(answer)
-    assert max(kkt(qp, answer)) <= 1e-4
-    np.testing.assert_allclose(answer.x, lv.solve_qp(lv.Problem.from_qp(**qp)).x, atol=1e-4)
-
-
 def test_program_is_singular_from_a_pivot_of_1e_13():
     for pivot, is_singular in ((1e-12, False), (1e-15, True)):
         beside = np.sqrt(1.0 - pivot)

@@ -79,12 +79,6 @@ def test_solve_qp_with_new_vectors_has_the_answer_of_a_new_program():
         lv.solve_qp(problem, lb=np.zeros(5))
 
 
-def test_linear_program_without_p_is_solved():
-    answer = lv.solve_qp(None, [-1.0, -2.0], G=[[1.0, 1.0]], h=[1.0], lb=[0.0, 0.0], tol=1e-9)
-    assert answer.found
-    np.testing.assert_allclose(answer.x, [0.0, 1.0], atol=1e-9)
-
-
 def test_solve_qp_of_an_exact_answer_at_tol_zero_is_found():
     answer = lv.solve_qp(lv.Problem.from_qp(2.0 * np.eye(2), [-2.0, -4.0], ub=[0.5, 9.0]), tol=0.0)
     assert answer.error == 0.0 and answer.found and answer.solution.status is lv.Status.CONVERGED
@@ -94,6 +88,7 @@ def test_solve_qp_of_an_exact_answer_at_tol_zero_is_found():
 EDGE_CASES = [
     ("CONVERGED", {"P": np.zeros((0, 0)), "q": []}),
     ("CONVERGED", {"P": np.zeros((2, 2)), "q": [0.0, 0.0]}),
+    ("CONVERGED", {"P": None, "q": [-1.0, -2.0], "G": [[1.0, 1.0]], "h": [1.0], "lb": [0.0, 0.0]}),
     ("CONVERGED", {"P": np.eye(2), "q": [1.0, 1.0], "lb": [1.0, 2.0], "ub": [1.0, 2.0]}),
     ("CONVERGED", {"P": np.eye(3), "q": [1e12, -1e12, 1.0], "lb": [-1.0] * 3, "ub": [1.0] * 3}),
     ("UNBOUNDED", {"P": np.zeros((2, 2)), "q": [1.0, 0.0]}),

@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from scipy.optimize import linprog
 from scipy.special import ellipk
 
 import lavender as lv
@@ -252,37 +251,6 @@ def make_arch(thickness, stones=4, slope=0.5, **parameters):
             turned = make_quaternion((0.0, 1.0, 0.0), -side * lean)
             scene.add_box((thick, 1.0, 1.0), position=(x, 0.0, z), quaternion=turned)
     return scene
-
-
-def can_stand(scene):
-    """Whether forces in the friction cones of the engine's own contacts balance the weights: a linear program."""
-    p = lv.Simulation(scene).constraint_problem()
-    j = p.rows.jacobian(p.cones).toarray()
-    moving = [b for b in scene.bodies if not b.is_static]
-    weight = np.zeros((len(moving), 6))
-    weight[:, :3] = [b.mass * np.array(scene.parameters.gravity) for b in moving]
-    rows, normals = [], p.cones.ptr[:-1]
-    for first, mu in zip(normals, p.cones.mu, strict=True):
-        for tangent, sign in ((1, 1.0), (1, -1.0), (2, 1.0), (2, -1.0)):
-            row = np.zeros(p.m)
-            row[first + tangent], row[first] = sign, -mu
-            rows.append(row)
-    bounds = [(0, None) if i in set(normals.tolist()) else (None, None) for i in range(p.m)]
-    found = linprog(np.zeros(p.m), np.array(rows), np.zeros(len(rows)), j.T, -weight.ravel(), bounds)
-    assert found.status in (0, 2)
-    return found.status == 0
-
-
-@pytest.mark.parametrize(
-    ("make", "limit"),
-    [
-        *((lambda f, n=n: make_overhang(f, n), (0.999, 1.001)) for n in (2, 5, 8)),
-        *((lambda f, n=n, s=s: make_arch(f, n, s), (1.01, 0.99)) for n, s in ((2, 0.5), (4, 0.3), (6, 0.7))),
-    ],
-)
-def test_limits_of_overhang_and_arch_equal_those_of_a_linear_program(make, limit):
-    assert can_stand(make(limit[0]))
-    assert not can_stand(make(limit[1]))
 
 
 @pytest.mark.parametrize(

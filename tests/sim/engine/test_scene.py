@@ -83,10 +83,8 @@ def test_scene_contacts_have_only_the_rows_of_their_friction():
 
 #: Calls of a scene with a ball and a plane, or of no scene, and words of their errors.
 REFUSED = [
-    (lambda s: s.add_box(mass=0.0), "mass"),
-    (lambda s: s.add_box((1, 0, 1)), "positive"),
-    (lambda s: s.add_sphere(0.0), "radius"),
-    (lambda s: s.add_plane((0, 0, 0)), "direction"),
+    (lambda s: s.add_box(mass=0.0), "mass"), (lambda s: s.add_box((1, 0, 1)), "positive"),
+    (lambda s: s.add_sphere(0.0), "radius"), (lambda s: s.add_plane((0, 0, 0)), "direction"),
     (lambda s: s.add_plane(position=(0, 0, 1)), "position"),
     (lambda s: s.add_body(quaternion=(0, 0, 0, 0)), "quaternion"),
     (lambda s: s.add_body(shape="box"), "a Plane, Sphere or Box"),
@@ -101,8 +99,7 @@ REFUSED = [
     (lambda s: s.add_body(inertia=[[1, 2, 0], [0, 1, 0], [0, 0, 1]]), "symmetric"),
     (lambda s: s.add_body(inertia=[[1, 2, 0], [2, 1, 0], [0, 0, 1]]), "positive"),
     (lambda s: s.add_body(static=True, velocity=(1, 0, 0)), "static"),
-    (lambda s: s.add_body(friction=-0.1), "friction"),
-    (lambda s: s.add_body(restitution=1.1), "restitution"),
+    (lambda s: s.add_body(friction=-0.1), "friction"), (lambda s: s.add_body(restitution=1.1), "restitution"),
     (lambda s: s.add_joint("ball", 0, 7, anchor=(0, 0, 0)), "body of ball 0 .* is 7"),
     (lambda s: s.add_joint("ball", 0, -2, anchor=(0, 0, 0)), "body of .* is -2"),
     (lambda s: s.add_joint("ball", 0, 0, anchor=(0, 0, 0)), "two bodies"),
