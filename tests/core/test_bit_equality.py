@@ -1,12 +1,12 @@
 """Two ways to compute one result give the same bits. Each pair is compared here once.
 
-`WAYS` compares ways to solve with a fresh solve, `RUNS` a run in parts with the whole run. Other pairs: batches and
-single solves in test_many.py; packed sweeps in test_packed.py; orders of blocks in test_sweeps_large.py; the compiled
-call of small problems in test_small.py; lanes of factors in test_newton.py and test_sparse_factor.py; the C library in
-tests/export/test_same_bits.py; the engine in tests/sim/engine/test_engine_bits.py.
+`WAYS` compares ways to solve with a fresh solve, `RUNS` a run in parts with the whole run. Other pairs: prepared
+solvers in test_sequences.py and the contract; batches and single solves in test_many.py; packed sweeps in
+test_packed.py; orders of blocks in test_sweeps_large.py; the compiled call of small problems in test_small.py; lanes
+of factors in test_newton.py and test_sparse_factor.py; the C library in tests/export/test_same_bits.py; the engine in
+tests/sim/engine/test_engine_bits.py.
 """
 
-import copy
 import functools
 import itertools
 import pickle
@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from calls import driven, facts
 from enumeration import random_bounds
-from random_problems import as_matrix, make_problem_with_other_numbers, make_problems_of_every_kind, touching
+from random_problems import as_matrix, make_problems_of_every_kind, touching
 
 import lavender as lv
 from benchmarks.core_problems import fresh, stacks
@@ -44,33 +44,6 @@ def examples():
 
 
 # -- a fresh solve, and the same problem solved in another way --------------------------------------
-
-
-def prepare_and_solve(problem, name, **options):
-    prepared = lv.prepare(problem, name)
-    first = prepared.solve(**options)
-    assert facts(prepared.solve(**options)) == facts(first)
-    return first
-
-
-def prepare_other_numbers(problem, name, **options):
-    prepared = lv.prepare(make_problem_with_other_numbers(problem), name)
-    prepared.solve(**options)
-    found = prepared.solve(problem, **options)
-    assert facts(prepared.solve(**options)) == facts(found), "the problem given last is kept"
-    return found
-
-
-def prepare_another_structure(problem, name, **options):
-    accepted = [p for p in examples() if registry.get(name).refuses(p) is None]
-    other = max(accepted, key=lambda p: (p.m != problem.m, p.operator != problem.operator))
-    prepared = lv.prepare(other, name)
-    prepared.solve(**options)
-    return prepared.solve(problem, **options)
-
-
-def prepare_and_copy(problem, name, **options):
-    return copy.deepcopy(lv.prepare(problem, name)).solve(**options)
 
 
 def at_once(function, n=8):
@@ -110,8 +83,6 @@ def solve_after_a_residual(problem, name, **options):
 
 #: Ways to solve a problem of which nothing was derived before.
 WAYS = {
-    "prepared": prepare_and_solve, "prepared for other numbers": prepare_other_numbers,
-    "prepared for another structure": prepare_another_structure, "a copy of what was prepared": prepare_and_copy,
     "a pickled problem": lambda p, name, **more: lv.solve(pickle.loads(pickle.dumps(p)), name, **more),
     "judged before": solve_after_a_residual, "one of a list": lambda p, name,
     **more: lv.solve_many([p], name, **more)[0], "a list and two threads": lambda p, name,

@@ -77,7 +77,7 @@ def test_lanes_have_the_bits_of_single_calls(width, rows, nv, n, law):
                 assert of_one is None or getattr(found, name)[i] == of_one, name
 
 
-def test_lanes_solve_most_worlds(width):
+def test_lanes_solve_all_worlds_that_an_impulse_moves(width):
     batch = make_batch(4, 18, 64, "cone", seed=3)
     many = lv.solve_many(batch)
     assert many.success[1:].all()  # No impulse moves the empty rows of world 0.

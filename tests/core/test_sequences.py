@@ -1,8 +1,8 @@
-"""Any sequence of calls on one prepared solver, one problem or one simulation has the bits of fresh ones.
+"""Any sequence of calls on one prepared solver and one problem has the bits of fresh ones.
 
 `Calls` draws sequences of solves with new right-hand sides, velocities, bounds and problems of other kinds and sizes,
-of starts that are carried by keys, of copies, and of calls that fail or are interrupted. `Steps` draws those of a
-simulation. The model of each is what its last calls have given; nothing that was derived before may show.
+of starts that are carried by keys, of copies, and of calls that fail or are interrupted. The model is what the last
+calls have given; nothing that was derived before may show.
 """
 
 import copy
@@ -181,57 +181,3 @@ class Calls(RuleBasedStateMachine):
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_any_sequence_of_calls_of_a_prepared_solver_has_the_bits_of_fresh_solves(solver):
     run_state_machine_as_test(type("CallsOf", (Calls,), {"solver": solver}))
-
-
-@functools.cache
-def run_anew(actions):
-    """Return what a new simulation shows after these actions."""
-    sim = lv.Simulation(lv.Scene("stack", n=2, solver="block_gauss_seidel"))
-    return [take(sim, action) for action in actions][-1]
-
-
-def take(sim, action):
-    """Set a velocity, the iterations or the warm start, or nothing; step, and return the bits of what is seen."""
-    name, value = action
-    if name:
-        getattr(sim, name)(*value)
-    seen = sim.step()[0]
-    return [np.asarray(seen[key]).tobytes() for key in ("positions", "quaternions", "velocities")]
-
-
-#: A reset keeps the iterations and the warm start.
-ACTIONS = st.sampled_from([
-    ("", ()), ("set_velocity", (1, (0.3, 0.0, 0.5), (0.0, 1.0, 0.0))), ("set_velocity", (2, (0.0, -0.4, 0.0))),
-    ("set_solver_iterations", (3,)), ("set_warm_start", (False,)), ("reset", ()),
-])  # fmt: skip
-
-
-class Steps(RuleBasedStateMachine):
-    states = Bundle("states")
-
-    def __init__(self):
-        super().__init__()
-        self.sim, self.actions = lv.Simulation(lv.Scene("stack", n=2, solver="block_gauss_seidel")), ()
-
-    @rule(action=ACTIONS)
-    def step(self, action):
-        self.actions += (action,)
-        assert take(self.sim, action) == run_anew(self.actions)
-
-    @rule(target=states)
-    def snapshot(self):
-        return self.sim.snapshot(), self.sim.solver_iterations, self.sim.warm_start, self.actions
-
-    @rule(state=states)
-    def restore(self, state):
-        snapshot, iterations, warm, self.actions = state
-        self.sim.restore(snapshot)
-        assert (self.sim.solver_iterations, self.sim.warm_start) == (iterations, warm)
-
-    @rule(way=WAYS_TO_COPY)
-    def copy_simulation(self, way):
-        self.sim = way(self.sim)
-
-
-def test_any_sequence_of_steps_and_snapshots_has_the_bits_of_a_new_simulation():
-    run_state_machine_as_test(Steps)

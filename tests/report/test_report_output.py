@@ -162,7 +162,7 @@ def test_profile_is_the_share_of_cases_within_a_factor_of_the_fastest():
     assert "Solved within twice the fastest time: x 33 %, y 100 %" in svg
 
 
-def test_page_of_forty_problems_and_twenty_solvers_has_at_most_150_kb(tmp_path):
+def test_page_of_forty_problems_and_twenty_solvers_is_within_150_kb(tmp_path):
     made = [
         record(f"problem {i}", f"solver_{j}", 1e-3 * (1 + j), 1e-8, tol=tol)
         for i in range(20) for j in range(20) for tol in (1e-3, 1e-6)

@@ -97,9 +97,11 @@ WAYS = {  # steps that were done before
 }
 
 
-@pytest.mark.parametrize("name", SCENES)
-def test_simulation_continued_in_any_way_has_the_bits_of_the_run(name, tmp_path):
-    scene = lv.Scene(name, seed=3, order="random", **SCENES[name])
+@pytest.mark.parametrize(
+    ("name", "more"), [*((name, {"order": "random"}) for name in SCENES), ("stack", {"solver": "block_gauss_seidel"})]
+)
+def test_simulation_continued_in_any_way_has_the_bits_of_the_run(name, more, tmp_path):
+    scene = lv.Scene(name, seed=3, **SCENES[name], **more)
     for way, (before, make) in WAYS.items():
         sim = after(before, scene)
         if before:

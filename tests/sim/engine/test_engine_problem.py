@@ -24,15 +24,26 @@ def reported(observation, problem):
     return np.concatenate(parts)
 
 
+#: Contacts of one, three, four, five and six rows, which are swept two at a time if they share no body.
+ROWS_OF_CONTACTS = (
+    {"friction": 0.0}, {}, {"patch_radius": 0.1}, {"rolling_radius": 0.05},
+    {"patch_radius": 0.1, "rolling_radius": 0.001},
+)  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("name", "more"),
     [
         *((name, {"warm_start": warm, "solver_iterations": 9}) for name in SCENES for warm in (True, False)),
-        *((name, {"order": order, "seed": 5}) for name in ("stack", "bridge") for order in SCENE_ORDERS),
+        *((name, {"order": order, "seed": 5}) for name in ("stack", "bridge", "pyramid") for order in SCENE_ORDERS),
+        *(("stack", {"n": 8} | more) for more in ROWS_OF_CONTACTS),
+        *(("pyramid", {"base": 6, "friction": 0.05, "friction_shape": "disk"} | more) for more in ROWS_OF_CONTACTS[1:]),
+        *(("pile", {"n": 60, "rolling_radius": 0.0, "patch_radius": 0.0, "friction": mu}) for mu in (0.0, 0.5)),
+        ("stack", {"n": 1}), ("table", {}), ("newtons_cradle", {}),
     ],
-)
+)  # fmt: skip
 def test_step_has_the_bits_and_residuals_of_solve(name, more):
-    sim, rows = lv.Simulation(lv.Scene(name, substeps=1, **SCENES[name], **more)), 0
+    sim, rows = lv.Simulation(lv.Scene(name, substeps=1, **SCENES.get(name, {}) | more)), 0
     order = sim.scene.parameters.order
     asked = {} if order == "alternating" else {"order": order}  # whose contacts stand as they are swept
     for _ in range(30):
