@@ -206,17 +206,6 @@ cdef inline bint is_slip_established(const admm_t* c) noexcept nogil:
     return imbalance * SLIP_RATIO < sqrt(shift / y) if y > 0.0 else False
 
 
-cdef inline double compute_balanced_rho(const admm_t* c) noexcept nogil:
-    """Return the rho that makes the imbalances (3) of the last iteration equal, or the present rho if their ratio is small."""
-    cdef double primal, dual, s
-    compute_residual_imbalance(c, &primal, &dual)
-    if not primal > 0.0:
-        return c.rho
-    s = clip(sqrt(primal / dual) if dual > 0.0 else 10.0, 0.1, 10.0)
-    s = clip(s * c.rho, 1e-9, 1e4)
-    return s if s > 3.0 * c.rho or 3.0 * s < c.rho else c.rho
-
-
 cdef public double lav_admm_workspace_size(int32_t m, int32_t memory) noexcept nogil:
     """Return the number of doubles of workspace of a run, as a double since some callers cannot receive 64-bit integers."""
     return (10.0 + 2.0 * memory) * m + CONTROL + MAX_MEMORY * MAX_MEMORY
@@ -286,7 +275,7 @@ cdef public double lav_admm(admm_t* c, const factor_t* f, double* lam, int32_t* 
     """
     cdef const blocks_t* p = c.blocks
     cdef int32_t m = p.n_rows, i, mixed
-    cdef double rho = c.rho
+    cdef double rho = c.rho, primal, dual
     while n[0] > 0:
         n[0] -= 1
         mixed = c.mixed
@@ -311,8 +300,12 @@ cdef public double lav_admm(admm_t* c, const factor_t* f, double* lam, int32_t* 
             c.shifted = 1
             clear_mixing_memory(&c.mixing)
         if c.done >= c.next:
-            if c.next > 0.0:
-                rho = compute_balanced_rho(c)
+            if c.next > 0.0:                            # Make the imbalances (3) equal, unless their ratio is small.
+                compute_residual_imbalance(c, &primal, &dual)
+            if c.next > 0.0 and primal > 0.0:
+                rho = clip(sqrt(primal / dual) if dual > 0.0 else 10.0, 0.1, 10.0)
+                rho = clip(rho * c.rho, 1e-9, 1e4)
+                rho = rho if rho > 3.0 * c.rho or 3.0 * rho < c.rho else c.rho
             c.next = c.done + (0.25 * c.done if c.done > 4.0 * RHO_UPDATE_INTERVAL else RHO_UPDATE_INTERVAL)
         for i in range(m):
             c.before[i] = c.z[i]

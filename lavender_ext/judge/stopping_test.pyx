@@ -85,26 +85,13 @@ cdef inline int32_t sweeps_until_next_check(const stopping_test_t* s, double now
     return <int32_t>(n if n < max_sweeps else max_sweeps)
 
 
-cdef inline bint is_check_better(stopping_test_t* s, double now, double tol) noexcept nogil:
-    """Return whether a check is better (see the header of stopping_test.pxd), after `store_better_islands`."""
-    cdef bint better = now < s.lowest
-    cdef int32_t i
-    if better:
-        s.lowest = now
-    for i in range(s.best.n):
-        if s.best_at < 0 or s.best.energy[i] < 0.99 * s.marked[i]:
-            better = better or s.best_at < 0 or not s.best.relative[i] <= tol
-            s.marked[i] = s.best.energy[i]
-    return better
-
-
 cdef inline int32_t perform_residual_check(stopping_test_t* s, const view_t* v, double* lam, double tol) noexcept nogil:
     """Perform one check and schedule the next; return the status."""
     cdef score_t x = make_empty_score()
     cdef const blocks_t* p = &v.p
     cdef double now, last, inf = 1.0 / 0.0
-    cdef bint refined = False, lost
-    cdef int32_t end
+    cdef bint refined = False, better = False, lost
+    cdef int32_t end, i
     x.by_island = s.best.now
     if s.total == 0:
         project_on_bounds(p, lam)
@@ -147,7 +134,14 @@ cdef inline int32_t perform_residual_check(stopping_test_t* s, const view_t* v, 
         if end != RUNNING:
             memcpy(lam, s.best.impulse, p.n_rows * sizeof(double))
             return end
-    if not lost and is_check_better(s, now, tol):
+    if not lost:                                        # Is the check better (see the header of stopping_test.pxd)?
+        better = now < s.lowest
+        s.lowest = now if better else s.lowest
+        for i in range(s.best.n):
+            if s.best_at < 0 or s.best.energy[i] < 0.99 * s.marked[i]:
+                better = better or s.best_at < 0 or not s.best.relative[i] <= tol
+                s.marked[i] = s.best.energy[i]
+    if better:
         s.best_at = s.total
         record_impulse(&s.progress, s.total, lam, p.n_rows)
         return RUNNING

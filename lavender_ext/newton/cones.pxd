@@ -153,17 +153,6 @@ cdef inline void apply_inv_scaling(const double* w, int32_t n, const double* x, 
         out[k] = w[SCALING_INV_ETA] * (x[k] + w[k] * t)
 
 
-cdef inline void divide_in_cone(const double* v, const double* c, int32_t n, double* out) noexcept nogil:
-    """Solve v o out = c in the Jordan algebra of the cone."""
-    cdef double det = cone_det(v, n), dot = 0.0
-    cdef int32_t k
-    for k in range(1, n):
-        dot += v[k] * c[k]
-    out[0] = (v[0] * c[0] - dot) / det
-    for k in range(1, n):
-        out[k] = (c[k] - out[0] * v[k]) / v[0]
-
-
 cdef inline bint has_lower_bound(const elements_t* e, int32_t j) noexcept nogil:
     """Return whether row j has a lower bound."""
     return e.lower[j] > -1.0 / 0.0
@@ -244,9 +233,11 @@ cdef inline void compute_combined_cone_rhs(const elements_t* e, int32_t i, int32
     """Compute v \\\\ c of interior.pxd (4) into the cone's scaling, and rhs = T^-1 (v \\\\ c)."""
     cdef double *w = scaling_of(e, g)
     cdef const double *v = w + SCALING_V
+    cdef double *c = w + SCALING_C
     cdef double x[4]
     cdef double y[4]
     cdef double back[4]
+    cdef double dot = 0.0
     cdef int32_t k
     compute_affine_cone_step(e, i, g, da, n, y, back)
     x[0] = -sigma_mu
@@ -254,8 +245,12 @@ cdef inline void compute_combined_cone_rhs(const elements_t* e, int32_t i, int32
         x[0] += v[k] * v[k] + y[k] * back[k]
     for k in range(1, n):
         x[k] = 2.0 * v[0] * v[k] + y[0] * back[k] + back[0] * y[k]
-    divide_in_cone(v, x, n, w + SCALING_C)
-    apply_inv_scaling(w, n, w + SCALING_C, rhs)
+    for k in range(1, n):
+        dot += v[k] * x[k]
+    c[0] = (v[0] * x[0] - dot) / cone_det(v, n)         # v o c = x in the Jordan algebra of the cone
+    for k in range(1, n):
+        c[k] = (x[k] - c[0] * v[k]) / v[0]
+    apply_inv_scaling(w, n, c, rhs)
 
 
 cdef inline double limit_cone_step(const elements_t* e, int32_t i, int32_t g, const double* dz, double best,

@@ -132,28 +132,11 @@ cdef inline void adapt_proximal_weight(damped_newton_t* x, int32_t factorisation
     x.is_stuck = x.idle > 3 or x.failures > 6 or x.alpha > 10.0
 
 
-cdef inline bint request_certificate_check(newton_t* n, const damped_newton_t* x) noexcept nogil:
-    """Write the change of z to `direction` and request a check; return False if it is 0 or not finite.
-
-    If there is no solution, proximal iterations diverge along a direction y with H y = 0, which proves it.
-    """
-    cdef int32_t j
-    cdef double big
-    for j in range(n.s.e.m):
-        n.direction[j] = x.z[j] - n.c[j]
-    big = norm_inf(n.direction, n.s.e.m)
-    if not 0.0 < big < 1.0 / 0.0:
-        return False
-    for j in range(n.s.e.m):            # Rounding leaves rows that do not act slightly beyond their bounds.
-        n.direction[j] = n.direction[j] / big if fabs(n.direction[j]) > 1e-11 * big else 0.0
-    n.needs_check = 1
-    return True
-
-
 cdef inline void step_damped_newton(newton_t* n) noexcept nogil:
     """Take a Newton step of a proximal iteration. End the phase if the judge accepts, the limit is reached, or it is stuck."""
     cdef damped_newton_t* x = &n.damped
-    cdef int32_t factorisations
+    cdef int32_t factorisations, j
+    cdef double big
     cdef bint idle
     # Begin a proximal iteration.
     if x.stage == 0:
@@ -173,9 +156,16 @@ cdef inline void step_damped_newton(newton_t* n) noexcept nogil:
         if x.is_solved or x.history[x.inner_steps - 1] <= x.history[0]:
             copy_vector(n, x.z, n.u)
         x.stage = 2
-        if (x.law == CONE and x.is_solved and n.best > 0.5 * x.earlier_best and n.best > 1e-8
-                and request_certificate_check(n, x)):
-            return
+        if x.law == CONE and x.is_solved and n.best > 0.5 * x.earlier_best and n.best > 1e-8:
+            # If there is no solution, proximal iterations diverge along a direction y with H y = 0, which proves it.
+            for j in range(n.s.e.m):
+                n.direction[j] = x.z[j] - n.c[j]
+            big = norm_inf(n.direction, n.s.e.m)
+            if 0.0 < big < 1.0 / 0.0:
+                for j in range(n.s.e.m):                # Rounding leaves rows that do not act slightly beyond their bounds.
+                    n.direction[j] = n.direction[j] / big if fabs(n.direction[j]) > 1e-11 * big else 0.0
+                n.needs_check = 1
+                return
     # End the iteration; the caller has checked a direction.
     x.stage = 0
     if n.proven:

@@ -64,6 +64,7 @@ from lavender_ext.core.block_types cimport CONE, COULOMB
 from lavender_ext.core.start cimport is_zero_impulse
 from lavender_ext.judge.score cimport relative_residual
 from lavender_ext.newton.cones cimport has_lower_bound, has_upper_bound
+from lavender_ext.newton.elements cimport is_row
 from lavender_ext.newton.flow cimport begin_flow, step_flow
 from lavender_ext.newton.path cimport begin_path, continue_path, step_path
 from lavender_ext.newton.active_set cimport begin_active_set, step_active_set
@@ -77,7 +78,7 @@ from lavender_ext.newton.run cimport (ACTIVE_SET, AUGMENTED_NEWTON, DAMPED_NEWTO
                                       UNLIMITED, PLAN_CONVEX, PLAN_COULOMB, compute_slack, copy_vector, is_at_roundoff,
                                       is_budget_spent, is_finished, is_over, newton_t, pop_phase, push_phase,
                                       judge_and_keep_best_point, write_unknown)
-from lavender_ext.newton.steps cimport begin_interior_point, has_free_rows, compute_proximal_weight
+from lavender_ext.newton.steps cimport begin_interior_point, compute_proximal_weight
 from lavender_ext.newton.system cimport (BARRIER, BODIES, factor_newton_system, has_passed_after_part, solve_newton_system)
 
 
@@ -208,8 +209,13 @@ cdef inline void begin_unbounded_point(newton_t* n) noexcept nogil:
 
 cdef inline bint may_need_augmented_system(const newton_t* n) noexcept nogil:
     """Return whether nearly dependent rows, as in loops of rigid joints, may prevent progress from a near point."""
-    return (n.best < 1e-3 and n.has_augmented and n.s.form == BODIES and n.s.e.m <= MAX_AUGMENTED_ROWS
-            and has_free_rows(n))
+    cdef int32_t i
+    if not (n.best < 1e-3 and n.has_augmented and n.s.form == BODIES and n.s.e.m <= MAX_AUGMENTED_ROWS):
+        return False
+    for i in range(n.s.e.n):                            # Rows without bounds are those of joints.
+        if is_row(n.s.e, i) and not has_lower_bound(n.s.e, n.s.e.ptr[i]) and not has_upper_bound(n.s.e, n.s.e.ptr[i]):
+            return True
+    return False
 
 
 # -- bounded rows and cones --------------------------------------------------------------------------------------------

@@ -55,15 +55,6 @@ cdef inline bint has_only_free_rows(const elements_t* e) noexcept nogil:
     return True
 
 
-cdef inline bint has_free_rows(const newton_t* n) noexcept nogil:
-    """Return whether any row has no bounds, which is the case for rows of joints."""
-    cdef int32_t i
-    for i in range(n.s.e.n):
-        if is_row(n.s.e, i) and not has_lower_bound(n.s.e, n.s.e.ptr[i]) and not has_upper_bound(n.s.e, n.s.e.ptr[i]):
-            return True
-    return False
-
-
 cdef inline void begin_interior_point(newton_t* n, double delta, double derivative_fraction) noexcept nogil:
     """Compute a first point near H z = g and shift it inside all boundaries; one factorisation.
 

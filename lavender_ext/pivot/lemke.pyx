@@ -281,19 +281,6 @@ cdef inline void swap_dictionary_columns(dictionary_t* d, int32_t i, int32_t j) 
     set_nonbasic_variable(d, j, variable)
 
 
-cdef inline bint find_free_pivot(const lemke_t* l, int32_t* r, int32_t* c) noexcept nogil:
-    """Find the largest entry, relative to its row, in the rows of free w and the columns of free s."""
-    cdef const dictionary_t* d = &l.d
-    cdef int32_t i, j
-    cdef double size, best = 1e-11                      # Smaller entries count as rounding.
-    for i in range(first_free_pair(l), d.n):
-        size = norm_inf(d.t + i * d.width + FIRST, d.n)
-        for j in range(first_free_pair(l) + FIRST, d.n + FIRST):
-            if fabs(d.t[i * d.width + j]) > best * size:
-                r[0], c[0], best = i, j, fabs(d.t[i * d.width + j]) / size
-    return best > 1e-11
-
-
 cdef inline int32_t find_pivot_pair_of_free_rows(lemke_t* l, int32_t* r, int32_t* c) noexcept nogil:
     """Find a free w (row r), a free s (column c), and a bounded pair between them; return its row, or -1.
 
@@ -331,12 +318,19 @@ cdef inline bint pivot_out_free_rows(lemke_t* l) noexcept nogil:
     rows are retired; the deadline ends it before.
     """
     cdef dictionary_t* d = &l.d
-    cdef int32_t r, c, bounded
+    cdef int32_t r, c, bounded, i, j
+    cdef double size, best
     while d.n > first_free_pair(l):
         if has_passed_after_pivot(l):
             return False
         r, c = d.n - 1, d.n - 1 + FIRST                 # Without a pivot the row depends on others, and s stays 0.
-        if find_free_pivot(l, &r, &c):
+        best = 1e-11                                    # Smaller entries, relative to their row, count as rounding.
+        for i in range(first_free_pair(l), d.n):
+            size = norm_inf(d.t + i * d.width + FIRST, d.n)
+            for j in range(first_free_pair(l) + FIRST, d.n + FIRST):
+                if fabs(d.t[i * d.width + j]) > best * size:
+                    r, c, best = i, j, fabs(d.t[i * d.width + j]) / size
+        if best > 1e-11:
             pivot_dictionary(d, r, c)
         else:
             bounded = find_pivot_pair_of_free_rows(l, &r, &c)
