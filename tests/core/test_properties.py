@@ -20,7 +20,7 @@ from lavender.problem.cones import project_impulse
 from lavender.solvers import direct
 from lavender.solvers.islands import find_islands
 from lavender.solvers.polyhedral import BoundedRowSolver, convert_to_bounded_rows
-from lavender.solving import log, loop
+from lavender.solving import auto, log, loop
 from lavender.solving.velocity import accept_velocity
 from lavender_ext.judge.measure import is_residual_at_floor
 
@@ -533,16 +533,16 @@ def test_residual_of_ellipses_has_row_errors_in_the_metric_of_the_disk():
 
 def test_solution_history_and_time_exclude_the_judge(monkeypatch):
     """The judge takes 1 s of a clock that nothing else moves."""
-    now, judge = [0.0], lv.residual
+    now, judge = [0.0], log.measure_residual
 
     def judge_slowly(*given):
         now[0] += 1.0
         return judge(*given)
 
     for module in (loop, log):
-        monkeypatch.setattr(module, "residual", judge_slowly)
-    for module in (loop, log):
+        monkeypatch.setattr(module, "measure_residual", judge_slowly)
         monkeypatch.setattr(module, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(auto, "Recorder", lambda solve: log.Recorder(solve, now[0]))
     problem = random_contact_problem(0)
     solution = lv.solve(problem, "auto", history=True, tol=1e-9)
     assert now[0] > 0.0 and solution.history.time.max() == solution.solve_time == 0.0
