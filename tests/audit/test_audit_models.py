@@ -117,9 +117,6 @@ def test_audit_of_a_gymnasium_environment_counts_its_steps():
     assert found.n_judged == 40 and found.runs.name == "Hopper-v5" and found.rows.max() > 0
 
 
-# -- states that do not fit ----------------------------------------------------------------------------------
-
-
 def test_read_states_of_a_model_with_other_options_accepts_them(boxes, tmp_path):
     audit(boxes(EARLY), worlds=2, steps=30, workers=1).write(tmp_path)
     model = mj.MjModel.from_xml_string(BOXES.format(options='solver="CG" iterations="3"'))
@@ -128,9 +125,6 @@ def test_read_states_of_a_model_with_other_options_accepts_them(boxes, tmp_path)
     assert hash_model(model) == hash_model(load_model(boxes(EARLY))[1])
     model.dof_damping[0] = 1.0
     assert "other bodies, geoms, joints" in read_states(mj, model, tmp_path / "states.npz").misfit
-
-
-# -- against another model -----------------------------------------------------------------------------------
 
 
 def test_audit_against_another_model_judges_both_on_the_same_states(boxes, tmp_path):
@@ -163,9 +157,6 @@ def test_audit_against_another_model_judges_both_on_the_same_states(boxes, tmp_p
     assert smaller != larger
     found.write(tmp_path / "out")
     assert (np.load(tmp_path / "out" / "records.npz")["against"] == found.against.numbers[0]).all()
-
-
-# -- Ctrl-C --------------------------------------------------------------------------------------------------
 
 
 def test_audit_stopped_by_ctrl_c_has_the_complete_worlds(boxes, tmp_path, monkeypatch):

@@ -49,9 +49,6 @@ def test_bench_peers_every_adapter_solves_the_same_problem(kind):
         assert least is None or least < 1e-4, f"{contestant.name} on {SMALL[kind]}: {least:.1e}"
 
 
-# -- engines ---------------------------------------------------------------------------------------
-
-
 def test_bench_peers_command_steps_one_scene_in_every_engine_and_keeps_losses(tmp_path, monkeypatch):
     out, steps = tmp_path / "peers.json", []
 

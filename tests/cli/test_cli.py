@@ -103,9 +103,6 @@ def test_solve_command_with_output_equal_to_the_problem_ends_with_2(lavender, pa
         assert path.read_bytes() == before
 
 
-# -- what nobody should ask for ---------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("command", ["audit", "tune"])
 def test_ctrl_c_in_a_command_ends_with_130(tmp_path, monkeypatch, capsys, command):
     pytest.importorskip("mujoco")

@@ -43,9 +43,6 @@ def examples():
     return [p for (_, kind), (forms, _) in kinds if not kind.startswith("round") for p in forms]
 
 
-# -- a fresh solve, and the same problem solved in another way --------------------------------------
-
-
 def at_once(function, n=8):
     """Results of n threads that begin together."""
     gate = threading.Barrier(n)
@@ -115,9 +112,6 @@ def test_prepared_solve_from_a_start_has_the_bits_of_a_fresh_solve(name):
         options = options | {"impulse": 10.0 * np.ones(problem.m)}
         expected = facts(lv.solve(fresh(problem), name, **options))
         assert facts(lv.prepare(fresh(problem), name).solve(**options)) == expected, problem
-
-
-# -- one run, and the same run in parts ---------------------------------------------------------------
 
 
 def run_solver(problem, sizes, name, tol=1e-9, budget=1000, **options):

@@ -20,8 +20,6 @@ from random_problems import random_lcp, seeds
 
 import lavender as lv
 
-# -- rows without an entry ------------------------------------------------------------------------------------------
-
 
 @pytest.mark.parametrize("form", ["A", "J and M"])
 def test_row_below_the_smallest_entry_is_solved_as_an_empty_row(form):
@@ -39,8 +37,6 @@ def test_row_below_the_smallest_entry_is_solved_as_an_empty_row(form):
     assert not solution.success or solution.residual.relative <= 1e-6
     assert solution.status is not lv.Status.INFEASIBLE or solution.claim_check == "confirmed"
 
-
-# -- claims of solvers, against the judge in long double --------------------------------------------------------------
 
 # Numbers whose exponents are below this are far from the ends of float64, so that both judges give the same.
 MODERATE = 90.0

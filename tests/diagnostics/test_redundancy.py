@@ -78,9 +78,6 @@ def test_redundancy_rank_of_a_sparse_island_is_that_of_its_eigenvalues():
     np.linalg.cholesky((unit @ a @ unit).toarray()[np.ix_(kept, kept)])  # and they are independent
 
 
-# -- rows and bodies of very different size -------------------------------------------------------------
-
-
 @pytest.mark.parametrize("form", ["masses", "rows of J", "matrix"])
 @pytest.mark.parametrize("spread", [0, 30, 44, 50, 66, 88, 96])  # A_ii up to 1e59, the door is at 1e60
 def test_redundancy_rank_at_any_scale_is_that_of_exact_numbers(form, spread):

@@ -37,9 +37,6 @@ def soft(problem, compliance=0.0):
     return lv.Problem(problem.b, problem.cones, rows=problem.rows, compliance=np.full(problem.m, compliance))
 
 
-# -- there and back -------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("spacedim", [2, 3, 5])
 @pytest.mark.parametrize("suffix", [".hdf5", ".h5"])
 def test_fclib_local_file_keeps_every_bit(tmp_path, spacedim, suffix):
@@ -86,9 +83,6 @@ def test_save_of_bodies_writes_the_local_form_with_the_bits_of_a(tmp_path_factor
     assert stored.problem.cones == problem.cones and stored.impulse.tobytes() == impulse.tobytes()
     assert np.array_equal(stored.problem.dense(), problem.dense())  # compliance is on the diagonal of W
     assert np.array_equal(stored.problem.b, problem.b)
-
-
-# -- files of others ------------------------------------------------------------------------------
 
 
 def make(path, spacedim=3, **parts):
@@ -187,9 +181,6 @@ def test_load_of_fclib_with_both_forms_reads_the_local_one(tmp_path):
     with h5py.File(path, "a") as file:
         file.create_group("fclib_global")
     assert lavender.io.read(path).format == "fclib_local"
-
-
-# -- refused --------------------------------------------------------------------------------------
 
 
 def test_save_to_fclib_of_unsupported_data_names_it(tmp_path):

@@ -96,9 +96,6 @@ def test_save_of_npz_twice_has_the_same_bytes(tmp_path):
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
 
 
-# -- writing --------------------------------------------------------------------------------------
-
-
 def test_save_of_invalid_arguments_names_them_and_leaves_no_file(tmp_path):
     problem = random_lcp(1)
     for name in ("p.mat", "p"):
@@ -111,9 +108,6 @@ def test_save_of_invalid_arguments_names_them_and_leaves_no_file(tmp_path):
     with pytest.raises(lv.InputError, match="has no effect on an"):
         lavender.io.save(problem, tmp_path / "p.npz", drop=["names"])
     assert not list(tmp_path.iterdir())
-
-
-# -- foreign, truncated, malicious ----------------------------------------------------------------
 
 
 def archive(path, entries):
@@ -200,9 +194,6 @@ def test_a_plain_archive_of_arrays_is_a_program(tmp_path, keys):
     assert answers_of(stored.problem) == answers_of(lv.Problem.from_qp(**PROGRAM))
     linear = lavender.io.load(archive(path, {"q": [1.0, 2.0], "lb": [0.0, 3.0]}))
     assert lv.solve_qp(linear, "highs").x.round(9).tolist() == [0.0, 3.0]
-
-
-# -- plain box format -----------------------------------------------------------------------------
 
 
 def box(tmp_path, **changes):

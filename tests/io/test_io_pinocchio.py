@@ -182,9 +182,6 @@ def test_from_pinocchio_desired_velocity_is_the_target(kind):
     np.testing.assert_allclose(problem_of(model, [one], q, v).b - without, added)
 
 
-# -- data that were changed -----------------------------------------------------------------------------
-
-
 def anchored_chain(kind):
     """A chain of four hinges with its tip anchored, a velocity that keeps the anchor, and (dJ/dt) v by kinematics."""
     model, parent = pin.Model(), 0

@@ -203,9 +203,6 @@ def test_the_planar_engine_runs_when_it_is_copied_alone(tmp_path):
     assert "bar: 1.50 rad/s wanted" in output and "no figure: the folder examples/panels is missing" in output
 
 
-# -- of the engine ---------------------------------------------------------------------------------
-
-
 def test_warm_starts_keep_their_matches_for_ten_minutes():
     sim = lv.Simulation(lv.Scene("stack", solver_iterations=4))
     for _ in range(600):

@@ -20,9 +20,6 @@ def bounded_problem(seed, stiff=0.3, contacts=8):
     return lv.Problem(problem.b, problem.cones, rows=problem.rows, compliance=problem.compliance + stiff)
 
 
-# -- the inequality -------------------------------------------------------------------------------------
-
-
 def test_cross_check_with_a_residual_that_is_too_small_reports_a_breach():
     problem = bounded_problem(3)
     optimum = lv.solve(problem, "osqp", tol=1e-10)
@@ -41,9 +38,6 @@ def test_cross_check_with_a_residual_that_is_too_small_reports_a_breach():
     )
     assert fair.verdict == check.NOT_SOLVED
     assert not fair.contradicted
-
-
-# -- the reference --------------------------------------------------------------------------------------
 
 
 def test_cross_check_under_coulomb_law_or_an_asymmetric_matrix_has_no_reference():
@@ -100,9 +94,6 @@ def test_cross_check_under_the_cone_law_uses_a_reference_of_cones():
         assert row.velocity == solution.residual.velocity
 
 
-# -- claims ---------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("kind", [RuntimeError, lv.InputError])
 def test_cross_check_with_a_plug_in_that_raises_loses_its_row_or_reference_only(plug_in, kind):
     def broken(problem, impulse):
@@ -123,8 +114,6 @@ def test_cross_check_with_a_refused_solver_lists_it_and_is_ok():
     assert table.ok and [row.solver for row in table.refused] == ["direct"]
     assert not cross_check(problem, ["direct"]).ok  # nobody solved it
 
-
-# -- the suite and the example ------------------------------------------------------------------------------
 
 # Backends with false claims on programs that they receive as written: ProxQP 0.8 reports SOLVED with an objective that
 # is 7 % off.

@@ -85,9 +85,6 @@ def test_hash_of_a_program_changes_with_every_array():
     assert len(set(map(hash_problem, problems))) == len(problems)
 
 
-# -- cross-check -------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("singular", [False, True])
 def test_cross_check_of_a_program_compares_errors_and_distances(singular):
     problem = lv.Problem.from_qp(**control(singular=singular))
@@ -126,9 +123,6 @@ def test_cross_check_names_programs_without_a_solution():
     assert {row.verdict for row in cross_check(infeasible, ["auto", "osqp"])} == {"no solution, proved"}
     unbounded = lv.Problem.from_qp(np.zeros((1, 1)), [1.0], ub=[0.0])
     assert {row.verdict for row in cross_check(unbounded, ["auto", "osqp"])} == {UNBOUNDED}
-
-
-# -- times -------------------------------------------------------------------------------------------------
 
 
 def test_timed_calls_import_nothing(tmp_path):

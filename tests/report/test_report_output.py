@@ -153,9 +153,6 @@ def test_write_files_has_frames_as_csv_and_data_as_json(tmp_path):
     assert (tmp_path / "numbers.json").read_text() == '{\n "n": 1\n}\n' and (tmp_path / "a.txt").read_text() == "text"
 
 
-# -- figures ----------------------------------------------------------------------------------------
-
-
 def test_profile_is_the_share_of_cases_within_a_factor_of_the_fastest():
     times = pd.DataFrame({"a": [1.0, 2.0], "b": [4.0, 1.0], "c": [np.nan, 1.0]}, index=["x", "y"])
     svg = figures.draw_profile(times, ["x", "y"], None)

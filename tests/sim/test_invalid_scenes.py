@@ -21,8 +21,6 @@ def trajectory(sim, steps):
     return [sim.step()[0]["positions"].tobytes() for _ in range(steps)]
 
 
-# -- scenes that are stepped --------------------------------------------------------------------------------------
-
 real = st.floats(-4.0, 4.0, allow_subnormal=False) | st.sampled_from([s * x for x in SPECIAL for s in (1.0, -1.0)])
 positive = real.map(lambda x: abs(x) or 1.0)
 size = st.sampled_from((0.0, 1e-60, 1e-12, 1e-3, 0.1, 0.5, 1.0, 10.0, 1e8, 1e30, 1e60))
@@ -216,8 +214,6 @@ def test_scenes_of_unlike_sizes_and_masses_lose_no_body(name, tmp_path):
     play({"parameters": {}, "bodies": LASTING[name], "actions": [240], "lasts": True}, tmp_path / "state")
 
 
-# -- snapshots that were changed ------------------------------------------------------------------------------------
-
 NUMBERS = {
     "real": st.sampled_from((*SPECIAL, float("nan"), float("inf"), -1.0, 1e9)),
     "keys": st.integers(0, 2**64 - 1),
@@ -252,9 +248,6 @@ def test_snapshot_with_changed_arrays_is_rejected_or_stepped(name, how, steps, e
         return
 
 
-# -- arrays of snapshots ---------------------------------------------------------------------------------
-
-
 def test_every_array_of_a_snapshot_that_the_scene_gives_is_compared():
     # One bit of one entry changes, which no other check detects.
     sim = after(5, "bridge", n=4, patch_radius=0.1)
@@ -269,9 +262,6 @@ def test_every_array_of_a_snapshot_that_the_scene_gives_is_compared():
         with pytest.raises(lv.InputError, match=f"damaged: {name} "):
             sim.restore(bad)
         assert sim.snapshot().real.tobytes() == before.real.tobytes()
-
-
-# -- threads -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("inspects", [False, True])
@@ -313,9 +303,6 @@ def caller(plug_in):
         return plan
 
     return make
-
-
-# -- Ctrl-C --------------------------------------------------------------------------------------------
 
 
 def stop():

@@ -20,9 +20,6 @@ EVERY = sorted({*DEFAULT, *hard.SET})
 LARGE = {"hang(n=10000)"}  # seconds
 
 
-# -- names ----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", EVERY)
 def test_suite_case_by_its_name_has_the_same_bits(name):
     one = suite.case(name)
@@ -61,9 +58,6 @@ def test_sets_and_families_are_listed():
         package = suite.parse_case_name(name)[1].get("package", "")
         if not suite.explain_missing_packages(package):
             assert suite.case(name).problem.m > 0  # the listing is itself a valid name
-
-
-# -- references -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -117,9 +111,6 @@ def test_random_spd_has_the_condition_it_names():
         a = suite.random_spd(30, condition).problem.dense()
         assert np.linalg.cond(a) == pytest.approx(condition, rel=1e-6)
         assert np.array_equal(a, a.T)
-
-
-# -- stored solutions -----------------------------------------------------------------------------
 
 
 def multiply_exactly(matrix, x):

@@ -17,9 +17,6 @@ def test_hard_set_uses_every_family():
     assert len(families) >= 12 and families <= names
 
 
-# -- as hard as they say --------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("name", "rank"),
     [("duplicated(k=64)", 1), ("slab(n=10)", 3), ("slabF(n=2)", 6), ("four_bar", 17), ("ring(n=8)", 27)],
@@ -27,9 +24,6 @@ def test_hard_set_uses_every_family():
 def test_hard_problems_have_their_documented_rank(name, rank):
     problem = suite.case(name).problem
     assert np.linalg.matrix_rank(problem.dense(), tol=1e-11 * problem.d.max()) == rank
-
-
-# -- closed forms, by a second way ----------------------------------------------------------------
 
 
 @pytest.mark.parametrize("angle", [5.0, 20.0, 26.5, 26.6, 30.0, 40.0])

@@ -33,9 +33,6 @@ def test_backend_started_near_its_answer_needs_at_most_half_of_the_iterations(na
     assert warm.success and warm.work.get("iterations", 0) <= cold.work["iterations"] / 2
 
 
-# -- the program form ----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("cost", [1e-10, 1.0, 1e10])
 @pytest.mark.parametrize("size", [1e-8, 1.0, 1e6])
 def test_scaled_program_has_numbers_near_one_and_powers_of_two_as_scales(cost, size):
@@ -87,9 +84,6 @@ def test_backend_form_has_a_p_that_is_symmetric_in_every_bit():
     for program in (build_form(problem, "impulse").program, get_program(lv.Problem.from_qp(**draw_program(6)).qp)):
         P = program.scaled.get_hessian(True)
         assert (P == P.T).all()
-
-
-# -- single backends -----------------------------------------------------------------------------------
 
 
 @pytest.mark.skipif("highs" not in BACKENDS, reason="highspy is not installed")

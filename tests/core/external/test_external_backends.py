@@ -28,9 +28,6 @@ def replaced(register, name, call):
     register(replace(registry.get(name), factory=partial(qp_solver.QPSolver, replace(backend, call=call))))
 
 
-# -- listing ----------------------------------------------------------------------------------------
-
-
 def test_every_backend_of_qpsolvers_is_known():
     qpsolvers = pytest.importorskip("qpsolvers")
     assert set(qpsolvers.available_solvers) <= set(BACKENDS)
@@ -64,9 +61,6 @@ def test_backend_prints_nothing_imports_nothing_and_runs_in_threads(name, capfd,
     assert capfd.readouterr() == ("", "")
     with pytest.raises(KeyboardInterrupt):  # some backends handle Ctrl-C themselves while they solve
         signal.raise_signal(signal.SIGINT)
-
-
-# -- what a problem may be ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", BACKENDS)
@@ -123,9 +117,6 @@ def test_backend_on_empty_or_fixed_problems_is_not_called(name):
     assert fixed.impulse.tolist() == [0.5, 2.0]
     assert fixed.work == {"backend_calls": 0}
     assert "determined by its bounds" in fixed.message
-
-
-# -- what ran -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", BACKENDS)
@@ -260,9 +251,6 @@ def test_isolated_process_errors_equal_errors_of_a_direct_call():
     assert there.message.split(";")[0] == here.message.split(";")[0]
 
 
-# -- options ------------------------------------------------------------------------------------------
-
-
 def test_settings_reach_the_backend_or_are_an_input_error():
     problem = lv.Problem.lcp(*spd(20))
     one = lv.solve(problem, "osqp", settings={"max_iter": 25, "polishing": False, "rho": 1e-6})
@@ -272,9 +260,6 @@ def test_settings_reach_the_backend_or_are_an_input_error():
         for wrong, word in (({"bogus": 1}, "bogus"), ([1], "mapping")):
             with pytest.raises(lv.InputError, match=word):
                 lv.solve(problem, name, settings=wrong)
-
-
-# -- failures of a backend ----------------------------------------------------------------------------
 
 
 def answers(register, *given):
@@ -362,6 +347,3 @@ def test_backend_at_tol_zero_runs_at_its_tightest_tolerance():
     solution = lv.solve(lv.Problem.lcp(*spd(10)), "clarabel", tol=0.0)
     assert solution.status in (lv.Status.STALLED, lv.Status.ROUNDOFF_LIMIT)
     assert solution.residual.relative <= 1e-10
-
-
-# -- the program that a backend is handed ---------------------------------------------------------------

@@ -64,9 +64,6 @@ def twice(by_mu):
     assert by_mu(jac, 2.0 * np.eye(3), np.array([2.0, 0.0, -1.0]), np.array([0.4, 0.4])) == pytest.approx(-1.0)
 
 
-# -- PyTorch -----------------------------------------------------------------------------------------------------
-
-
 def torch_and_solve():
     torch = pytest.importorskip("torch")
     from lavender.torch import solve
@@ -106,9 +103,6 @@ def test_batches_of_torch():
     frees = stacked[2][0] + 1e-3 * torch.arange(4, dtype=torch.float64)[:, None]
     one = torch.func.vmap(lambda v: each(*(x[0] for x in stacked[:2]), v, *(x[0].detach() for x in stacked[3:]))[0])
     assert one(frees).shape == (4, 5)
-
-
-# -- JAX ---------------------------------------------------------------------------------------------------------
 
 
 def jax_and_solve():

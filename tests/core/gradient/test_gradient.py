@@ -70,9 +70,6 @@ def test_derivative_vjp_is_the_adjoint_of_jvp(kind, law, operator):
         assert told == pytest.approx(wanted, rel=1e-9, abs=1e-9), name
 
 
-# -- states ------------------------------------------------------------------------------------------------------
-
-
 def test_derivative_states_of_rows_and_components_are_documented_ones():
     p = lv.Problem.lcp(np.eye(4), [1.0, -1.0, 3.0, 0.0], [0.0, 0.0, 0.0, 0.0], [2.0, 2.0, 2.0, 2.0])
     solution = lv.solve(p, tol=1e-12)
@@ -107,9 +104,6 @@ def test_derivative_states_fit_impulse_and_slack(kind):
             reach = np.where(c.friction_coefficient[rows[1:]] > 0.0, c.friction_coefficient[rows[1:]], 1.0)
             share = np.linalg.norm(lam[rows[1:]] / reach) / lam[rows[0]]
             assert share == pytest.approx(0.0 if kind == "smooth" and i < 4 else 1.0, abs=1e-6) or kind == "smooth"
-
-
-# -- where it does not exist ------------------------------------------------------------------------------------
 
 
 def test_derivative_of_dependent_rows_gives_velocities_and_rejects_impulses():
@@ -150,9 +144,6 @@ def test_derivative_near_a_switch_is_flagged():
     assert rough.distance[0] < 1e-8 and rough.distance_in_errors[0] < 10.0
 
 
-# -- what is refused ---------------------------------------------------------------------------------------------
-
-
 def test_derivative_of_equal_bounds_moves_them_together():
     p = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, 1.0], [0.25, 0.0], [0.25, np.inf])
     d = lv.derivative(p, lv.solve(p, tol=1e-13))
@@ -163,9 +154,6 @@ def test_derivative_of_equal_bounds_moves_them_together():
     assert g.lower == pytest.approx([-0.25, 0.0]) and g.upper == pytest.approx([-0.25, 0.0])
     for name in ("lower", "upper"):  # one of them: half of it, both ways
         assert d.jvp(**{name: [1.0, 0.0]}).impulse == pytest.approx([0.5, -0.25])
-
-
-# -- many at once ------------------------------------------------------------------------------------------------
 
 
 def test_derivatives_of_a_batch_equal_single_gradients():

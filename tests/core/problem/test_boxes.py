@@ -19,9 +19,6 @@ def free(seed, contacts=4, friction="coulomb", mu=None):
     return dragged(seed, contacts, mu, "box", friction)
 
 
-# -- blocks ------------------------------------------------------------------------------------------------------------
-
-
 def test_cones_shaped_to_box_and_back_are_equal():
     disk = lv.Cones.free(2) + lv.Cones.contacts([0.5, 0.3]) + lv.Cones.contacts(0.4, 1)
     assert disk.shaped("box").shaped("disk") == disk
@@ -29,9 +26,6 @@ def test_cones_shaped_to_box_and_back_are_equal():
     two = lv.Cones.contacts([(0.1, 0.2), (0.3, 0.3)], shape="box")
     assert two.shaped("disk").kind.tolist() == [lv.CONTACT_ELLIPSE, lv.CONTACT]
     assert two.shaped("disk").shaped("box") == two
-
-
-# -- findex ------------------------------------------------------------------------------------------------------------
 
 
 @given(seed=seeds)
@@ -74,9 +68,6 @@ def test_boxed_problem_has_constant_friction_bounds():
     assert boxed.cones.upper.tolist() == [np.inf, 0.5, 1.0]
 
 
-# -- solutions ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", ["lemke", "direct"])
 @pytest.mark.parametrize("law", LAWS)
 @given(seed=seeds, iterations=st.sampled_from([1, 2, 1000]))
@@ -91,9 +82,6 @@ def test_pivoting_on_boxes_is_not_worse_than_its_start(law, name, seed, iteratio
     # a solution at the floor of rounding may be as far above zero as the start
     bound = max(lv.residual(problem, start).relative, 1e-8, 2.0 * end.residual.roundoff_floor)
     assert end.residual.relative <= bound, end
-
-
-# -- ellipses --------------------------------------------------------------------------------------------------------
 
 
 def test_cones_of_two_coefficients_return_them_and_equal_ones_are_a_disk():

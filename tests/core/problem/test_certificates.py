@@ -25,9 +25,6 @@ def opposed(eps):
     return lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0 + eps]], [1.0, 1.0])
 
 
-# -- the bound on the impulses ---------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", lv.available(opposed(1.0)))
 def test_certificate_of_a_definite_matrix_is_rejected(name):
     """Its solution is b.y over the slack: 2e12 N s in each row, which some find, and all others say they miss."""
@@ -140,9 +137,6 @@ def test_impulse_bound_holds_for_every_solution(law, form):
             assert found.impulse_bound <= np.abs(solution.impulse).sum() * (1.0 + 1e-6), seed
             told += found.impulse_bound > 0.0
     assert told > 5
-
-
-# -- dust -----------------------------------------------------------------------------------------------
 
 
 def walking(seed, dust=2.78e-17):

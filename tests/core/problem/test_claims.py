@@ -11,8 +11,6 @@ from random_problems import CONTACTS, GIVEN, arrays_of, random_contact_problem, 
 import lavender as lv
 from lavender import registry
 
-# -- finite numbers -----------------------------------------------------------------------------------
-
 # Worked out anew at each call, and the caller's own.
 ANEW = {
     "contact_rows", "friction_rows", "normal_rows", "n_tangents", "n_together", "separate_rows", "spin_rows",
@@ -27,9 +25,6 @@ def test_solver_without_progress_is_stopped_as_stalled(plug_in):
     solution = lv.solve(random_lcp(5), name, max_iter=10**9)
     assert solution.status is lv.Status.STALLED
     assert "none of the" in solution.message
-
-
-# -- the problem is out of reach ----------------------------------------------------------------------
 
 
 def given_by(form):
@@ -66,9 +61,6 @@ def test_claim_with_a_residual_of_another_problem_is_contradicted(plug_in):
     np.testing.assert_array_equal(solution.residual.slack, -problem.b)
 
 
-# -- no solution --------------------------------------------------------------------------------------
-
-
 def test_infeasible_rows_leave_impulses_of_other_rows(plug_in):
     """The largest velocity error is that of rows that cannot be met; it chose the zero impulse for all."""
 
@@ -93,8 +85,6 @@ def test_lemke_ray_on_a_solvable_problem_is_stalled():
     nearly = lv.solve(lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0 + 1e-6]], [1.0, 1.0]), "pgs", max_iter=100)
     assert nearly.impulse_bound is None or "at least" in nearly.message
 
-
-# -- plug-ins that lie --------------------------------------------------------------------------------
 
 #: What a solver may return in place of the answer, of (problem, answer): each with a claim of success.
 LIARS = {
@@ -139,9 +129,6 @@ def test_false_claim_in_every_form_and_law_is_contradicted(form, status, plug_in
             solution = lv.solve(problem, liar)
             assert solution.claim_check == "contradicted", (problem, name, str(solution))
     assert seen == {"linear", "lcp", "coulomb", "cone"}
-
-
-# -- the floor does not excuse an impulse that ran away ------------------------------------------------
 
 
 HIDDEN = lv.Problem.lcp([[1.0, -3.0], [-3.0, 9.0]], [1.0, 0.0], [-2.0, -np.inf])  # b is not in A's range

@@ -11,8 +11,6 @@ from random_problems import random_contact_problem, random_lcp, random_tree_pare
 import lavender as lv
 from lavender.judge.residuals import UNIT_ROUNDOFF_FLOAT32, estimate_float32_slack_errors
 
-# -- the floor --------------------------------------------------------------------------------------
-
 
 def dense_parts(p):
     """A, J, M^-1, M, v*: dense, whatever the problem holds."""
@@ -73,9 +71,6 @@ def test_a_solution_rounded_to_float32_is_at_its_floor_and_one_further_off_is_no
         assert off.verdict == "stopped before convergence"
         assert off.excess == off.relative / off.roundoff_floor > 4.0
         assert f"stopped before convergence, {off.excess:.2g} times its floor" in str(off)
-
-
-# -- data in float32 ----------------------------------------------------------------------------------
 
 
 def test_jacobian_in_float32_is_widened_exactly():

@@ -13,8 +13,6 @@ from random_problems import as_matrix, random_generalized_problem, random_tree_p
 
 import lavender as lv
 
-# -- the operator ----------------------------------------------------------------------------------
-
 
 def row_by_row(mass, x):
     """M^-1 x by M = L^T D L, a row after the other."""
@@ -83,9 +81,6 @@ def test_from_jacobian_without_rows_or_velocities_is_solved():
     np.testing.assert_allclose(solution.impulse, [1.0, 4.0])  # the row on nothing: decided on the spot
     hopeless = lv.Problem.from_jacobian(jac, np.eye(2), [-1.0, 0.0], target=[0.0, 1.0], cones=lv.Cones.free(2))
     assert lv.solve(hopeless, "newton").status is lv.Status.INFEASIBLE
-
-
-# -- newton over velocities -------------------------------------------------------------------------
 
 
 @given(seed=seeds)

@@ -111,9 +111,6 @@ def test_the_residual_of_two_problems_side_by_side_is_the_larger_one(form, kind,
         )
 
 
-# -- rows that do not act ------------------------------------------------------------------------------
-
-
 def with_inactive_rows(problem, rng, sizes):
     """A problem in generalised coordinates and more rows of every kind, whose bounds hold them at zero impulse.
 
@@ -274,9 +271,6 @@ def test_residual_row_with_zero_b_at_rest_is_compared_with_its_own_terms():
     # |target| + |J v*| is 6 m/s.
     assert lv.residual(rolls, [1e9, 0.5]).relative == pytest.approx(0.5 / 6.0)
     assert lv.solve(rolls, tol=1e-9).success
-
-
-# -- immovable bodies and entries that are zero --------------------------------------------------------
 
 
 @pytest.mark.parametrize("seed", range(3))

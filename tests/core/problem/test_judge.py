@@ -13,8 +13,6 @@ import lavender as lv
 from lavender.judge import residuals
 from lavender.judge.certificates import check_certificate
 
-# -- the twin --------------------------------------------------------------------------------------
-
 
 def equals_the_twin(problem, lam):
     """Everything the judge says of an impulse, and what it is made of; 1e-9: M and its inverse, roots of many terms."""
@@ -130,9 +128,6 @@ def test_energy_change_of_a_solution_without_targets_is_not_positive(seed):
     assert solution.success and problem.energy_change(solution.impulse) <= 1e-8 * before
 
 
-# -- diagonals, b = 0, floor ---------------------------------------------------------------------------
-
-
 def test_diagonal_of_zero_or_negative_entries_uses_the_largest_of_the_row():
     a = np.array([[0.0, 3.0, 0.0], [3.0, -1.0, 0.0], [0.0, 0.0, 0.0]])
     np.testing.assert_array_equal(lv.Problem.lcp(a, np.zeros(3)).d, [3.0, 3.0, 3.0])
@@ -202,9 +197,6 @@ def test_certificate_check_equals_its_twin(kind, law, seed):
     problem = lv.Problem(b, cones, g @ g.T, friction=law)
     reason = judge_twin.Problem(spec_of(problem)).refutes(y)
     assert (check_certificate(problem, y) is None) == (reason is None), reason
-
-
-# -- nothing to do ----------------------------------------------------------------------------------
 
 
 def test_solve_at_rest_converges_without_iterations():

@@ -16,9 +16,6 @@ import lavender as lv
 I2 = np.eye(2)
 
 
-# -- classes and forms -----------------------------------------------------------------------------------
-
-
 def test_problem_law_follows_from_the_kinds_of_blocks():
     assert lv.Problem.linear(I2, [1, 1]).law == "linear"
     assert lv.Problem.lcp(I2, [1, 1]).law == "lcp"
@@ -85,9 +82,6 @@ def test_problem_rows_have_names():
         replace(random_lcp(1), key=[[1, 2], [3]])
 
 
-# -- friction: defaults with a meaning ------------------------------------------------------------------------
-
-
 def test_from_rows_with_a_scalar_mu_or_one_for_each_contact_is_the_same():
     with pytest.raises(lv.InputError, match=r"mu has 3 values for 3 rows.*one mu for each contact"):
         lv.Problem.contact(np.eye(3), np.ones(3), mu=[0.5, 0.5, 0.5])
@@ -95,9 +89,6 @@ def test_from_rows_with_a_scalar_mu_or_one_for_each_contact_is_the_same():
     assert lv.Problem.contact(np.eye(9), np.ones(9), mu=0.5) == lv.Problem.contact(np.eye(9), np.ones(9), mu=[0.5] * 3)
     assert lv.Problem.contact(np.eye(8), np.ones(8), mu=0.5, patch_radius=0.1).n_blocks == 2
     assert lv.Problem.contact(np.eye(2), np.ones(2), mu=0.5).n_blocks == 1
-
-
-# -- copies and interruptions ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("again", [copy.copy, copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
@@ -129,9 +120,6 @@ def test_ctrl_c_by_a_signal_ends_a_solve_as_interrupted():
         "assert solution.iterations > 1000 and solution.residual.relative < 1e-9, solution\n"
     )
     python("-c", code)
-
-
-# -- what is given stays the giver's ---------------------------------------------------------------------
 
 
 def given_arrays():

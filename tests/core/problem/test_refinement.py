@@ -59,9 +59,6 @@ def false_claim(problem, solution):
     return f"{status.name} at {r.relative:.1e}, floor {r.roundoff_floor:.1e}; in long double {found.relative:.1e}"
 
 
-# -- claims ----------------------------------------------------------------------------------------
-
-
 def check_claims(name, law, condition, seed, tol):
     problem = ill_problem(seed, condition, law)
     if registry.get(name).refuses(problem) is not None:
@@ -119,9 +116,6 @@ def test_residual_above_the_floor_is_not_converged():
             assert not solution.residual.at_floor
             seen += "ill-conditioned" in solution.message
     assert seen > 5
-
-
-# -- the refined pass ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("condition", [1e4, 1e8, 1e12])

@@ -42,9 +42,6 @@ def test_restrict_to_islands_gives_blocks_of_the_matrix(form, seed):
         assert not a[np.ix_(rows, others)].any()
 
 
-# -- the convex relaxation -----------------------------------------------------------------------------
-
-
 def test_auto_solves_a_resting_pile_by_its_relaxation():
     problem = lv.suite.case("granularF(n=6)").problem
     solution = lv.solve(problem, "auto", tol=1e-6)
@@ -101,9 +98,6 @@ def test_auto_continues_only_with_islands_that_the_relaxation_has_not_solved():
     assert solution.success and lv.residual(problem, solution.impulse).relative <= 1e-6
     sweeps = [s.work["sweeps"] for s in solution.stages if s.solver == "anderson" and s.before > 0.1]
     assert sum(sweeps) <= 128  # The pile needs fewer than 128; the sweeps end when half of the blocks are solved.
-
-
-# -- time limits ---------------------------------------------------------------------------------------
 
 
 def test_auto_with_stages_left_out_for_lack_of_time_ends_with_the_status_time_limit(monkeypatch):

@@ -96,9 +96,6 @@ def test_sweeps_under_coulomb_law_return_the_last_iterate(name):
                 np.testing.assert_array_equal(solution.impulse, last.impulse)
 
 
-# -- starts ------------------------------------------------------------------------------------------------------------
-
-
 def test_sweeps_stale_start_begin_at_zero_in_that_island_alone():
     problem = lv.Problem.lcp(np.diag([1.0, 1.0]) + np.array([[0.0, 0.0], [0.0, 0.0]]), [1.0, 1.0])
     assert find_islands(problem)[0] == 2
@@ -141,9 +138,6 @@ def test_combine_best_islands_takes_the_smallest_objective_of_each_island(seed):
     found = combine_best_islands(problem, points[0], list(points[1:4]), 1e-12)  # The last is always compared, too.
     best = np.argmin(values, axis=0)
     np.testing.assert_array_equal(found, np.concatenate([np.split(points[i], 3)[k] for k, i in enumerate(best)]))
-
-
-# -- bounds that exclude zero ------------------------------------------------------------------------------------------
 
 
 def preloaded_problem(seed, law, rhs_size):

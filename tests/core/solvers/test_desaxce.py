@@ -14,9 +14,6 @@ def problem_of(seed, compliant, friction="coulomb"):
     return problem if compliant else dataclasses.replace(problem, compliance=np.zeros(problem.m))
 
 
-# -- equations ----------------------------------------------------------------------------------------
-
-
 @given(seed=seeds)
 def test_slip_is_de_saxces_term_and_psi_its_derivative(seed):
     solve = system_in(problem_of(seed, True), "velocity").solve

@@ -90,8 +90,6 @@ def test_velocity_tol_of_masses_times_1000_and_speeds_times_10_takes_the_same_sw
     assert own.iterations == lv.solve(lv.Problem.lcp(A / 1000.0, 10.0 * b), "pgs", velocity_tol=1e-3).iterations
 
 
-# -- islands -----------------------------------------------------------------------------------------------------------
-
 BALLS = 10  # Each is an island of its own: a contact with friction that slides.
 #: Rows on the velocity of one body, and targets [m/s] that no impulse meets.
 JAMS = {

@@ -16,9 +16,6 @@ def named(name, **more):
     return dataclasses.replace(SPEC, name=name, **more)
 
 
-# -- specs ------------------------------------------------------------------------------------------
-
-
 def test_claim_of_more_iterations_than_the_limit_is_a_numerical_error(plug_in):
     name = plug_in(lambda problem, impulse: lv.Claim(lv.Status.MAX_ITERATIONS, 6, {}))
     solution = lv.solve(TINY, name, max_iter=5)
@@ -53,9 +50,6 @@ def test_a_plug_in_without_update_is_prepared_anew(register):
     assert solver.solve(lv.Problem.lcp(np.eye(2), [2.0, 3.0])).impulse.tolist() == [2.0, 3.0]
 
 
-# -- names ------------------------------------------------------------------------------------------
-
-
 def test_available_selects_by_capabilities():
     ordered = lv.available(law="lcp", order=True)
     assert "pgs" in ordered
@@ -67,9 +61,6 @@ def test_available_selects_by_capabilities():
         lv.available(law="lpc")
     with pytest.raises(lv.UnknownName, match="did you mean 'sequential_impulses'"):
         lv.solve(TINY, "si")  # its initials
-
-
-# -- from outside -----------------------------------------------------------------------------------
 
 
 def test_register_of_a_name_twice_raises_without_replace(register):

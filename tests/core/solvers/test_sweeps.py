@@ -76,9 +76,6 @@ def test_gauss_seidel_sor_and_jacobi_are_their_formulas(seed):
         np.testing.assert_allclose(sweeps(linear, name, 3, **options), lam, atol=1e-12 * np.abs(lam).max())
 
 
-# -- the damping of Jacobi ------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("k", [2, 3, 5])
 def test_jacobi_without_damping_diverges_on_coincident_contacts(k):
     """k contacts at one place: A is all ones. Unprojected factor k - 1; projected from 0, period 2."""

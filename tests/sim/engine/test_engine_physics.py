@@ -109,9 +109,6 @@ def test_a_closed_system_keeps_its_momentum(kind):
     np.testing.assert_allclose(np.linalg.norm(last["quaternions"], axis=1), 1.0, atol=1e-15)
 
 
-# -- joints ----------------------------------------------------------------------------------------
-
-
 def test_scene_motor_turns_its_joint_within_its_torque():
     sim = lv.Simulation(lv.Scene("four_bar", motor=2.0, solver_iterations=64))
     speed = np.linalg.norm(run(sim, 240)["velocities"][0, 3:])
@@ -119,9 +116,6 @@ def test_scene_motor_turns_its_joint_within_its_torque():
     weak = lv.Simulation(lv.Scene("four_bar", motor=50.0, torque=3.0))
     impulses = run(weak, 5)["joint_impulses"]
     assert impulses[5] == pytest.approx(3.0 / 240.0, rel=1e-12)  # torque times the substep, at its bound
-
-
-# -- stacks and sweeps -----------------------------------------------------------------------------
 
 
 def slope(angle, turned, shape, **more):

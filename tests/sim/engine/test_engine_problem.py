@@ -94,9 +94,6 @@ def test_scene_iterations_and_warm_start_set_now_act_in_the_next_step():
     assert sim.step()[0]["solver"][[0, 1, 3]].tolist() == [33, 1, 24]
 
 
-# -- snapshots -----------------------------------------------------------------------------------
-
-
 def test_restore_of_a_foreign_or_damaged_snapshot_raises(tmp_path):
     sim = lv.Simulation(lv.Scene("stack", n=3))
     path = tmp_path / "state"
@@ -144,9 +141,6 @@ def test_restore_of_a_foreign_or_damaged_snapshot_raises(tmp_path):
     one.load(path)
 
 
-# -- other solvers ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("rolling", [0.0, 0.01])
 @pytest.mark.parametrize("name", [n for n in lv.available(external=False) if "cone" in lv.get(n).laws or n == "pgs"])
 def test_scene_step_by_any_registered_solver_runs(name, rolling):
@@ -190,9 +184,6 @@ def test_step_after_a_failed_solve_follows_on_failure(policy):
     assert info["failed_solves"] == 1
     expected = {"use": found, "keep": problem.guess, "damp": 0.5 * (problem.guess + found)}[policy]
     np.testing.assert_array_equal(observation["contacts"]["impulses"].ravel(), expected)
-
-
-# -- every row judged ------------------------------------------------------------------------------
 
 
 def test_scene_residual_of_all_rows_is_that_of_the_judge():

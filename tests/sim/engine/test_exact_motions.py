@@ -52,9 +52,6 @@ def find_period(time, x):
     return 2.0 * np.diff(time[i] + (time[i + 1] - time[i]) * x[i] / (x[i] - x[i + 1])).mean()
 
 
-# -- friction --------------------------------------------------------------------------------------
-
-
 @SOLVERS
 @pytest.mark.parametrize("mu", [0.2, 1.0])
 @pytest.mark.parametrize("ratio", [0.5, 0.98, 1.02, 1.5])
@@ -109,9 +106,6 @@ def test_spinning_ball_slows_linearly_by_torsional_friction(mu, spin):
     seconds = spin * 0.4 * 0.25 / (mu * patch * G)  # Inertia 2/5 m R^2, torque mu r m g.
     time, _, _, v = record(scene, seconds + 0.5)
     np.testing.assert_allclose(v[:, 1, 5], spin * np.maximum(0.0, 1.0 - time / seconds), rtol=0, atol=1e-9 * spin)
-
-
-# -- joints and free bodies ------------------------------------------------------------------------
 
 
 def test_pendulum_period_is_exact_and_energy_loss_falls_with_substep():
@@ -171,9 +165,6 @@ def test_chain_under_load_has_no_gap_and_first_joint_carries_all_weight(ratio):
     assert tension == pytest.approx(G * sum(b.mass for b in scene.bodies), rel=1e-3)
     # A tenth of the slop of contacts; sweeps open a gap of centimetres at the largest ratio.
     assert np.abs(sim.state.a["joint_error"]).max() < 1e-4
-
-
-# -- bodies that stand or fall ---------------------------------------------------------------------
 
 
 @SOLVERS

@@ -78,9 +78,6 @@ def test_scene_contacts_have_only_the_rows_of_their_friction():
     np.testing.assert_array_equal(np.concatenate([impulses[0], impulses[1, :1], impulses[2, :3]]), expected)
 
 
-# -- bad input ----------------------------------------------------------------------------------------
-
-
 #: Calls of a scene with a ball and a plane, or of no scene, and words of their errors.
 REFUSED = [
     (lambda s: s.add_box(mass=0.0), "mass"), (lambda s: s.add_box((1, 0, 1)), "positive"),
@@ -143,9 +140,6 @@ def test_scene_with_a_wrong_part_or_parameter_raises_and_adds_nothing(call, word
     assert lv.Scene("stack", dt=1e6, substeps=3).parameters.substeps == 3  # because it is given
 
 
-# -- extremes ---------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("solver", "velocity", "spin"),  # of the second, rows whose impulses are far from all others
     [("sequential_impulses", (1e60, 0, 0), 0), ("pgs", (1e60, 0, -1e55), 1e55), ("newton", (1e60, 0, 0), 0)],
@@ -166,9 +160,6 @@ def test_step_with_a_lost_state_names_its_body_and_ends_the_simulation(solver, v
         sim.step()
     sim.restore(before)
     assert not sim.step()[2]
-
-
-# -- parts --------------------------------------------------------------------------------------------
 
 
 def test_scene_shapes_have_their_textbook_inertia():

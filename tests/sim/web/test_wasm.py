@@ -32,9 +32,6 @@ def recording(tmp_path_factory):
     return folder
 
 
-# -- the module ------------------------------------------------------------------------------------------------
-
-
 HEAD = "from libc.stdint cimport int32_t\n"
 GOOD = HEAD + "cdef public int32_t lav_good(int32_t x) noexcept nogil:\n    return 2 * x + <int32_t>sizeof(void*)\n"
 
@@ -61,9 +58,6 @@ def test_wasm_module_has_the_documented_size_and_can_grow(name, request):
     assert size < 0.95 * wasm.MAX_MODULE_BYTES
 
 
-# -- Node ------------------------------------------------------------------------------------------------------
-
-
 def node(*arguments):
     if shutil.which("node") is None:
         pytest.skip("Node is not installed")
@@ -82,9 +76,6 @@ def test_wasm_module_has_the_bits_of_the_native_engine(module_file, recording):
     done = node(CHECK, module_file, recording)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "all the same: 16 scenes, 4800 steps, 640 solves by newton" in done.stdout
-
-
-# -- scenes and command ----------------------------------------------------------------------------------------
 
 
 def test_page_scenes_are_the_start_of_native_ones():
