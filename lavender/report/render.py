@@ -83,20 +83,21 @@ def escape_markdown(text: str) -> str:
 def print_table(console: Console, frame: pd.DataFrame, optional: Sequence[str] = ()) -> None:
     """Print a frame within the width of the terminal. Its texts are not read as markup.
 
-    In a table that is too wide, heads and words fold and numbers stay whole; then columns are left out and named: those
-    of `optional` in their order, then the last ones.
+    Heads fold between words and numbers stay whole. In a table that is too wide, heads fold within words; then columns
+    are left out and named: those of `optional` in their order, then the last ones.
     """
     from rich.table import Table
     from rich.text import Text
 
-    remaining, left_out = [head for head in optional if head in frame], list[str]()
+    remaining, left_out, keeps_words = [head for head in optional if head in frame], list[str](), True
     while True:
         texts = format_cells(frame)
         numbers, width = list_number_heads(texts), 2 * (texts.shape[1] - 1)
         grid = Table(box=None, pad_edge=False, header_style="bold")
         for head, cells in texts.items():
             if head in numbers:
-                lines = textwrap.wrap(head, max(map(len, ["x" * MIN_HEAD_WIDTH, *cells])))
+                longest = min(max(map(len, head.split()), default=0), MAX_WORD_WIDTH) if keeps_words else 0
+                lines = textwrap.wrap(head, max(MIN_HEAD_WIDTH, longest, *map(len, cells)))
                 smallest = max(map(len, [*cells, *lines]))
                 grid.add_column(Text("\n".join(lines)), justify="right", no_wrap=True)
             else:
@@ -104,10 +105,13 @@ def print_table(console: Console, frame: pd.DataFrame, optional: Sequence[str] =
                 smallest = min(longest, MAX_WORD_WIDTH)
                 grid.add_column(Text(head), overflow="fold", min_width=smallest)
             width += smallest
-        if width <= console.width or texts.shape[1] <= 2:
+        if width <= console.width or (texts.shape[1] <= 2 and not keeps_words):
             break
-        left_out.append(remaining.pop(0) if remaining else str(frame.columns[-1]))
-        frame = frame.drop(columns=left_out[-1])
+        if keeps_words:
+            keeps_words = False
+        else:
+            left_out.append(remaining.pop(0) if remaining else str(frame.columns[-1]))
+            frame = frame.drop(columns=left_out[-1])
     for row in texts.to_numpy().tolist():
         grid.add_row(*map(Text, row), style="red" if any("✗" in text for text in row) else "")
     console.print(grid, highlight=False)

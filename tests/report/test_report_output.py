@@ -9,9 +9,10 @@ import numpy as np
 import pandas as pd
 import pytest
 from approved_texts import check_text
+from rich.console import Console
 
 from lavender.report import drawing, figures, write
-from lavender.report.render import write_files
+from lavender.report.render import print_table, write_files
 from tests.report.synthetic import EVIL, FALSE_CLAIM, example, record, report_of, shown, skip
 
 
@@ -180,3 +181,11 @@ def test_strip_of_errors_names_each_colour_once_and_shows_the_limit(close):
     _, below, above, far, empty = axes.images[0].get_array()[0].tolist()
     orange = [list(color) for color in drawing.ERROR_COLORS[-2:]]
     assert [above, far] == orange and below not in orange and empty == [0.0] * 4
+
+
+@pytest.mark.parametrize(("width", "head"), [(19, ["iterations,", "cold"]), (16, ["iteratio", "ns, cold"])])
+def test_head_of_a_table_folds_between_words_if_the_table_fits(width, head):
+    console = Console(width=width, record=True)
+    print_table(console, pd.DataFrame({"solver": ["pgs"], "iterations, cold": [8]}))
+    lines = console.export_text().split("\n")
+    assert [line.removeprefix("solver").strip() for line in lines[:2]] == head
