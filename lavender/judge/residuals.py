@@ -144,7 +144,7 @@ class Residual:
         Largest velocity error of an answer with the verdict "close enough".
     moved_by : {"impulse", "acceleration"}
         Judged quantity: the impulse, or the acceleration by which an engine moved the bodies. `error` then is the
-        difference of its velocities from those of the exact solution, divided by the weights of `velocity_by_row`.
+        difference of its velocities from the exact ones, divided by the weights of `velocity_by_row`.
     lost_digits : float
         Decimal digits that an engine's forces have lost, because R is far below the diagonal of A; else 0.
     acceleration_error : float, m/s

@@ -221,8 +221,10 @@ class _Task:
         if self.judge.x is None:  # Without a point, x = 0 is judged.
             self.judge.keep(np.zeros(len(self.qp.q)), np.zeros(len(self.qp.target)))
         is_stopped = self.runs[-1].status is Status.INTERRUPTED
-        # Large x makes the violations of rows that contradict each other small: a proof has precedence.
-        has_budget = self.max_iter is None and not self.deadline.has_passed() and len(self.qp.q) > 0
+        # Large x makes the violations of rows that contradict each other small: a proof has precedence, also over a
+        # point that was found in `max_iter` iterations.
+        has_budget = self.max_iter is None or self.judge.error <= self.judge.tol
+        has_budget = has_budget and not self.deadline.has_passed() and len(self.qp.q) > 0
         if not self.judge.strict_error <= self.judge.tol and not is_stopped and has_budget:
             # Search for a proof that no x satisfies the rows and, if no point is found, for a ray.
             self.proof = self.proof or find_infeasibility_proof(

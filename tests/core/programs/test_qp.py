@@ -314,6 +314,7 @@ def test_two_rows_over_a_singular_p_that_contradict_each_other_are_infeasible(un
     rows = {"A": [a, 3.0 * a], "b": [1.0, 4.0]} if side else {"G": [a, -3.0 * a], "h": [-1.0, 0.0]}
     answer = lv.solve_qp(unit * root @ root.T, np.zeros(11), **rows)
     assert answer.solution.status is lv.Status.INFEASIBLE and not answer.found
+    assert not lv.solve_qp(unit * root @ root.T, np.zeros(11), max_iter=10_000, **rows).found
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in (1, 2))])
