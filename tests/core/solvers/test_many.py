@@ -362,6 +362,7 @@ def test_solve_many_with_a_start_that_is_not_finite_fails_in_its_world_only(list
     many = lv.solve_many(given, tol=1e-8, errors="status", **starts)
     impulse, velocity = many.impulse.reshape(6, -1), many.velocity.reshape(6, -1)
     assert sorted(many.faults) == [2, 4] and not many.success[[2, 4]].any()
+    assert many.iterations[[2, 4]].tolist() == [0, 0] and many.worst_row[[2, 4]].tolist() == [-1, -1]
     assert np.isnan(impulse[[2, 4]]).all() and np.isnan(velocity[[2, 4]]).all()
     for i in (0, 1, 3, 5):
         # Each start is a solution; its friction exceeded its bound by at most 4e-12 of it, and is projected on it.
