@@ -36,6 +36,13 @@ def state(cone="elliptic", solver="Newton", condim=3, jacobian="dense", steps=25
     return model, data
 
 
+def get_state(model, data):
+    """All that the next step reads, as `mj_setState` takes it."""
+    found = np.empty(mj.mj_stateSize(model, mj.mjtState.mjSTATE_INTEGRATION))
+    mj.mj_getState(model, data, found, mj.mjtState.mjSTATE_INTEGRATION)
+    return found
+
+
 def whole_mass(model, data):
     """M (nv, nv)."""
     whole = np.zeros((model.nv, model.nv))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from calls import BOXES
 from calls import EARLY_BOXES as EARLY
-from mujoco_scene import mj
+from mujoco_scene import get_state, mj
 
 import lavender as lv
 from lavender.audit import audit as module
@@ -18,9 +18,7 @@ from lavender.io.start_states import hash_model, load_model, read_states
 def judge_forward(model, data):
     """Return the judge's velocity error [m/s] of MuJoCo's answer in the present state."""
     copied = mj.MjData(model)
-    state = np.empty(mj.mj_stateSize(model, mj.mjtState.mjSTATE_INTEGRATION))
-    mj.mj_getState(model, data, state, mj.mjtState.mjSTATE_INTEGRATION)
-    mj.mj_setState(model, copied, state, mj.mjtState.mjSTATE_INTEGRATION)
+    mj.mj_setState(model, copied, get_state(model, data), mj.mjtState.mjSTATE_INTEGRATION)
     mj.mj_forward(model, copied)
     return lv.residual(lv.io.from_mujoco(model, copied), lv.io.mujoco.impulse(model, copied)).velocity
 
@@ -135,13 +133,11 @@ def test_audit_against_another_model_judges_both_on_the_same_states(boxes, tmp_p
     assert found.numbers.tobytes() == alone.numbers.tobytes()
     model = mj.MjModel.from_xml_path(str(path))
     converged = mj.MjModel.from_xml_path(str(other))
-    data, rng = mj.MjData(model), np.random.default_rng(0)
-    copied, state = mj.MjData(converged), np.empty(mj.mj_stateSize(model, mj.mjtState.mjSTATE_INTEGRATION))
+    data, copied, rng = mj.MjData(model), mj.MjData(converged), np.random.default_rng(0)
     expected = []
     for _ in range(30):
         data.ctrl[:] = rng.uniform(-1.0, 1.0, model.nu)
-        mj.mj_getState(model, data, state, mj.mjtState.mjSTATE_INTEGRATION)
-        mj.mj_setState(converged, copied, state, mj.mjtState.mjSTATE_INTEGRATION)
+        mj.mj_setState(converged, copied, get_state(model, data), mj.mjtState.mjSTATE_INTEGRATION)
         expected.append(judge_forward(converged, copied))
         mj.mj_step(model, data)
     np.testing.assert_allclose(found.against.numbers[0, 0], expected, rtol=1e-6, atol=1e-13)

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from mujoco_scene import get_state
+from mujoco_scene import mj as mujoco
 
 import lavender as lv
 from lavender.audit.slip import REMEDY_STEPS, explain_slip
 from lavender.audit.slip_states import explain_slip_of_states
-
-mujoco = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[peers]'")
 
 GRAVITY = 9.81
 
@@ -69,19 +69,16 @@ def test_slip_with_one_iteration_is_unfinished_solving():
     data = mujoco.MjData(exact)
     for _ in range(40):
         mujoco.mj_step(exact, data)
-    state = np.empty(mujoco.mj_stateSize(exact, mujoco.mjtState.mjSTATE_INTEGRATION))
     data.qacc_warmstart[:] = 0.0
-    mujoco.mj_getState(exact, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
-    assert dominant(explain_slip_of_states(model, state[None]).explanations[0]) == "unfinished solving"
+    assert dominant(explain_slip_of_states(model, get_state(exact, data)[None]).explanations[0]) == "unfinished solving"
 
 
 def test_slip_of_an_unfinished_acceleration_is_the_speed_of_the_corners_after_the_step():
     """CG leaves forces behind the acceleration, and only the acceleration moves the box."""
     model = block(0.3, option='cone="elliptic" solver="CG" iterations="2"')
     data = mujoco.MjData(model)
-    state = np.empty(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION))
     for _ in range(20):
-        mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
+        state = get_state(model, data)
         mujoco.mj_step(model, data)
     by_forces = mujoco.MjData(model)
     mujoco.mj_setState(model, by_forces, state, mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -224,8 +221,7 @@ def test_explain_slip_of_states_remedy_has_the_slip_that_the_typed_setting_gives
     for _ in range(steps - 1):
         mujoco.mj_step(model, data)
     mujoco.mj_forward(model, data)
-    state = np.empty(mujoco.mj_stateSize(model, state_kind))
-    mujoco.mj_getState(model, data, state, state_kind)
+    state = get_state(model, data)
     (explanation,) = explain_slip_of_states(model, steps=steps).explanations
     settings = {remedy.setting: remedy for remedy in explanation.remedies}
     assert next(iter(settings)) == "as it is" and 'solref="0.004 1" of all geoms' in settings
@@ -254,15 +250,13 @@ def test_explain_slip_of_states_remedy_has_the_slip_that_the_typed_setting_gives
 
 def falling_states(model, velocities):
     """Return the states of a box that has settled, with these velocities along x and upwards [m/s]."""
-    kind, data = mujoco.mjtState.mjSTATE_INTEGRATION, mujoco.MjData(model)
+    data, states = mujoco.MjData(model), []
     for _ in range(300):
         mujoco.mj_step(model, data)
-    states = []
     for x, up in velocities:
         data.qvel[:] = 0.0
         data.qvel[0], data.qvel[2] = x, up
-        states.append(np.empty(mujoco.mj_stateSize(model, kind)))
-        mujoco.mj_getState(model, data, states[-1], kind)
+        states.append(get_state(model, data))
     return np.array(states)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mujoco_scene import mj
+from mujoco_scene import get_state, mj
 
 import lavender as lv
 
@@ -43,14 +43,13 @@ def iterate_models():
 
 def step_model(model, seed):
     """Return the states before steps under random controls, and the velocities after them."""
-    kind, data, rng = mj.mjtState.mjSTATE_INTEGRATION, mj.MjData(model), np.random.default_rng(seed)
+    data, rng = mj.MjData(model), np.random.default_rng(seed)
     low, high = np.clip(model.actuator_ctrlrange.T, -1.0, 1.0) if model.nu else (0.0, 0.0)
     states, after = [], []
     data.qvel[:] = 0.1 * rng.standard_normal(model.nv)
     for _ in range(N_STEPS):
         data.ctrl[:] = rng.uniform(low, np.maximum(high, low), model.nu)
-        states.append(np.empty(mj.mj_stateSize(model, kind)))
-        mj.mj_getState(model, data, states[-1], kind)
+        states.append(get_state(model, data))
         mj.mj_step(model, data)
         if data.warning[mj.mjtWarning.mjWARN_BADQACC].number or data.warning[mj.mjtWarning.mjWARN_BADQVEL].number:
             return np.array(states[:-1]), np.array(after)

@@ -5,7 +5,7 @@ import pickle
 
 import numpy as np
 import pytest
-from mujoco_scene import mj
+from mujoco_scene import get_state, mj
 
 import lavender as lv
 from lavender.io import mujoco as adapter
@@ -160,11 +160,9 @@ for mark in every_model:
 @pytest.mark.parametrize("solver", ["PGS", "Newton"])
 def test_from_mujoco_many_judges_and_predicts_as_single_steps(integrator, solver):
     model = make_model(integrator, "elliptic", solver, "tendon", iterations=2)
-    kind = mj.mjtState.mjSTATE_INTEGRATION
     states, after, single = [], [], []
     for before, forward, stepped in iterate_steps(model):
-        states.append(np.empty(mj.mj_stateSize(model, kind)))
-        mj.mj_getState(model, before, states[-1], kind)
+        states.append(get_state(model, before))
         after.append(stepped.qvel.copy())
         single.append(lv.residual(lv.io.from_mujoco(model, forward), adapter.impulse(model, forward)))
     velocity = np.empty((len(states), model.nv))

@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from mujoco_scene import mj, scene, whole_mass
+from mujoco_scene import get_state, mj, scene, whole_mass
 
 import lavender as lv
 from lavender.io import mujoco as single
@@ -64,11 +64,9 @@ def test_from_mujoco_many_with_scratch_has_the_bits_of_calls_without_it():
     """Controls, warm starts and clamped numbers of an earlier call, and of one that failed, do not reach the next."""
     model = mj.MjModel.from_xml_string(scene())
     scratch, states = lv.io.MujocoScratch(model), states_of(model, 6)
-    whole = np.zeros((2, mj.mj_stateSize(model, mj.mjtState.mjSTATE_INTEGRATION)))
     data = forwarded(model, states[0])
     data.qfrc_applied[:], data.xfrc_applied[:], data.qacc_warmstart[:] = 3.0, 2.0, 7.0
-    for state in whole:
-        mj.mj_getState(model, data, state, mj.mjtState.mjSTATE_INTEGRATION)
+    whole = np.tile(get_state(model, data), (2, 1))
     kept = scratch.take_data()
     scratch.keep_data(kept)
     for some in (states[:1], whole, states, whole * np.nan, states[2:], states[:1]):
@@ -94,8 +92,7 @@ def test_scratch_of_a_model_of_another_size_is_made_anew():
 def test_scratch_leaves_the_data_of_the_caller_unchanged():
     model = mj.MjModel.from_xml_string(scene())
     own = forwarded(model, states_of(model, 1)[0])
-    state = np.zeros((1, mj.mj_stateSize(model, mj.mjtState.mjSTATE_INTEGRATION)))
-    mj.mj_getState(model, own, state[0], mj.mjtState.mjSTATE_INTEGRATION)
+    state = get_state(model, own)[None]
 
     def list_arrays():
         values = {name: getattr(own, name) for name in dir(own) if not name.startswith("_")}

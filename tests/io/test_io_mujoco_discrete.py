@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from mujoco_scene import mj
+from mujoco_scene import get_state, mj
 
 import lavender as lv
 from lavender.io import mujoco as adapter
@@ -56,12 +56,11 @@ MODELS = {
 def make_states(text, steps=120, every=6):
     """Return the model and the states before steps with constraint rows, under random controls."""
     model = mj.MjModel.from_xml_string(text)
-    data, rng, kind = mj.MjData(model), np.random.default_rng(0), mj.mjtState.mjSTATE_INTEGRATION
+    data, rng = mj.MjData(model), np.random.default_rng(0)
     states = []
     for k in range(steps):
         data.ctrl[:] = 0.2 * rng.normal(size=model.nu)
-        state = np.empty(mj.mj_stateSize(model, kind))
-        mj.mj_getState(model, data, state, kind)
+        state = get_state(model, data)
         mj.mj_step(model, data)
         if data.nefc and k % every == 0:
             states.append(state)

@@ -5,7 +5,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from mujoco_scene import mj
+from mujoco_scene import get_state, mj
 
 import lavender as lv
 from lavender.io import mujoco as adapter
@@ -86,11 +86,9 @@ def test_residual_of_changed_acceleration_is_the_change_of_the_row_velocities(co
 
 
 def test_stiff_rows_of_many_worlds_equal_those_of_single_ones():
-    kind = mj.mjtState.mjSTATE_INTEGRATION
     states, single = [], []
     for model, data in iterate_pressed_states(3):
-        states.append(np.zeros(mj.mj_stateSize(model, kind)))
-        mj.mj_getState(model, data, states[-1], kind)
+        states.append(get_state(model, data))
         mj.mj_forward(model, data)
         single.append(lv.residual(lv.io.from_mujoco(model, data), adapter.impulse(model, data)))
     imported = lv.io.from_mujoco_many(model, np.array(states))
