@@ -1,7 +1,7 @@
 """Worlds in the lanes of vectors: 8, 4 or 2 worlds of similar structure at once, with bounded rows and contacts of three rows.
 
 Entry i of an array holds entry i of every world: x[width i + lane]. Worlds with fewer rows than another lane's receive empty
-rows, whose impulses are 0 and which change no bit of the others. A world's arithmetic is that of one problem by the functions
+rows, whose impulses are 0 and which change no bit of the others. A world is processed as one problem by the functions
 of core and judge, with the same bits: no sum runs over lanes, so that the width changes no bit. Zeros of J, M and Y are processed
 as numbers, or left out where every lane has them. Worlds that a lane does not cover are processed alone: invalid numbers,
 several islands, a zero impulse that is a solution or violates bounds, results that judge/refine.pxd refines or that are above
@@ -47,7 +47,7 @@ cdef extern from *:
     static void lavender_close_columns(int n, unsigned long long* left, unsigned long long* above) {
         const unsigned long long one = 1;
         int last[LANE_VELOCITIES];
-        for (int i = n - 1; i >= 0; i--) {              /* row i is added to that of its last column */
+        for (int i = n - 1; i >= 0; i--) {              /* row i is added to the row of its last column */
             int j = i - 1;
             while (j >= 0 && !(left[i] >> j & 1)) j--;
             if (j >= 0) left[j] |= left[i] & ((one << j) - 1);
@@ -443,18 +443,14 @@ cdef extern from *:
         out[LANE_STEPS] = steps; \
     }
     #define LAVENDER_LANES(N, V, I, ISA) \
-    /* Interleave n numbers from each of N arrays, of float if `narrow`, to their places, or one after the other if `at` is 0. */ \
-    ISA static void interleave_##N(const void* const* from, int narrow, long long n, const int* at, double* to) { \
-        const float* single[N]; \
-        const double* wide[N]; \
+    /* Interleave n numbers from each of N arrays, of float if `narrow`, number i to place at[i]. */ \
+    ISA static void interleave_##N(const void* const* from, int narrow, int n, const int* at, double* to) { \
         for (int l = 0; l < N; l++) { \
-            single[l] = from[l]; \
-            wide[l] = from[l]; \
+            const float* single = from[l]; \
+            const double* wide = from[l]; \
+            for (int i = 0; narrow && i < n; i++) to[N * at[i] + l] = single[i]; \
+            for (int i = 0; !narrow && i < n; i++) to[N * at[i] + l] = wide[i]; \
         } \
-        for (long long i = 0; narrow && i < n; i++) \
-            for (int l = 0; l < N; l++) to[N * (at ? at[i] : i) + l] = single[l][i]; \
-        for (long long i = 0; !narrow && i < n; i++) \
-            for (int l = 0; l < N; l++) to[N * (at ? at[i] : i) + l] = wide[l][i]; \
     } \
     \
     /* Overwrite v (n) with M^-1 v. */ \
@@ -840,7 +836,7 @@ cdef extern from *:
     void solve_lanes "lavender_solve_lanes"(const lanes_t* x, int32_t width) noexcept nogil
     void solve_one "lavender_solve_one"(const lanes_t* x, int32_t wide) noexcept nogil
     void judge_lanes "lavender_judge_lanes"(const lanes_t* x, int32_t width) noexcept nogil
-    void interleave "lavender_interleave"(const void** x, int32_t narrow, int64_t n, const int32_t* at, double* out,
+    void interleave "lavender_interleave"(const void** x, int32_t narrow, int32_t n, const int32_t* at, double* out,
                                           int32_t width) noexcept nogil
 
 
@@ -974,19 +970,24 @@ cdef inline void load_lanes(const lanes_t* x, const lane_rows_t* p, const worlds
     cdef const int64_t* at[MAX_LANES]
     cdef const void* line[MAX_LANES]
     cdef double zero[MAX_LANE_VELOCITIES]
+    cdef int32_t place[MAX_LANE_VELOCITIES]
     cdef int32_t place_in_mass[LANE_TRIANGLE]
+    cdef const int32_t* in_mass = place
     cdef int32_t i, k, own, lane, n = x.n
     cdef int64_t j, stride, here
     memset(zero, 0, sizeof(zero))
+    for i in range(n):
+        place[i] = i
     for lane in range(width):
         at[lane] = w.at + PLACES * worlds[lane if lane < n_worlds else 0]
         x.out[LANE_COUNT * width + lane] = p.rows[lane]
     # M and v*
     for lane in range(width):
         line[lane] = <const char*>w.array[2] + (4 if w.narrow[2] else 8) * at[lane][FREE]
-    interleave(line, w.narrow[2], n, NULL, x.free, width)
+    interleave(line, w.narrow[2], n, place, x.free, width)
     stride = w.mass_row if w.mass_row else n
     if w.mass_ptr != NULL:
+        in_mass = place_in_mass
         memset(x.mass, 0, <int64_t>n * n * width * sizeof(double))
         for i in range(n):
             for k in range(w.mass_ptr[i], w.mass_ptr[i + 1]):
@@ -994,7 +995,7 @@ cdef inline void load_lanes(const lanes_t* x, const lane_rows_t* p, const worlds
     for i in range(1 if w.mass_ptr != NULL else n):
         for lane in range(width):
             line[lane] = <const char*>w.array[1] + (4 if w.narrow[1] else 8) * (at[lane][MASS] + i * stride)
-        interleave(line, w.narrow[1], w.mass_ptr[n] if w.mass_ptr != NULL else n, place_in_mass if w.mass_ptr != NULL else NULL,
+        interleave(line, w.narrow[1], w.mass_ptr[n] if w.mass_ptr != NULL else n, in_mass,
                    x.mass + <int64_t>i * n * width, width)
     # rows and blocks; an empty row has a tiny d, so that it is no lane's largest
     stride = w.jac_row_stride if w.jac_row_stride else n
@@ -1010,7 +1011,7 @@ cdef inline void load_lanes(const lanes_t* x, const lane_rows_t* p, const worlds
                 x.target[j], x.soft[j] = read_number(w, 3, at[lane][TARGET] + own), read_number(w, 4, at[lane][SOFT] + own)
                 here = at[lane][CONE_ROW] + own
                 x.lower[j], x.upper[j], x.lam[j] = w.blocks.lower[here], w.blocks.upper[here], lam[at[lane][AT_ROW] + own]
-        interleave(line, w.narrow[0], n, NULL, x.jac + <int64_t>i * n * width, width)
+        interleave(line, w.narrow[0], n, place, x.jac + <int64_t>i * n * width, width)
     for i in range(x.k):
         for lane in range(width):
             j = i * width + lane

@@ -85,8 +85,8 @@ def test_lanes_solve_all_worlds_that_an_impulse_moves(width):
     assert np.median(many.iterations) <= 5  # Newton steps over velocities are twice as many.
 
 
-def make_tree_batch(law, seed=0):
-    """Return ragged worlds of three structures over trees, with bounded and free rows and contacts between them.
+def make_tree_batch(law, seed=1):
+    """Return ragged worlds of twelve structures over trees, with bounded and free rows and contacts between them.
 
     Some worlds have several islands, a zero in M, or a zero impulse outside the bounds.
     """
@@ -99,7 +99,8 @@ def make_tree_batch(law, seed=0):
         lv.Cones.bounded([0.0] * 8, [np.inf] * 8),
         lv.Cones.bounded([0.0], [np.inf]) + lv.Cones.contacts([0.3, 1.0], count=2) + lv.Cones.bounded([-0.2], [0.2]),
     ]
-    cones = [blocks[int(rng.integers(0, 3))] for _ in range(n)]
+    more = [lv.Cones.bounded([0.0] * k, [np.inf] * k) for k in range(4)]
+    cones = [blocks[int(rng.integers(0, 3))] + more[int(rng.integers(0, 4))] for _ in range(n)]
     cones[3] = lv.Cones.bounded([0.1], [1.0])
     rows = [c.n_rows for c in cones]
     jac = [np.zeros((m, nv)) for m in rows]
