@@ -37,7 +37,7 @@ NARROW_CHECK_OMITS = (
 @click.argument(
     "files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...", shell_complete=complete_case_or_file
 )
-@click.option("--solvers", type=ListType(click.STRING), shell_complete=complete_solver,
+@click.option("--solvers", type=ListType(str), shell_complete=complete_solver,
               help="Solvers by name; default: all that accept the problem.")  # fmt: skip
 @click.option("--reference", default="osqp", show_default=True, shell_complete=complete_solver,
               help="Reference solver, with which the others are compared.")  # fmt: skip

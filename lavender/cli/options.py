@@ -39,9 +39,9 @@ NUMBER = re.compile(r"[\d.]+(e[-+]?\d+)?", re.IGNORECASE)  # Matches a word of a
 class ListType(_ParamType):
     """Option type: values of another type, separated by commas or blanks."""
 
-    def __init__(self, kind: _ParamType) -> None:
-        self.kind = kind
-        self.name = "x,x,..." if kind in (click.INT, click.FLOAT) else "a,b,..."
+    def __init__(self, kind: Any) -> None:
+        self.kind = click.types.convert_type(kind)  # str, int and float are types, too.
+        self.name = "x,x,..." if kind in (int, float) else "a,b,..."
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return the values as a tuple."""
@@ -201,11 +201,11 @@ OPTIONS_WITHOUT_EFFECT: dict[str, tuple[str, tuple[str, ...]]] = {
 
 #: Options of the commands that measure, as fields of `lavender.report.Plan`.
 PLAN_OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
-    ("--solvers", {"type": ListType(click.STRING), "shell_complete": complete_solver,
+    ("--solvers", {"type": ListType(str), "shell_complete": complete_solver,
                    "help": "Solvers by name; default: all that are installed."}),
-    ("--tolerances", {"type": ListType(click.FLOAT), "default": "1e-3,1e-6,1e-9", "show_default": True,
+    ("--tolerances", {"type": ListType(float), "default": "1e-3,1e-6,1e-9", "show_default": True,
                   "help": "Relative residuals to reach."}),
-    ("--budgets", {"type": ListType(click.INT), "default": "4,8,16,32,64", "show_default": True,
+    ("--budgets", {"type": ListType(int), "default": "4,8,16,32,64", "show_default": True,
                    "help": "Numbers of iterations to run exactly."}),
     ("--repeats", {"type": int, "default": 3, "show_default": True,
                    "help": "Repetitions of each solve; minimum and median are recorded."}),

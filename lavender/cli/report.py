@@ -50,7 +50,7 @@ from lavender.report.drawing import FILE_KINDS
 @click.option("--backend", default="loky", show_default=True,
               help="The same with the workers of a backend of joblib, such as dask.")  # fmt: skip
 @click.option("--compare", type=PATH, help="Compare with earlier records (.jsonl, or their folder).")
-@click.option("--time-budgets", type=ListType(click.FLOAT), default=(), metavar="S,S,...",
+@click.option("--time-budgets", type=ListType(float), default=(), metavar="S,S,...",
               help="Times in seconds for which the report lists the best solver; default: three decades about the "
               "fastest.")  # fmt: skip
 @click.option("--sweeps", is_flag=True,
@@ -64,7 +64,7 @@ from lavender.report.drawing import FILE_KINDS
               help="Write no figures; they take the largest part of the time of writing.")  # fmt: skip
 @click.option("--figure-kinds", type=ListType(click.Choice(FILE_KINDS)), default="pdf,svg,png", show_default=True,
               help="Formats of the figures in OUT/figures.")  # fmt: skip
-@click.option("--columns", type=ListType(click.STRING), default=(), metavar="A,B,...",
+@click.option("--columns", type=ListType(str), default=(), metavar="A,B,...",
               help="Columns of OUT/tables/solvers.tex: solved, a tolerance such as 1e-6, ratio, slowest, accepted, "
               "false; default: solved and all tolerances.")  # fmt: skip
 @quiet_option
