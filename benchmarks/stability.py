@@ -34,7 +34,6 @@ import numpy as np
 from benchmarks.output import markdown
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
-from lavender.io.stored import write_figure
 from lavender.sim.engine import Simulation
 from lavender.sim.engine.layout import HEAD, SETTING
 from lavender.sim.engine.state import State
@@ -229,7 +228,7 @@ def figure(path: str | PathLike[str]) -> None:
     right.set_title("g = 0: gravity is quicker than the sweeps", fontsize=10)
     for panel in (left, middle, right):
         panel.legend(fontsize=10, loc="upper left" if panel is not left else "lower right")
-    write_figure(canvas, path, dpi=150)
+    canvas.savefig(path, dpi=150)
 
 
 def numbers() -> Iterator[tuple[str, ...]]:
