@@ -1,8 +1,8 @@
 """Draw figures for pages: inline SVG in the colours of the page, and PDF, SVG and PNG for papers.
 
 Colours of series are hues of Okabe and Ito, darkened to a contrast of at least 5 on white; the style sheet of a page
-replaces them, and those of text, grid and paper, by the colours of its theme. Figures are 4.7 to 4.9 inches wide, so
-that their texts have at least 9 pixels on a phone. Lines have labels at their ends in place of a legend.
+replaces them, and the colours of text, grid and paper, by its theme. Figures are 4.7 to 4.9 inches wide, so that their
+texts have at least 9 pixels on a phone. Lines have labels at their ends in place of a legend.
 """
 
 from __future__ import annotations

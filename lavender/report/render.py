@@ -84,7 +84,7 @@ def print_table(console: Console, frame: pd.DataFrame, optional: Sequence[str] =
     """Print a frame within the width of the terminal. Its texts are not read as markup.
 
     Heads fold between words and numbers stay whole. In a table that is too wide, heads fold within words; then columns
-    are left out and named: those of `optional` in their order, then the last ones.
+    are left out and named: first `optional` in its order, then the last ones.
     """
     from rich.table import Table
     from rich.text import Text
