@@ -31,7 +31,7 @@ __all__ = ["Diagnostic", "diagnose"]
 
 CHECKS = (
     blocks.diagnose_blocks, blocks.diagnose_row_order, blocks.diagnose_duplicate_contacts,
-    motion.diagnose_joint_targets, motion.diagnose_targets, bodies.diagnose_geometry, bodies.diagnose_masses,
+    motion.diagnose_targets, bodies.diagnose_geometry, bodies.diagnose_masses,
     blocks.diagnose_conflict,
 )  # fmt: skip
 
@@ -81,14 +81,13 @@ def diagnose(
     ['friction', 'tangents first']
     """
     check_problem(problem)
-    state = motion.check_state_arguments(problem, velocity, gap, dt)
-    solution = problem.guess if impulse is None else problem.make_start(impulse)
     with np.errstate(all="ignore"):  # Comparisons with numbers beyond float64 are false.
+        of_state = tuple(motion.diagnose_state(problem, velocity, gap, dt))
+        solution = problem.guess if impulse is None else problem.make_start(impulse)
         cached = problem.derived.cache.get(__name__)
         if cached is None:
             cached = problem.derived.cache[__name__] = tuple(s for check in CHECKS for s in check(problem))
-        diagnostics = [replace(s, data=dict(s.data)) for s in cached]
-        diagnostics += motion.diagnose_state(problem, *state)
+        diagnostics = [*(replace(s, data=dict(s.data)) for s in cached), *of_state]
         if solution is not None:
             diagnostics += blocks.diagnose_impulses(problem, solution)
     return tuple(diagnostics)

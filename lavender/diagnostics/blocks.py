@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.diagnostics.bodies import are_normals_first
+from lavender.diagnostics.bodies import reconstruct_bodies, reconstruct_bodies_from_rows
 from lavender.diagnostics.diagnostic import Diagnostic, make_diagnostic
 from lavender.judge.certificates import list_conflicting_blocks
 from lavender.judge.residuals import residual
@@ -53,11 +53,16 @@ def diagnose_row_order(p: Problem) -> Iterator[Diagnostic]:
     full = np.flatnonzero(c.n_tangents == 2)
     if p.rows is not None or len(full) < 2:
         return
-    if are_normals_first(p):
-        reason = "J has the rows of rigid bodies if all normals come first; the order is contact by contact: normal, "
-        reason += "tangent, tangent, then the next contact"
-        yield make_diagnostic(p, "all normals first", reason, full)
-        return
+    k, i = len(full), np.arange(len(full))[:, None]
+    all_full = 3 * k == np.count_nonzero(c.contact_rows)
+    if p.generalized is not None and all_full and reconstruct_bodies(p) is None:
+        # After the normals, the tangents come contact by contact, or all first tangents before all second ones.
+        orders = np.hstack([i, k + 2 * i, k + 2 * i + 1]), np.hstack([i, k + i, 2 * k + i])
+        if any(reconstruct_bodies_from_rows(p, c.ptr[full[0]] + order) is not None for order in orders):
+            reason = "J has the rows of rigid bodies if all normals come first; the order is contact by "
+            reason += "contact: normal, tangent, tangent, then the next contact"
+            yield make_diagnostic(p, "all normals first", reason, full)
+            return
     # For a matrix, only b can be checked. On a normal row, b is an approach velocity from gravity, bounce or
     # penetration.
     b = p.b[c.ptr[full][:, None] + np.arange(3)]
@@ -132,10 +137,9 @@ def diagnose_impulses(p: Problem, impulse: FloatArray) -> Iterator[Diagnostic]:
         yield make_diagnostic(p, "impulses", reason, [p.block_of(r.worst_row)], relative=r.relative)
         return
     if p.rows is not None:
-        inertia = np.linalg.pinv(p.rows.inv_inertia, hermitian=True)
         mass = np.divide(1.0, p.rows.inv_mass, out=np.zeros(p.rows.n_bodies), where=p.rows.inv_mass > 0.0)
-        turn = np.diagonal(inertia, axis1=1, axis2=2)
-        masses = np.hstack([np.repeat(mass[:, None], 3, axis=1), turn]).ravel()
+        turn = np.diagonal(np.linalg.pinv(p.rows.inv_inertia, hermitian=True), axis1=1, axis2=2)
+        masses = np.column_stack([mass, mass, mass, turn]).ravel()
     elif p.generalized is not None:
         masses = p.generalized.mass.diagonal()
     else:

@@ -22,11 +22,11 @@ MISTAKEN_READINGS = (  # Possible mistakes in problems of bodies, and in problem
 def reconstruct_bodies(p: Problem) -> Rows | None:
     """Return the contacts as `Rows`, also for J and M of free rigid bodies; None if they are not rigid bodies."""
     if __name__ not in p.derived.cache:
-        p.derived.cache[__name__] = _reconstruct_bodies(p)
+        p.derived.cache[__name__] = reconstruct_bodies_from_rows(p)
     return p.derived.cache[__name__]
 
 
-def _reconstruct_bodies(p: Problem, rows: npt.NDArray[np.intp] | None = None) -> Rows | None:
+def reconstruct_bodies_from_rows(p: Problem, rows: npt.NDArray[np.intp] | None = None) -> Rows | None:
     """Compute the result of `reconstruct_bodies`.
 
     `rows` (c, 3) holds the rows of J of each contact; the default is the rows of the problem's cones.
@@ -67,20 +67,6 @@ def _reconstruct_bodies(p: Problem, rows: npt.NDArray[np.intp] | None = None) ->
     )  # fmt: skip
 
 
-def are_normals_first(p: Problem) -> bool:
-    """Return whether J has the rows of rigid bodies with all normals first, and not in the order of the cones."""
-    contact = p.cones.is_contact
-    k = int(np.count_nonzero(contact))
-    if p.generalized is None or k < 2 or 3 * k != np.count_nonzero(p.cones.contact_rows):
-        return False
-    if reconstruct_bodies(p) is not None:
-        return False
-    first = int(p.cones.ptr[:-1][contact][0])
-    i = np.arange(k)[:, None]
-    each, alike = np.hstack([i, k + 2 * i, k + 2 * i + 1]), np.hstack([i, k + i, 2 * k + i])
-    return any(_reconstruct_bodies(p, first + order) is not None for order in (each, alike))
-
-
 def diagnose_geometry(p: Problem) -> Iterator[Diagnostic]:
     """Yield diagnostics about tangents before normals, normals from b to a, and duplicates."""
     r = reconstruct_bodies(p)
@@ -88,57 +74,51 @@ def diagnose_geometry(p: Problem) -> Iterator[Diagnostic]:
         return
     blocks = np.flatnonzero(p.cones.is_contact)
     a, b = r.contact_body.T
-    reach = np.linalg.norm(np.stack([r.arm_a, r.arm_b]), axis=2) * np.stack([a >= 0, b >= 0])
-    size = reach.sum(axis=0)
-    between = r.arm_a * (a >= 0)[:, None] - r.arm_b * (b >= 0)[:, None]
+    arms = np.stack([r.arm_a, r.arm_b]) * (r.contact_body.T >= 0)[:, :, None]
+    size = np.linalg.norm(arms, axis=2).sum(axis=0)
     axes = np.stack([r.normal, r.tangent, np.cross(r.normal, r.tangent)], axis=1)
-    along, *aside = np.einsum("cki,ci->kc", axes, between)
+    along, *aside = np.einsum("cki,ci->kc", axes, arms[0] - arms[1])
     for row, other in zip(("second", "third"), aside, strict=True):
-        for sign in (1.0, -1.0):
-            if len(along) > 2 and np.all(sign * other > 1e-3 * size) and not np.all(along > 1e-6 * size):
-                reason = f"the second body lies along the {row} row of the contacts, not along the first; the rows of "
-                reason += "a contact are normal, tangent, tangent"
-                yield make_diagnostic(p, "tangents first", reason, blocks)
-                return
+        is_aside = np.all(other > 1e-3 * size) or np.all(-other > 1e-3 * size)
+        if len(along) > 2 and is_aside and not np.all(along > 1e-6 * size):
+            reason = f"the second body lies along the {row} row of the contacts, not along the first; the "
+            reason += "rows of a contact are normal, tangent, tangent"
+            yield make_diagnostic(p, "tangents first", reason, blocks)
+            return
     against = np.flatnonzero(along < -0.1 * size)  # (1)
     if len(against):
         i = int(against[np.argmin(along[against] / size[against])])
         reason = f"{len(against)} of {len(along)} normals point from body b to body a by their arms: body {a[i]} to "
         reason += f"{b[i]}, {along[i]:.3g} m; a normal points from a to b, arms from the centres to the point"
         yield make_diagnostic(p, "normals", reason, blocks[against], along=float(along[i]))
-    if p.rows is None:
-        return  # Without reconstructed bodies, `blocks.diagnose_duplicate_contacts` compares the rows of J.
-    again, opposed = _find_coincident(r, size)
-    if len(again):
-        reason = f"{len(again)} contacts are at the position of another contact of the pair"
-        yield make_diagnostic(p, "duplicate rows", reason, blocks[again])
-    if len(opposed):
-        reason = "two contacts of a pair at one position have opposite normals"
-        yield make_diagnostic(p, "opposed normals", reason, blocks[opposed])
+    if p.rows is not None:  # With J and M, `blocks.diagnose_duplicate_contacts` compares the rows of J.
+        yield from _diagnose_coincident_contacts(p, p.rows, size)
 
 
-def _find_coincident(r: Rows, size: FloatArray) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-    """Return two index arrays of contacts, each compared with the other contacts of its pair of bodies.
-
-    The first holds contacts that are equal to another up to rounding, the second contacts that are opposite to another
-    within 1 %.
-    """
+def _diagnose_coincident_contacts(p: Problem, r: Rows, size: FloatArray) -> Iterator[Diagnostic]:
+    """Yield diagnostics about contacts of a pair that are equal up to rounding, or opposite within 1 %."""
     pair = np.sort(r.contact_body, axis=1)
     sign = np.where(r.contact_body[:, 0] > r.contact_body[:, 1], -1.0, 1.0)[:, None]
     # Compare the arms on the body with the larger number, which is a moving body.
     arm = np.where((r.contact_body[:, 1] == pair[:, 1])[:, None], r.arm_b, r.arm_a)
     n = sign * r.normal
     order = np.lexsort((arm[:, 2], arm[:, 1], arm[:, 0], pair[:, 1], pair[:, 0]))
-    again, opposed = [], []
+    equal, opposed, blocks = [], [], np.flatnonzero(p.cones.is_contact)
     for step in (1, 2, 3):
         i, j = order[:-step], order[step:]
         near = np.linalg.norm(arm[i] - arm[j], axis=1)
         same = np.all(pair[i] == pair[j], axis=1)
         dot = np.einsum("ij,ij->i", n[i], n[j])
-        again.append(j[same & (near <= 1e-12 * size[i]) & (dot > 1.0 - 1e-12)])
+        equal.append(j[same & (near <= 1e-12 * size[i]) & (dot > 1.0 - 1e-12)])
         clash = same & (near <= 1e-2 * size[i]) & (dot < -0.9)
         opposed += [i[clash], j[clash]]
-    return np.unique(np.concatenate(again)), np.unique(np.concatenate(opposed))
+    again = np.unique(np.concatenate(equal))
+    if len(again):
+        reason = f"{len(again)} contacts are at the position of another contact of the pair"
+        yield make_diagnostic(p, "duplicate rows", reason, blocks[again])
+    if any(map(len, opposed)):
+        reason = "two contacts of a pair at one position have opposite normals"
+        yield make_diagnostic(p, "opposed normals", reason, blocks[np.concatenate(opposed)])
 
 
 def diagnose_masses(p: Problem) -> Iterator[Diagnostic]:

@@ -24,51 +24,36 @@ MIN_RESTITUTION = 0.05
 RESTITUTION_ROUNDING = 1e-6
 
 
-def get_row_velocities_and_targets(p: Problem) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-    """Return J v* (m,) and target (m,) [m/s], and v*; None for a problem in matrix form."""
-    if p.rows is not None:
-        v = p.rows.v_free
-        u = p.jacobian @ v.ravel()
-    elif p.generalized is not None:
-        v = p.generalized.v_free
-        u = p.generalized.velocity_of(v)
-    else:
+def get_targets_and_velocity(p: Problem) -> tuple[FloatArray, FloatArray] | None:
+    """Return the targets b + J v* (m,) [m/s], and v*; None for a problem in matrix form."""
+    bodies = p.rows or p.generalized
+    if bodies is None:
         return None
+    u = p.jacobian @ bodies.v_free.ravel()
     target = p.b + u
     # Smaller targets are rounding of b + J v*.
     target[np.abs(target) <= 1e-12 * np.abs(u).max(initial=0.0)] = 0.0
-    return u, target, v
-
-
-def diagnose_joint_targets(p: Problem) -> Iterator[Diagnostic]:
-    """Yield a diagnostic if rows that connect points of two bodies have targets far above usual speeds."""
-    motion = get_row_velocities_and_targets(p)
-    if p.rows is None or motion is None or not len(p.rows.jac):
-        return
-    jac, count = np.asarray(p.rows.jac), len(p.rows.jac)
-    is_linear = np.any(jac[:, 0:3] != 0.0, axis=1) | np.any(jac[:, 6:9] != 0.0, axis=1)
-    is_rigid = (p.cones.lower[:count] == -np.inf) & (p.cones.upper[:count] == np.inf)
-    if p.compliance is not None:
-        is_rigid &= p.compliance[:count] == 0.0
-    target = motion[1][:count]
-    rows = np.flatnonzero(is_linear & is_rigid & (np.abs(target) > MAX_SEPARATION_TARGET))
-    if len(rows):
-        largest = float(target[rows[np.argmax(np.abs(target[rows]))]])
-        reason = f"{len(rows)} rows of joints have targets up to {largest:.3g} m/s: are the anchors of both bodies in "
-        reason += "world coordinates, and is the error of the joint divided by dt once?"
-        blocks = np.searchsorted(p.cones.ptr, rows, side="right") - 1
-        yield make_diagnostic(p, "joint targets", reason, blocks, target=largest)
+    return target, bodies.v_free
 
 
 def diagnose_targets(p: Problem) -> Iterator[Diagnostic]:
-    """Yield diagnostics about implausible targets of contacts."""
-    c = p.cones
-    motion = get_row_velocities_and_targets(p)
-    contact = c.is_contact
-    if motion is None or not contact.any():
+    """Yield diagnostics about implausible targets of joint rows that connect points of two bodies, and of contacts."""
+    motion = get_targets_and_velocity(p)
+    if motion is None:
         return
-    target = motion[1]
-    normal, tangent = c.normal_rows, c.friction_rows
+    target, c = motion[0], p.cones
+    if p.rows is not None and p.compliance is not None:
+        jac, own = p.rows.jac, slice(len(p.rows.jac))
+        is_linear = np.any(jac[:, 0:3] != 0.0, axis=1) | np.any(jac[:, 6:9] != 0.0, axis=1)
+        is_rigid = (c.lower[own] == -np.inf) & (c.upper[own] == np.inf) & (p.compliance[own] == 0.0)
+        rows = np.flatnonzero(is_linear & is_rigid & (np.abs(target[own]) > MAX_SEPARATION_TARGET))
+        if len(rows):
+            largest = float(target[rows[np.argmax(np.abs(target[rows]))]])
+            reason = f"{len(rows)} rows of joints have targets up to {largest:.3g} m/s: are the anchors of both bodies "
+            reason += "in world coordinates, and is the error of the joint divided by dt once?"
+            blocks = np.searchsorted(c.ptr, rows, side="right") - 1
+            yield make_diagnostic(p, "joint targets", reason, blocks, target=largest)
+    contact, normal, tangent = c.is_contact, c.normal_rows, c.friction_rows
     joints = int(np.count_nonzero(~c.contact_rows))
     if joints and np.any(target[tangent]) and not np.any(np.roll(target, joints)[tangent]):
         largest = np.abs(target[tangent]).max()
@@ -87,20 +72,26 @@ def diagnose_targets(p: Problem) -> Iterator[Diagnostic]:
         yield make_diagnostic(p, "targets", reason, np.flatnonzero(contact)[wild], target=largest)
 
 
-def check_state_arguments(
-    p: Problem, velocity: Any, gap: Any, dt: float | None
-) -> tuple[FloatArray | None, FloatArray | None, float]:
-    """Validate velocity, gap and dt of `diagnose`."""
-    motion = None if velocity is None and gap is None else get_row_velocities_and_targets(p)
-    if motion is None and (velocity is not None or gap is not None):
+def diagnose_state(p: Problem, velocity: Any, gap: Any, dt: float | None) -> Iterator[Diagnostic]:
+    """Yield diagnostics if v* is not v + dt a, or targets of normals are not -gap/dt (or a share of it on overlap).
+
+    The arguments are those of `diagnose`, and are validated here.
+    """
+    if dt is not None:
+        dt = check_float("dt [s]", dt, above=0.0)
+    if velocity is None and gap is None:
+        return
+    motion = get_targets_and_velocity(p)
+    if motion is None:
         raise InputError(
             "velocity and gap are compared with v* and J, which a problem in matrix form does not have: leave them out"
         )
-    if velocity is not None and motion is not None:
-        shape = motion[2].shape
+    target, v_free = motion
+    if velocity is not None:
+        shape = v_free.shape
         if p.rows is not None and get_shape("velocity", velocity) == (p.rows.n_bodies, 3):
             out_of_plane = np.reshape([2, 3, 4] + 6 * np.arange(shape[0])[:, None], -1)
-            if motion[2][:, 2:5].any() or p.jacobian[:, out_of_plane].count_nonzero():
+            if v_free[:, 2:5].any() or p.jacobian[:, out_of_plane].count_nonzero():
                 raise InputError(
                     f"velocity [m/s] has shape {(shape[0], 3)}; {shape} is needed, because the problem is not in the "
                     "xy plane: numpy.insert(v, [2, 2, 2], 0.0, axis=1) converts (v_x, v_y, omega_z)"
@@ -112,23 +103,13 @@ def check_state_arguments(
         if dt is None:
             raise InputError("gap [m] is compared with targets [m/s] by the step size: give dt [s], too")
         gap = as_array("gap", gap, (int(np.count_nonzero(p.cones.is_contact)),), unit="m")
-    return velocity, gap, 0.0 if dt is None else check_float("dt [s]", dt, above=0.0)
-
-
-def diagnose_state(p: Problem, velocity: Any, gap: Any, dt: float) -> Iterator[Diagnostic]:
-    """Yield diagnostics if v* is not v + dt a, or targets of normals are not -gap/dt (or a share of it on overlap)."""
-    motion = None if velocity is None and gap is None else get_row_velocities_and_targets(p)
     contact = np.flatnonzero(p.cones.is_contact)
-    if motion is None or not len(contact):
+    if not len(contact):
         return
     normal, g, r = p.cones.normal_rows, p.generalized, p.rows
-
-    def of_normals(v: FloatArray) -> FloatArray:
-        return np.asarray(p.jacobian @ v.ravel() if g is None else g.velocity_of(v))[normal]
-
     if velocity is not None:
-        step = (motion[2] - velocity).ravel()
-        change = np.abs(of_normals(step))
+        step = (v_free - velocity).ravel()
+        change = np.abs((p.jacobian @ step)[normal])
         push = step.reshape(-1, 6)[r.inv_mass > 0.0, :3] if r is not None else np.zeros((0, 3))
         if g is not None and g.nv <= MAX_DENSE_VELOCITIES:
             push = np.array([step[j : j + 3] for j in find_free_bodies(g.mass.toarray())]).reshape(-1, 3)
@@ -142,14 +123,14 @@ def diagnose_state(p: Problem, velocity: Any, gap: Any, dt: float) -> Iterator[D
         elif typical > 0.5 * G:
             reason = f"v* differs from v by {typical:.3g} m/s in the median: do accelerations lack dt?"
             yield make_diagnostic(p, "v_free", reason, change=typical)
-    if gap is None:
+    if gap is None or dt is None:
         return
-    target = motion[1][normal]
+    target = target[normal]
     comparable = (target != 0.0) & (np.abs(gap) > 1e-9)
     if (
         velocity is not None
     ):  # Targets that are -e times the normal velocities, with one e for all, are bounces.
-        before = of_normals(velocity)
+        before = (p.jacobian @ velocity.ravel())[normal]
         e = np.divide(-target, before, out=np.zeros(len(target)), where=before < 0.0)
         bounces = (e > MIN_RESTITUTION) & (e <= 1.0)
         if bounces.any():

@@ -68,13 +68,13 @@ class MotionError:
     row: int
     reference: FloatArray = field(repr=False)
     reference_residual: Residual
-    note: str = ""
-    _problem: Problem | None = field(default=None, repr=False)
+    note: str
+    _problem: Problem = field(repr=False)
 
     @property
     def body_name(self) -> str:
         """Name of the body (or generalised velocity) with the largest error, e.g. "body 3"; empty without one."""
-        if self._problem is None or self.body < 0:
+        if self.body < 0:
             return ""
         general = self._problem.generalized
         return f"body {self.body}" if general is None else general.velocity_name(self.body)
@@ -82,10 +82,10 @@ class MotionError:
     @property
     def row_name(self) -> str:
         """Name of the row with the largest error, e.g. "contact 3, normal"; empty without one."""
-        return self._problem.row_name(self.row) if self._problem is not None and self.row >= 0 else ""
+        return self._problem.row_name(self.row) if self.row >= 0 else ""
 
     def __str__(self) -> str:
-        is_angular = self._problem is not None and self.row >= 0 and self._problem.angular_rows[self.row]
+        is_angular = self.row >= 0 and self._problem.angular_rows[self.row]
         numbers = (
             ("relative", self.relative, "", ""),
             ("kinetic", self.kinetic, " sqrt(J)", ""),
@@ -136,11 +136,9 @@ def motion_error(problem: Problem, impulse: Any, reference: Any = None) -> Motio
     x = problem.make_start(impulse)
     if reference is None and problem.law == "coulomb":
         reference = raise_if_interrupted(solve(problem, impulse=x, tol=COULOMB_REFERENCE_TOL)).impulse
-    elif reference is None:
-        if __name__ not in problem.derived.cache:
-            best = raise_if_interrupted(solve(problem, impulse=problem.start(), tol=REFERENCE_TOL)).impulse
-            problem.derived.cache.setdefault(__name__, best)
-        reference = problem.derived.cache[__name__]
+    elif reference is None and (reference := problem.derived.cache.get(__name__)) is None:
+        best = raise_if_interrupted(solve(problem, impulse=problem.start(), tol=REFERENCE_TOL)).impulse
+        reference = problem.derived.cache.setdefault(__name__, best)
     reference = mark_read_only(np.array(problem.make_start(reference, "reference")))
     # Numbers that are not finite are None; `note` names them.
     with np.errstate(over="ignore", invalid="ignore"):
@@ -157,7 +155,7 @@ def _compute_error(problem: Problem, x: FloatArray, reference: FloatArray) -> Mo
         notes.append("the reference is not a solution, so there is no estimate")
     else:
         delta = x - reference
-        velocity = _compute_velocity_change(problem, delta)
+        velocity, *energies = _compute_motion(problem, delta)
         if velocity is None:
             slack_change = problem.csr @ delta
         else:
@@ -175,9 +173,8 @@ def _compute_error(problem: Problem, x: FloatArray, reference: FloatArray) -> Mo
             reason = "not positive semidefinite" if problem.is_symmetric else asymmetry
             notes.append(f"A is {reason}: no energies")
         else:
-            energies = _compute_energy_norms(problem, delta, velocity)
-            own = _compute_energy_norms(problem, reference, _compute_velocity_change(problem, reference))
             values["kinetic"], values["energy"] = energies
+            _, *own = _compute_motion(problem, reference)
             size, scale = (x[velocity is None] for x in (energies, own))
             values["relative"] = 0.0 if size == 0.0 else size / scale if scale else math.inf
             if values["relative"] == math.inf and math.isfinite(size):
@@ -192,21 +189,18 @@ def _compute_error(problem: Problem, x: FloatArray, reference: FloatArray) -> Mo
     )
 
 
-def _compute_velocity_change(problem: Problem, impulse: FloatArray) -> FloatArray | None:
-    """Compute M^-1 J^T x (6 n,) or (nv,) [m/s, rad/s] of an impulse x (m,); None if M is not known."""
-    return None if problem.matrix is not None else problem.compute_velocity_change(impulse).ravel()
+def _compute_motion(problem: Problem, impulse: FloatArray) -> tuple[FloatArray | None, Any, float]:
+    """Compute dv = M^-1 J^T x (6 n,) or (nv,) [m/s, rad/s] of an impulse x (m,) [N s], and norms [sqrt J].
 
-
-def _compute_energy_norms(
-    problem: Problem, impulse: FloatArray, velocity: FloatArray | None
-) -> tuple[Any, float]:
-    """Compute sqrt(1/2 dv.M dv), None if M is not known, and sqrt(1/2 x.A x) [sqrt J] of an impulse x (m,)."""
-    if velocity is None:
-        return None, math.sqrt(max(0.5 * float(impulse @ (problem.csr @ impulse)), 0.0))
+    The norms are sqrt(1/2 dv.M dv) and sqrt(1/2 x.A x). dv and the first norm are None if M is not known.
+    """
+    if problem.matrix is not None:
+        return None, None, math.sqrt(max(0.5 * float(impulse @ (problem.csr @ impulse)), 0.0))
+    velocity = problem.compute_velocity_change(impulse).ravel()
     kinetic = max(0.5 * float((problem.jacobian.T @ impulse) @ velocity), 0.0)
     assert problem.compliance is not None
     elastic = 0.5 * float(np.sum(problem.compliance * impulse * impulse))
-    return math.sqrt(kinetic), math.sqrt(kinetic + elastic)
+    return velocity, math.sqrt(kinetic), math.sqrt(kinetic + elastic)
 
 
 def _find_index_and_max(x: FloatArray) -> tuple[int, float]:

@@ -140,9 +140,8 @@ def write_npz(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = 
         if impulse is None or not np.array_equal(arrays["impulse"], motion.impulse):
             arrays["engine_impulse"] = motion.impulse
         meta["moved_by"] = motion.moved_by
-        arrays["engine_change"], arrays["engine_compliance"] = motion.change, motion.compliance
-        if motion.momentum is not None:
-            arrays["engine_momentum"] = motion.momentum
+        parts = (motion.change, motion.compliance, motion.momentum)
+        arrays |= {name: x for name, x in zip(MOTION, parts, strict=True) if x is not None}
     arrays["meta"] = np.frombuffer(json.dumps(meta).encode("ascii"), np.uint8)
     write_arrays(path, arrays)
 
@@ -264,10 +263,9 @@ def _build_box_cones(archive: Arrays, m: int) -> Cones:
             f"cones have sizes {size.min()} to {size.max()}, from row {start.min()} to {end.max() - 1}; cone_start "
             f"and cone_dim of cones of 1 to 3 rows that do not overlap, within rows 0 to {m - 1}, are needed"
         )
-    inside = np.zeros(m, bool)  # Whether a row belongs to the block of the row before it.
-    for s, e in zip(start, end, strict=True):
-        inside[s + 1 : e] = True
-    first = np.flatnonzero(~inside)
+    # All rows but the later ones of cones are the first of a block.
+    later = [np.arange(s + 1, e) for s, e in zip(start, end, strict=True)]
+    first = np.setdiff1d(np.arange(m), np.concatenate(later))
     contact, friction = np.zeros(len(first), bool), np.zeros(len(first))
     at = np.searchsorted(first, start)
     contact[at], friction[at] = True, mu
