@@ -51,7 +51,6 @@ def test_contract_of_a_false_solver_ends_with_1_and_names_unmet_requirements(lav
     assert lv.load(tmp_path / "unmet" / "problems_are_solved.npz").m > 0
     code, out, _ = lavender("contract", "liar", "--list")
     assert code == 0 and "problems_are_solved, all solvers" in out and "met " not in out
-    assert lavender("contract", "no such solver")[0] == cli.EXIT_BAD_INPUT
 
 
 #: The words with which a command would run, where it has an option of a real number.
@@ -120,13 +119,12 @@ def test_ctrl_c_in_a_command_ends_with_130(tmp_path, monkeypatch, capsys, comman
     assert "lavender: stopped" in capsys.readouterr().err
 
 
-def test_doctor_of_a_problem_with_duplicates_lists_them(lavender, path, tmp_path):
+def test_doctor_of_a_problem_with_duplicates_lists_them(lavender, path):
     assert lavender("doctor", path)[:2] == (0, "1 problems checked, none with diagnostics\n")
     code, out, _ = lavender("doctor", path, "duplicated(k=3)")
     assert (code, out.splitlines()[-1]) == (1, "2 problems checked, 1 with diagnostics")
     assert out.startswith("duplicated(k=3): duplicate rows: 2 contacts")
     assert json.loads(lavender("doctor", "duplicated(k=3)", "--json")[1])["duplicated(k=3)"][0]["blocks"] == [1, 2]
-    assert lavender("doctor", tmp_path / "none.npz")[0] == 2
 
 
 def _must_not_begin(*_, **__):

@@ -107,7 +107,6 @@ def test_a_recorded_scene_is_reported_as_a_sequence(lavender, tmp_path):
     assert (code, "steps of two recordings" in err) == (2, True)
     assert lavender("run", "stack", "--steps", 3, "--record", folder, "--replace")[0] == 0
     assert len(list(folder.glob("*.npz"))) == 3  # none of the four is left
-    assert lavender("run", "no such scene")[0] == 2
     assert lavender("report", "--sequence")[0] == 2
     code, _, err = lavender("report", "two_particles", "--solvers", "pgs", "newtn")
     assert (code, "newton" in err) == (2, True)  # A misspelt solver is not read as a case.

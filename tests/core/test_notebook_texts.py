@@ -22,8 +22,6 @@ def test_plot_of_a_solution_shows_worst_rows_and_history(solution):
     assert widths == sorted(solution.residual.velocity_by_row)[-3:]
     assert [text.get_text() for text in worst.get_yticklabels()][-1] == f"{solution.residual.worst_name} [m/s]"
     np.testing.assert_array_equal(history.lines[0].get_ydata(), solution.history.relative)
-    with pytest.raises(lv.InputError, match="rows is 0"):
-        solution.plot(rows=0)
 
 
 def test_repr_of_results_has_one_line_with_their_numbers(problem, solution, tmp_path):

@@ -157,9 +157,6 @@ def test_solve_returns_arrays_of_the_library_of_its_arguments():
     many = check_results(StandardArray(np.zeros(1)), lambda x: x.array)
     assert "3 to 1e-09" in repr(many)
     assert isinstance(lv.solve_many(lv.Batch(*ARRAYS.values(), cones=CONES), like=np.zeros(1)).impulse, np.ndarray)
-    batch = lv.Batch(*ARRAYS.values(), cones=CONES)
-    with pytest.raises(lv.InputError, match="like is a list"):
-        lv.solve_many(batch, like=[0.0])
 
 
 def test_impulses_of_from_efc_return_in_the_callers_library():

@@ -144,12 +144,10 @@ def test_record_with_controls_plays_draws_or_calls_them(tmp_path):
     lv.io.record(model, data, tmp_path, 1, control="random", seed=3)
     assert -2.0 <= data.ctrl[0] <= 3.0
     calls = [lambda *_, given=given: given for given in ([np.nan], [1.0, 2.0], "fast")]
-    for wrong in ("ramp", np.zeros((3, 2)), np.zeros((0, 1)), *calls):
-        with pytest.raises(lv.InputError, match="control"):
-            lv.io.record(model, data, tmp_path, 1, control=wrong)
-    with pytest.raises(lv.InputError, match="seed is -1"):
-        lv.io.record(model, data, tmp_path, 1, control="random", seed=-1)
-    with pytest.raises(lv.InputError, match="replace is 'no'"):
-        lv.io.record(model, data, tmp_path, 1, replace="no")
-    with pytest.raises(lv.InputError, match="steps is 0"):
-        lv.io.record(model, data, tmp_path, 0)
+    for given, words in (
+        *(({"control": wrong}, "control") for wrong in ("ramp", np.zeros((3, 2)), np.zeros((0, 1)), *calls)),
+        ({"control": "random", "seed": -1}, "seed is -1"), ({"replace": "no"}, "replace is 'no'"),
+        ({"steps": 0}, "steps is 0"),
+    ):  # fmt: skip
+        with pytest.raises(lv.InputError, match=words):
+            lv.io.record(model, data, tmp_path, **{"steps": 1} | given)

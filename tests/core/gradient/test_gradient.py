@@ -179,9 +179,6 @@ def test_derivatives_of_a_batch_equal_single_gradients():
             assert np.array_equal(found.b, np.concatenate([g.b for g in each]))
             lists = d.vjp(velocity=[y.tolist() for y in weights])
             assert np.array_equal(lists.b, found.b)
-        weights[1][0] = np.nan
-        with pytest.raises(lv.InputError, match="problem 1: velocity"):
-            d.vjp(velocity=weights)
 
 
 def test_derivatives_of_a_stacked_batch_equal_single_ones_and_reject_other_solutions():
@@ -201,9 +198,6 @@ def test_derivatives_of_a_stacked_batch_equal_single_ones_and_reject_other_solut
         assert np.array_equal(g.b, alone.b) and np.array_equal(found.v_free[7 * i : 7 * i + 7], alone.v_free)
     with pytest.raises(lv.InputError, match="problem 0: the impulse is not a solution"):
         lv.derivatives(batch[::-1], solutions)
-    others = [drawn(seed, "free", "cone", "generalized") for seed in range(3)]
-    with pytest.raises(lv.InputError, match=r"problem 0: impulse .* has shape"):
-        lv.derivatives(others, solutions)
     assert len(lv.derivatives([], [])) == 0 and lv.derivatives([], []).vjp(impulse=[]).b.tolist() == []
 
 

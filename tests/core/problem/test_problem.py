@@ -54,8 +54,6 @@ def test_problem_relaxed_or_boxed_differs_in_its_law_alone():
     j, mu, r = problem.cones.ptr[i], problem.cones.mu[i], problem.cones.patch_radius[i]
     np.testing.assert_allclose(boxed.cones.upper[j : j + 4], [np.inf, 2 * mu, 2 * mu, 2 * mu * r])
     np.testing.assert_allclose(boxed.cones.lower[j : j + 4], [0.0, -2 * mu, -2 * mu, -2 * mu * r])
-    with pytest.raises(lv.InputError, match="negative"):
-        problem.boxed(np.full(c, -1.0))
 
 
 def test_problem_rows_have_names():
@@ -74,17 +72,9 @@ def test_problem_rows_have_names():
     assert named.row_name(int(problem.cones.ptr[wide]) + 1) == f"hinge {wide}, axis 1"
     assert named.row_name(first) == "box 1 on box 2, normal"
     assert random_lcp(1).row_name(3) == "row 3"
-    with pytest.raises(lv.InputError, match="row is 99"):
-        random_lcp(1).row_name(99)
-    with pytest.raises(lv.InputError, match="row is -1"):
-        random_lcp(1).block_of(-1)
-    with pytest.raises(lv.InputError, match="key cannot be read as an array"):
-        replace(random_lcp(1), key=[[1, 2], [3]])
 
 
 def test_from_rows_with_a_scalar_mu_or_one_for_each_contact_is_the_same():
-    with pytest.raises(lv.InputError, match=r"mu has 3 values for 3 rows.*one mu for each contact"):
-        lv.Problem.contact(np.eye(3), np.ones(3), mu=[0.5, 0.5, 0.5])
     assert lv.Problem.contact(np.eye(3), np.ones(3), mu=[0.0, 0.0, 0.0]).law == "lcp"
     assert lv.Problem.contact(np.eye(9), np.ones(9), mu=0.5) == lv.Problem.contact(np.eye(9), np.ones(9), mu=[0.5] * 3)
     assert lv.Problem.contact(np.eye(8), np.ones(8), mu=0.5, patch_radius=0.1).n_blocks == 2

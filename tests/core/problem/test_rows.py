@@ -132,15 +132,14 @@ def test_problem_carry_keeps_impulses_by_key_and_starts_new_blocks_at_zero():
     assert np.array_equal(before.carry(solution), solution.impulse)
     three, four = (lv.Problem.lcp(np.eye(n), np.ones(n)) for n in (3, 4))  # without keys, by the same blocks
     assert three.carry((three, np.ones(3))).all()
-    with pytest.raises(lv.InputError, match=r"this problem and the previous one, .* \(4 now, 3 before\).*key="):
-        four.carry((three, np.ones(3)))
-    with pytest.raises(lv.InputError, match=r"no keys in the previous one, "):
-        dataclasses.replace(four, key=np.arange(4)).carry((three, np.ones(3)))
-    twice = dataclasses.replace(three, key=[7, 8, 7])
-    with pytest.raises(lv.InputError, match="key 7 of the previous one names 2 blocks"):
-        dataclasses.replace(four, key=np.arange(4)).carry((twice, np.ones(3)))
-    with pytest.raises(lv.InputError, match="key 7 of this problem names 2 blocks"):
-        twice.carry((dataclasses.replace(three, key=[7, 8, 9]), np.ones(3)))
+    keyed, twice = dataclasses.replace(four, key=np.arange(4)), dataclasses.replace(three, key=[7, 8, 7])
+    for problem, previous, words in (
+        (four, three, r"this problem and the previous one, .* \(4 now, 3 before\).*key="),
+        (keyed, three, "no keys in the previous one, "), (keyed, twice, "key 7 of the previous one names 2 blocks"),
+        (twice, dataclasses.replace(three, key=[7, 8, 9]), "key 7 of this problem names 2 blocks"),
+    ):  # fmt: skip
+        with pytest.raises(lv.InputError, match=words):
+            problem.carry((previous, np.ones(3)))
     assert not lv.report.carry_impulses(three, np.ones(3), four).any()  # a report starts such a step from zero
     assert np.array_equal(dataclasses.replace(before, key=None).carry(solution), solution.impulse)
     for bad, keys, words in (

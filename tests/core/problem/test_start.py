@@ -40,13 +40,11 @@ def test_solution_and_pair_as_impulse_are_carried_by_their_keys(name):
     assert not np.array_equal(CALLS[name](second, np.zeros(second.m)), expected)
 
 
-def test_solution_without_keys_is_a_start_of_the_same_blocks_only():
+def test_solution_without_keys_is_a_start_of_the_same_blocks():
     problem = random_contact_problem(3)
     solution = lv.solve(problem, tol=1e-9)
     again = lv.solve(problem, "pgs", impulse=solution, tol=1e-6)
     assert again.success and not again.iterations
-    with pytest.raises(lv.InputError, match="no keys in this problem and the previous one"):
-        lv.solve(lv.Problem.lcp(np.eye(2), [1.0, 1.0]), "pgs", impulse=solution)
 
 
 def test_solve_qp_and_batches_start_from_a_result():

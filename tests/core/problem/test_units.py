@@ -80,8 +80,6 @@ def test_texts_of_an_angular_row_have_its_unit(tmp_path):
     assert "rows 2 rad/s (row 1)" in str(lv.motion_error(problem, np.zeros(2)))
     problem.save(tmp_path / "a.npz")
     assert lv.load(tmp_path / "a.npz") == problem
-    with pytest.raises(lv.InputError, match=r"angular holds 0\.5; True or False is needed"):
-        replace(problem, angular=[0.5, 1.0])
 
 
 MODEL = """<mujoco><option cone="elliptic"/><worldbody><geom type="plane" size="5 5 1"/>

@@ -273,8 +273,6 @@ def test_solve_many_begins_at_the_given_impulses():
     assert (warm.iterations[[0, 1, 2, 4, 5]] == 0).all() and warm.iterations[3] > 0
     for i in range(6):
         assert_same(warm, i, lv.solve(batch[i], tol=1e-8, impulse=start[i]))
-    with pytest.raises(lv.InputError, match="impulse="):
-        lv.solve_many(batch, impulses=list(start))
 
 
 def spoiled(jac, mass, free, mu):
@@ -313,8 +311,6 @@ def test_invalid_world_of_a_batch_is_named_and_others_are_solved(threads):
         else:
             assert many.impulse[i].tobytes() == clean.impulse[i].tobytes()
             assert found.relative[i] == clean.relative[i]
-    with pytest.raises(lv.InputError, match="'raise' or 'status'"):
-        lv.solve_many(batch, errors="ignore")
     assert [one.impulse.tobytes() for one in many[many.success]] == [
         many.impulse[i].tobytes() for i in range(10) if i not in words
     ]
@@ -333,8 +329,6 @@ def test_solve_many_index_selects_worlds_as_entries_of_an_array():
     for wrong in (5, -6, mask[:4], [5]):
         with pytest.raises(IndexError):
             many[wrong]
-    with pytest.raises(lv.InputError, match="a sequence of whole numbers, or a mask"):
-        many["a"]
     with pytest.raises(IndexError, match="world 5 does not exist; there are 5"):
         batch[5]
 
@@ -346,8 +340,6 @@ def test_solve_many_of_a_list_begins_at_its_impulses():
     assert len(lv.solve_many([])) == 0
     warm = lv.solve_many(given[:2], impulses=[many[0].impulse, None])
     assert warm[0].iterations == 0 < warm[1].iterations
-    with pytest.raises(lv.InputError, match="impulses of world 1"):
-        lv.residual_many(given, [np.zeros(12), np.zeros(3), np.zeros(2)])
 
 
 @pytest.mark.parametrize("listed", [False, True])

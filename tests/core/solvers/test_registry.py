@@ -55,10 +55,6 @@ def test_available_selects_by_capabilities():
     assert "pgs" in ordered
     assert "direct" not in ordered
     assert set(ordered).isdisjoint(lv.available(law="lcp", order=False))
-    with pytest.raises(lv.InputError, match="unknown capability 'ordered'"):
-        lv.available(ordered=True)
-    with pytest.raises(lv.UnknownName, match="law"):
-        lv.available(law="lpc")
     with pytest.raises(lv.UnknownName, match="did you mean 'sequential_impulses'"):
         lv.solve(TINY, "si")  # its initials
 
@@ -70,8 +66,6 @@ def test_register_of_a_name_twice_raises_without_replace(register):
         lv.register(named("mine"))
     lv.register(named("mine", summary="another"), replace=True)
     assert lv.get("mine").summary == "another"
-    with pytest.raises(lv.InputError, match="SolverSpec"):
-        lv.register("mine")
 
 
 def test_impulse_of_an_infeasible_problem_is_inside_its_bounds_whatever_the_solver_returned(plug_in):

@@ -132,8 +132,6 @@ def test_restore_of_a_foreign_or_damaged_snapshot_raises(tmp_path):
             sim.restore(replace(shot, **{name: getattr(shot, name)[:-1]}))
     with pytest.raises(lv.InputError, match="its sizes differ from the sizes of this scene"):
         sim.restore(replace(lv.Simulation(lv.Scene("stack", n=4)).snapshot(), fingerprint=shot.fingerprint))
-    with pytest.raises(lv.InputError, match="Snapshot is needed"):
-        sim.restore({"x": 1})
     alone = lv.Scene()  # no pair, no contact: arrays of one entry or none
     alone.add_sphere()
     one = after(2, alone)
