@@ -25,8 +25,7 @@ class Derived:
         Arrays that kernels read in generalised coordinates; set when the problem is created.
     cache : dict
         Values of other modules; each key begins with the name of its module. The key of the lock, which is held while
-        a `computed_once` property is computed, is the number of the process: threads that hold the locks of another
-        process do not exist in a forked one.
+        a `computed_once` property is computed, is `_process`.
     """
 
     __slots__ = ("cache", "view")
@@ -34,6 +33,20 @@ class Derived:
     def __init__(self, view: Data | None = None) -> None:
         self.view = view
         self.cache: dict[Any, Any] = {}
+
+
+# Identity of this process. A forked process gets a new object and then new locks, because threads that hold the old
+# locks do not exist in it. The number of the process would need a system call at each property.
+_process = object()
+
+
+def _replace_process_after_fork() -> None:
+    global _process
+    _process = object()
+
+
+if hasattr(os, "register_at_fork"):  # Windows has no fork.
+    os.register_at_fork(after_in_child=_replace_process_after_fork)
 
 
 class cached_property(Generic[T]):
@@ -63,8 +76,7 @@ class cached_property(Generic[T]):
         if not self.is_locked:
             return attributes.setdefault(self.name, self.function(instance))
         cache = instance.derived.cache
-        process = os.getpid()
-        with cache.get(process) or cache.setdefault(process, RLock()):
+        with cache.get(_process) or cache.setdefault(_process, RLock()):
             if self.name not in attributes:
                 attributes[self.name] = self.function(instance)
             return attributes[self.name]
