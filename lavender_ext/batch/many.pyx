@@ -510,7 +510,6 @@ cdef class Worlds:
         for i in range(N_ARRAYS):
             self.w.array[i] = NULL if arrays[i] is None else (<ndarray>arrays[i]).data
             self.w.narrow[i] = arrays[i] is not None and arrays[i].itemsize == sizeof(float)
-        self.order_worlds()
 
     cdef void order_worlds(self):
         """Order the worlds by their structure, in groups of MAX_LANES; -1 fills the last group of each structure."""
@@ -524,11 +523,11 @@ cdef class Worlds:
         by, keys = np.lexsort(both), both[1]
         sizes = np.diff(np.flatnonzero(np.diff(keys[by])) + 1, prepend=0, append=self.w.n)
         places = -(-sizes // MAX_LANES) * MAX_LANES
-        self.order = np.full(places.sum(), -1)
-        self.order[np.arange(self.w.n) + np.repeat(np.cumsum(places - sizes) - (places - sizes), sizes)] = by
-        order = self.order
-        if self.w.n:
-            self.order_at = &order[0]
+        ordered = np.full(places.sum(), -1)
+        ordered[np.arange(self.w.n) + np.repeat(np.cumsum(places - sizes) - (places - sizes), sizes)] = by
+        if self.order is None:                          # Another thread may have ordered the worlds.
+            order = ordered
+            self.order, self.order_at = ordered, &order[0] if self.w.n else NULL
 
     def set_from_problems(self, list problems, list data, list starts):
         """Set the worlds from problems and their `list_problem_data`; None defers a problem to the caller."""
@@ -759,6 +758,8 @@ cdef class Worker:
         if not judges:
             uses_lanes = limits != NULL and limits.lanes != 0.0 and w.cold
         if uses_lanes and w.width > 1 and until == NULL:        # With a limit of time, worlds are solved in their own order.
+            if w.order is None:                         # Only lanes need the order.
+                w.order_worlds()
             order, n = w.order_at, len(w.order)
         with nogil:
             while not self.stop[0]:

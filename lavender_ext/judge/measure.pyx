@@ -1,5 +1,5 @@
 """The judge: its pass over any form of A, and its functions for Python."""
-from libc.math cimport NAN, sqrt
+from libc.math cimport INFINITY, NAN, sqrt
 from libc.stdint cimport int32_t
 from libc.string cimport memcmp, memcpy
 
@@ -8,6 +8,7 @@ import numpy as np
 from lavender_ext.core.validate cimport all_finite as is_finite
 from lavender_ext.core.arrays cimport as_double_pointer
 from lavender_ext.core.csr cimport csr_row_dot_with_abs_sum
+from lavender_ext.core.dot cimport dot
 from lavender_ext.core.generalized cimport multiply_whitened_transpose
 from lavender_ext.core.islands cimport find_islands, island_workspace_integers
 from lavender_ext.core.block_types cimport blocks_t, islands_t
@@ -149,9 +150,19 @@ cdef void choose_start(const view_t* v, bint symmetric, const double* zero_resid
     """
     cdef score_t s = make_empty_score()
     cdef double* now = scratch + 2 * <ssize_t>v.p.n_rows
+    cdef double energy, objective
+    cdef int32_t i
     project_on_bounds(&v.p, lam)
     if is_zero_impulse(&v.p, lam):
         return
+    if v.g != NULL and v.p.islands == NULL and zero_residual[2] >= 0.5:
+        # A start whose objective f = 1/2 |Y^T lam|^2 + 1/2 compliance lam^2 - b.lam is clearly below 0 is kept.
+        multiply_whitened_transpose(v.g, lam, now)
+        energy = objective = 0.5 * dot(now, now, v.g.n)
+        for i in range(v.p.n_rows):
+            objective += lam[i] * (0.5 * v.g.compliance[i] * lam[i] - v.p.b[i])
+        if -INFINITY < objective < -1e-6 * energy:      # M with a condition up to 1e8 may change f by 1e-6 of the energy.
+            return
     s.by_island = now
     judge_view(v, lam, scratch, scratch + v.p.n_rows, now + 2 * count_islands(&v.p), False, &s)
     if v.p.islands == NULL:
