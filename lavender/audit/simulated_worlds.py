@@ -121,8 +121,8 @@ class Runs:
         sizes = [mj.mj_stateSize(m, mj.mjtState.mjSTATE_INTEGRATION) for m in (model, other)]
         if sizes[0] != sizes[1] or model.nv != other.nv:
             raise InputError(
-                f"against names {name_model(against)}, a state of which has {sizes[1]} numbers, and a state of "
-                f"{runs.name} {sizes[0]}; a model with the same state is needed, such as one with other options"
+                f"against names {name_model(against)}, whose state has {sizes[1]} numbers; the state of "
+                f"{runs.name} has {sizes[0]}; a model with the same state is needed, such as one with other options"
             )
         return replace(runs, against=(name_model(against), without_sleep(mj, other)))
 

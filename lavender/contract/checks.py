@@ -22,7 +22,7 @@ from lavender.solvers.registry import SolverSpec, get
 from lavender.solving.prepared import prepare
 from lavender.solving.solve import solve
 
-# Kinds of `work`, of which a solver has to count one.
+# A solver has to count at least one of these kinds of `work`.
 WORK_COUNTERS = {"sweeps", "products", "matvecs", "factorisations", "solves", "pivots", "backend_calls"}
 MIN_BUDGET = 5_000  # Iterations that a resumable solver may use on a problem.
 Requirement = Callable[[SolverSpec, Problem], str]  # Returns the sentence of a failure, or an empty string.

@@ -75,7 +75,7 @@ def diagnose_targets(p: Problem) -> Iterator[Diagnostic]:
 def diagnose_state(p: Problem, velocity: Any, gap: Any, dt: float | None) -> Iterator[Diagnostic]:
     """Yield diagnostics if v* is not v + dt a, or targets of normals are not -gap/dt (or a share of it on overlap).
 
-    The arguments are those of `diagnose`, and are validated here.
+    This function validates the arguments, which `diagnose` describes.
     """
     if dt is not None:
         dt = check_float("dt [s]", dt, above=0.0)

@@ -472,7 +472,7 @@ def measure_residual(
     problem: Problem, impulse: Any, precision: str | None = None, threshold: float = DEFAULT_THRESHOLD,
     tol: float = TOL,
 ) -> Residual:  # fmt: skip
-    """Return the residual of impulses by `residual`, also of those with which an engine moved by its acceleration."""
+    """Return the residual of the impulses themselves, even if an engine moved the bodies by another acceleration."""
     check_problem(problem)
     precision = problem.precision if precision is None else check_choice("precision", precision, PRECISIONS)
     if type(impulse) is not np.ndarray or impulse.dtype != float or not impulse.flags.c_contiguous:

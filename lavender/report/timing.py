@@ -250,7 +250,7 @@ class Plan:
     tolerances: Sequence[float] = (1e-3, 1e-6, 1e-9)
     # Exact iteration counts (`tol=0`), for solvers that can stop after any iteration.
     budgets: Sequence[int] = (4, 8, 16, 32, 64)
-    # Number of solves of each kind, of which minimum and median are recorded. A solve of more than 50 ms is not
+    # Each kind of solve runs so many times, and the minimum and median are recorded. A solve of more than 50 ms is not
     # repeated, and steps of sequences of more than twenty steps are solved once.
     repeats: int = 3
     time_limit: float = 1.0  # [s] Limit of one solve.

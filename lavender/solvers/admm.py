@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -253,6 +253,8 @@ def _factor_shifted_matrix(
 class ADMM(Solver):
     """Proximal splitting with spectral penalty and Anderson mixing."""
 
+    # Only a prepared state has a stopping test before the start is chosen.
+    checks_start: ClassVar[bool] = False
     memory: int = 10
     relaxation: float = 1.6
 

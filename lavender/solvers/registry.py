@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from math import nan
-from typing import TYPE_CHECKING, Any, Literal, Protocol, TypedDict
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, TypedDict
 
 from lavender.base.arrays import FloatArray, check_bool, check_int
 from lavender.base.deadline import Deadline
@@ -81,6 +81,9 @@ class Solver:
 
     A plug-in may return any object with `prepare` and `run` (`external/foreign.py` wraps it).
     """
+
+    #: Whether the stopping test of a prepared state checks the start, so that no result is worse than the start.
+    checks_start: ClassVar[bool] = True
 
     def prepare(self, problem: Problem) -> Any:
         """Build the state of a solve: factor, colour, allocate."""

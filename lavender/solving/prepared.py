@@ -387,8 +387,9 @@ class Prepared:
             claim = Claim(TIME_LIMIT, 0, {}, NO_TIME_MESSAGE)
             loop.keep_start()
         else:
-            # `admm` makes its checks in the first run, so that its start cannot depend on them.
-            has_checks = type(getattr(setup.state, "watch", None)) is StoppingTest and spec.name != "admm"
+            has_checks = (
+                type(getattr(setup.state, "watch", None)) is StoppingTest and setup.solver.checks_start
+            )
             keeps_best = has_checks or spec.delegates  # Its result is never worse than the start.
             is_given = not (has_default_start or problem.has_singular_program)
             if loop.tol > 0.0 and not keeps_best and is_given:

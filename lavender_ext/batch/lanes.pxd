@@ -997,7 +997,7 @@ cdef inline void load_lanes(const lanes_t* x, const lane_rows_t* p, const worlds
             line[lane] = <const char*>w.array[1] + (4 if w.narrow[1] else 8) * (at[lane][MASS] + i * stride)
         interleave(line, w.narrow[1], w.mass_ptr[n] if w.mass_ptr != NULL else n, in_mass,
                    x.mass + <int64_t>i * n * width, width)
-    # rows and blocks; an empty row has a tiny d, so that it is no lane's largest
+    # Fill the rows and blocks. An empty row has a tiny d, so that the largest d of a lane is never that of an empty row.
     stride = w.jac_row_stride if w.jac_row_stride else n
     for i in range(x.m):
         for lane in range(width):

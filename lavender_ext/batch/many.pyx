@@ -78,7 +78,7 @@ cdef enum:
     CACHE_LINE_DOUBLES = 8          # doubles of a cache line, 64 bytes
     MAX_LANE_PAUSE = 31             # groups of worlds without lanes, where lanes cover none
 
-cdef enum:                      # workspaces of a worker, after those of a call
+cdef enum:                      # indices of a worker's own workspaces, which follow the workspaces of a call
     SLACK_ERROR = N_CALL_WORKSPACES
     BY_ISLAND = N_CALL_WORKSPACES + 1
     LANES = N_CALL_WORKSPACES + 2
@@ -313,8 +313,8 @@ def solve_compiled(problem, spec, impulse, tol, deadline=None):
     Returns
     -------
     tuple
-        Solution, or None if there is no result within tol; judged result or None; work counts, None if no call was made or
-        the start is the result; start (m,) of the call or None.
+        Four items: the solution, or None if no result is within tol; the judged result, or None; the work counts, or None if
+        no call was made or the start is the result; the start (m,) of the call, or None.
     """
     cdef Call call
     solution, view = None, problem.derived.view
@@ -739,7 +739,7 @@ cdef class Worker:
         free(self.h.made.numbers)
 
     cpdef int64_t process_worlds(self, double tol, Call call=None, deadline=None, bint judges=False, bint narrow=False) except? -3:
-        """Solve worlds, or judge their impulses, until one is deferred; return its index, or DONE_ALL if there are no more.
+        """Solve worlds, or judge their impulses. Return the index of the first deferred world, or DONE_ALL if no world is left.
 
         Without a call all worlds are deferred, and without its limits all worlds of J and M. At the deadline the present
         iterate of a world is its result, and the starts of the worlds after it are judged. narrow: judge with the round-off

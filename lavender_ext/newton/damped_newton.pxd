@@ -157,7 +157,7 @@ cdef inline void step_damped_newton(newton_t* n) noexcept nogil:
             copy_vector(n, x.z, n.u)
         x.stage = 2
         if x.law == CONE and x.is_solved and n.best > 0.5 * x.earlier_best and n.best > 1e-8:
-            # If there is no solution, proximal iterations diverge along a direction y with H y = 0, which proves it.
+            # If proximal iterations diverge along a direction y with H y = 0, then y proves that there is no solution.
             for j in range(n.s.e.m):
                 n.direction[j] = x.z[j] - n.c[j]
             big = norm_inf(n.direction, n.s.e.m)

@@ -357,7 +357,8 @@ cdef inline bint compute_path_directions(newton_t* n, const double* z, double ta
     n.counts[N_PATH] += 1
     n.s.law = COULOMB
     factor_newton_system(&n.s, NATURAL, n.path.eps)
-    n.path.sign = 0 if n.s.augmented or n.s.form == SPARSE else compute_determinant_sign(n.s.linear)      # of (3); 0: unknown
+    # The sign of the determinant of (3) is 0 if it is unknown.
+    n.path.sign = 0 if n.s.augmented or n.s.form == SPARSE else compute_determinant_sign(n.s.linear)
     solve_natural_map_system(&n.s, n.f, n.dz)
     solve_natural_map_system(&n.s, n.c, n.path.b)
     for j in range(m):

@@ -212,7 +212,7 @@ cdef inline bint may_need_augmented_system(const newton_t* n) noexcept nogil:
     cdef int32_t i
     if not (n.best < 1e-3 and n.has_augmented and n.s.form == BODIES and n.s.e.m <= MAX_AUGMENTED_ROWS):
         return False
-    for i in range(n.s.e.n):                            # Rows without bounds are those of joints.
+    for i in range(n.s.e.n):                            # A row without bounds belongs to a joint.
         if is_row(n.s.e, i) and not has_lower_bound(n.s.e, n.s.e.ptr[i]) and not has_upper_bound(n.s.e, n.s.e.ptr[i]):
             return True
     return False
@@ -247,8 +247,8 @@ cdef inline void enter_next_convex_state(newton_t* n) noexcept nogil:
         begin_interior_steps(n, True)
     elif state == FIRST_CONE_WEIGHT:
         # The weight, a fraction of d, is larger than on rows: the scaling matrices of cones have a wider range of eigenvalues,
-        # and N loses 2^-53 / weight to rounding. On a pyramid of redundant contacts, 1e-10 ends at a residual of 3e-8 and 1e-8
-        # at 4e-10; 1e-6 takes one more step.
+        # and N loses 2^-53 / weight to rounding. Newton's method on a pyramid of redundant contacts ends at a
+        # residual of 3e-8 with the weight 1e-10, and at 4e-10 with 1e-8; it takes one more step with 1e-6.
         begin_interior_point(n, 1e-8, 0.0)
         begin_interior_steps(n, False)
     elif state == SECOND_CONE_WEIGHT:

@@ -64,7 +64,7 @@ cdef inline double max_newton_cost(const blocks_t* p, const generalized_t* g, co
     """Return the permitted cost [ns], 0 if Newton's method must not run; with a rigid row at most the estimated cost of sweeps."""
     cdef double max_rows = l.coulomb_rows if p.law == COULOMB else INFINITY if soft else l.cone_rows
     cdef double each
-    cdef int32_t b, columns = 0                         # of the row that couples the largest number of velocities
+    cdef int32_t b, columns = 0                         # largest number of velocities that one row couples
     for b in range(g.n_panels):
         columns = max(columns, g.pcol[b + 1] - g.pcol[b])
     if islands * max_rows < p.n_rows < l.dense * g.n and has_friction(p) and columns <= l.columns:

@@ -82,7 +82,7 @@ DIRECTIVE_LINE = re.compile(
     rf"\s*^[ \t]*({DIRECTIVE})(?:\s*\n)?(?:[ \t]+(?=[^\s#]))?", re.MULTILINE | re.DOTALL
 )
 WORD = re.compile(r"[A-Za-z_]\w*")
-#: A word that is no member of a struct.
+#: The pattern excludes members of structs, which follow `.` or `->`.
 NAME = re.compile(r"(?<![\w.])(?<!->)[A-Za-z_]\w*")
 DIGITS = re.compile(r"\d+")
 #: Words that need no declaration from the kernels: some are defined by the prologue or by the headers.
