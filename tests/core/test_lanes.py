@@ -135,3 +135,13 @@ def test_mixed_worlds_over_trees_have_the_bits_of_single_calls(width, law, tol):
         assert judged.relative[i] == single.relative
         assert (judged.roundoff_floor[i], judged.worst_row[i]) == (single.roundoff_floor, single.worst_row)
     assert many.success.all()
+
+
+@pytest.mark.parametrize("law", ["coulomb", "cone"])
+def test_starts_worse_than_zero_are_replaced_by_zero(law):
+    batch = make_batch(4, 18, 24, law, seed=5)
+    size = 1.0 + lv.solve_many(batch).impulse
+    far, further = (lv.solve_many(batch, impulse=scale * size) for scale in (1e5, 3e6))
+    assert far.success[1:].all()  # No impulse moves the empty rows of world 0.
+    assert far.impulse.tobytes() == further.impulse.tobytes()
+    assert far.impulse[5].tobytes() == lv.solve(batch[5], impulse=1e5 * size[5]).impulse.tobytes()
