@@ -332,6 +332,7 @@ def extension(path):
     return Extension(
         ".".join(path.with_suffix("").parts),
         [path.as_posix()],
+        include_dirs=[path.parent.as_posix()],  # headers of C that several widths of vectors share
         extra_compile_args=[*COMPILE_ARGS, *options],
         extra_link_args=LINK_ARGS,
     )

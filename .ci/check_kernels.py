@@ -101,16 +101,17 @@ def run(*command: str | Path, cwd: Path = ROOT, **env: str) -> str:
 def read_dialect(c_file: Path) -> list[str]:
     """Return the warnings of the C compiler about nonstandard C, except those of Cython's own tables."""
     compiler = shlex.split(os.environ.get("CC", "cc"))
-    include = "-I" + sysconfig.get_paths()["include"]
+    folders = [sysconfig.get_paths()["include"], str(ROOT / "lavender_ext" / "batch")]
     found: dict[str, None] = {}
-    guarded = PLAIN[0].removeprefix("-D") in c_file.read_text(encoding="utf-8")
+    text = c_file.read_text(encoding="utf-8")
+    guarded = PLAIN[0].removeprefix("-D") in text or '"lanes.h"' in text
     for more in ([], PLAIN) if guarded else ([],):  # without the guard both compilations are the same
         command = [
             *compiler,
             *OPTIONS["COMPILE_FLAGS"],
             *DIALECT,
             *more,
-            include,
+            *(f"-I{folder}" for folder in folders),
             "-fsyntax-only",
             str(c_file),
         ]
